@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses ICP with the network's registration: each checks the other, and disagreement is reported in `reason`."""
+"""ICP and the network's registration: each checks the other, and disagreement is reported in `reason`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import eigh
 
 from dpm2_core.descriptors import LazyDescriptors
 from dpm2_core.estimates import Registration
@@ -16,33 +15,28 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
-from dpm2_core.slam.registration.protocol import CHI2_95, MAP_NOISE, Prediction, agree, near
+from dpm2_core.slam.registration.protocol import CHI2_95, Prediction, agree, near
 from dpm2_core.slam.registration.swept import Beginning, Swept
 
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
-_UNCLAIMED = np.diag(np.repeat([np.radians(1), 0.3], 3) ** 2.0)
-"""Covariance that a network pose has besides its own: at the walls of a building, seen by 16 beams, such poses err by
-0.2 to 0.4 m and claim 0.06 m; above a town, hovering, where the points fit nowhere near them, by 0.27 m."""
+_UNCONFIRMED = np.diag(np.repeat([np.radians(1), 0.3], 3) ** 2.0)
+"""Covariance that a network pose has besides its own where the points fit nowhere near it: above a town, hovering, such
+poses err by 0.27 m and claim 0.06 m."""
 _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
-_AT_MOST = 25.0
-"""Times the information of the points. Where they leave a direction open, as on a highway, most of what a scan shows
-looks alike all along it: the network then matches what moves with the sensor, and is sure of standing still."""
-_TOGETHER = 3.0  # m, least deviation of what it finds there by the images: most of its matches err together
 
 
 class FusedScanRegistration:
-    """ICP and the network's registration, fused.
+    """ICP, led and checked by the network's registration.
 
-    If both agree (see `agree`), they are fused by their information (see `_mean`): nearly always that of the points. If
-    they disagree, ICP starts from the network's pose as well, and the more likely of its results is kept, unless the
-    points are just where the motion leads: among what repeats, such as doors and parked cars, a place beside may fit
-    better. Points that have strayed from where the motion leads are registered anew from a network's pose that they
-    agree with. Where little is known of the motion, it starts there at once: a direction that seems open from afar may
-    be closed at the right place. If ICP fails, it is tried again from the network's pose; if it fails there too, or
-    converges elsewhere, the network's pose is returned, less sure than it claims. `reason` says which of the two
-    disagreed, and why.
+    If both agree (see `agree`), the pose is that of the points. If they disagree, ICP starts from the network's pose as
+    well, and the more likely of its results is kept, unless the points are just where the motion leads: among what
+    repeats, such as doors and parked cars, a place beside may fit better. Points that have strayed from where the
+    motion leads are registered anew from a network's pose that they agree with. Where little is known of the motion, it
+    starts there at once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is
+    tried again from the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned,
+    less sure than it claims. `reason` says which of the two disagreed, and why.
     """
 
     def __init__(
@@ -113,7 +107,7 @@ class FusedScanRegistration:
             likelier = self._geometric.located(scan, replace(prediction, starts=starts))
             decides = not agreed or likelier.worst_sigma <= _SURE_SIGMA
             if likelier.ok and decides and agree(likelier, neural):
-                return self._fused(scan, likelier, neural, None)
+                return _confirmed(likelier)
             points = likelier if likelier.ok and not agreed else points
         if not agreed:
             if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
@@ -124,23 +118,20 @@ class FusedScanRegistration:
             points = led if led.ok and agree(led, neural) else points
         if not self._always and _sure(points, prediction):
             return points  # all that they needed was the start
-        return self._fused(scan, points, neural, prediction.information)
+        return _confirmed(points)
 
     def _led(self, scan: Scan, neural: Registration) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
         points = self._points_from(scan, neural)
         if not points.ok:
-            covariance = neural.covariance + _UNCLAIMED
+            covariance = neural.covariance + _UNCONFIRMED
             return replace(neural, covariance=covariance, reason=f"not refined: {points.reason}")
         if agree(points, neural):
-            return self._fused(scan, points, neural, None)
+            return _confirmed(points)
         return _instead(neural, points)
 
     def _points_from(self, scan: Scan, neural: Registration) -> Registration:
         return self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
-
-    def _fused(self, scan: Scan, points: Registration, neural: Registration, prior: Array | None) -> Registration:
-        return _mean(points, neural, prior, self._seen(scan))
 
     def _seen(self, scan: Scan) -> bool:
         return self.uses_images and bool(scan.images)
@@ -152,25 +143,13 @@ class FusedScanRegistration:
         return kept
 
 
-def _mean(points: Registration, neural: Registration, prior: Array | None, seen: bool) -> Registration:
-    """Both by their information, along the directions in which the network's is more, even with `_UNCLAIMED` errors.
+def _confirmed(points: Registration) -> Registration:
+    """The points, with which the network agrees.
 
-    Elsewhere its errors would count for more than it adds: the covariance of the points is too large. What it claims to
-    know and the points leave open altogether counts for nothing unless it has `seen` an image, and for `_TOGETHER`
-    then. The information of the prediction, prior (6, 6), holds the points but is no part of the uncertainty.
+    A mean of both would be worse: at the walls of a building, seen by 16 beams, its poses err by 0.2 to 0.4 m and claim
+    0.06 m; along a tunnel or a highway, where all that a scan shows looks alike, it is sure of standing still.
     """
-    of_points = np.linalg.inv(points.of_scene)
-    held = of_points if prior is None else of_points + prior
-    claimed, axes = eigh(np.linalg.inv(neural.of_scene + MAP_NOISE), of_points)
-    dual = of_points @ axes
-    ratio = 1 / (1 / claimed + (dual * (_UNCLAIMED @ dual)).sum(0))
-    known = np.minimum(ratio, (axes[3:] ** 2).sum(0) / _TOGETHER**2) if seen else 0 * ratio
-    ratio = np.where(claimed > _AT_MOST, known, ratio)
-    of_network = (dual * np.where(ratio < 1, 0, ratio)) @ dual.T
-    step = np.linalg.solve(held + of_network, of_network @ _difference(points, neural))
-    T = se3.orthonormalized(points.T_target_source @ se3.exp(step))
-    covariance = np.linalg.inv(of_points + of_network) + points.covariance - points.of_scene
-    return replace(points, T_target_source=T, covariance=covariance, method="refined")
+    return replace(points, method="refined")
 
 
 def _also_from(neural: Registration, prediction: Prediction) -> Prediction:

@@ -117,16 +117,16 @@ def test_a_network_that_knows_less_moves_nothing(case: Case) -> None:
     np.testing.assert_allclose(result.T_target_source, alone.T_target_source, atol=1e-9)
 
 
-def test_a_network_that_claims_a_little_more_than_few_points_moves_nothing(suburb_drive: Drive) -> None:
+def test_a_network_that_claims_more_than_few_points_moves_nothing(suburb_drive: Drive) -> None:
     """It claims 0.04 m, they 0.06: as at the walls of a building it is off by more than either."""
     case, frame = Case(suburb_drive), suburb_drive[0][5]
     case.scan = case.registration.prepare(replace(frame, points=frame.points[::100]), np.zeros(6))
-    result, error = case.register([0, 0, 0, 0.2, 0, 0])
+    result, _ = case.register([0, 0, 0, 0.2, 0, 0])
     assert (result.ok, result.method, result.reason) == (True, "refined", "")
-    alone, error_alone = case.register([0, 0, 0, 0, 0, 0], size=0)
-    assert alone.worst_sigma > 0.05
-    assert abs(error - error_alone) < 0.01
-    assert result.worst_sigma == pytest.approx(alone.worst_sigma, rel=0.05)
+    alone, error = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert error < 0.05 < alone.worst_sigma
+    np.testing.assert_allclose(result.T_target_source, alone.T_target_source, atol=1e-9)
+    np.testing.assert_allclose(result.covariance, alone.covariance, atol=1e-12)
 
 
 @pytest.mark.parametrize("silent", [{"ok": False}, {"size": 0}])
