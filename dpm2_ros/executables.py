@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,23 +22,23 @@ _MANAGED = "--lifecycle"
 def slam_node(arguments: Sequence[str] | None = None) -> int:
     """Odometry and, by default, the map; with `--lifecycle` a node that waits to be configured and activated."""
 
-    def work(arguments: Sequence[str]) -> int:
+    def kind() -> Callable[[bool], Any]:
         from dpm2_ros.slam_node import SlamNode
 
-        return _spin("slam_node", SlamNode, arguments)
+        return SlamNode
 
-    return _run(work, arguments)
+    return _run(partial(_spin, "slam_node", kind), arguments)
 
 
 def mapper_node(arguments: Sequence[str] | None = None) -> int:
     """The map apart; `--lifecycle` likewise."""
 
-    def work(arguments: Sequence[str]) -> int:
+    def kind() -> Callable[[bool], Any]:
         from dpm2_ros.mapper_node import MapperNode
 
-        return _spin("mapper_node", MapperNode, arguments)
+        return MapperNode
 
-    return _run(work, arguments)
+    return _run(partial(_spin, "mapper_node", kind), arguments)
 
 
 def bag_player(arguments: Sequence[str] | None = None) -> int:
@@ -51,20 +52,21 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
     return _run(work, arguments)
 
 
-def _spin(name: str, kind: Callable[[bool], Any], arguments: Sequence[str]) -> int:
+def _spin(name: str, kind: Callable[[], Callable[[bool], Any]], arguments: Sequence[str]) -> int:
+    """`kind` imports the class of the node."""
     if "--help" in arguments:
         print(f"usage: {name} [{_MANAGED}] [--ros-args -p NAME:=VALUE ...]; docs/parameters.md lists the parameters")
         return 0
     of_ros = [text for text in arguments if text != _MANAGED]
 
-    def make() -> Any:
+    def load() -> Callable[[], Any]:
         from rclpy.utilities import remove_ros_args
 
         if unknown := remove_ros_args(["", *of_ros])[1:]:
             raise UsageError(f"unknown argument {unknown[0]}; those of ROS, such as -p, come after --ros-args")
-        return kind(len(of_ros) < len(arguments))
+        return partial(kind(), len(of_ros) < len(arguments))
 
-    return spin_node(make, of_ros)
+    return spin_node(load, of_ros)
 
 
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:

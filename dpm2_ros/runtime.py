@@ -115,21 +115,24 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
         raise UsageError(f"{what}: {text}{hint}") from None
 
 
-def spin_node(make: Callable[[], Any], arguments: Sequence[str]) -> int:
+def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -> int:
     """Make a node, spin it until a signal comes, close it; nothing of that if one came before.
 
     Args:
-        make: returns a `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
+        load: imports the node, which takes seconds: wrong arguments are answered before. What it returns makes a
+            `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
         arguments: those of the process, without its name.
     """
-    if STOP.is_set():  # while it was imported: no map is opened, no network loaded
+    if STOP.is_set():
         return 0
-    sys.setswitchinterval(_SWITCH)
     ros_context(arguments)
     nodes = list[Any]()
     try:
-        nodes.append(make())
-        _spin(nodes[0])
+        make = load()
+        if not STOP.is_set():  # else no map is opened, no network loaded
+            sys.setswitchinterval(_SWITCH)
+            nodes.append(make())
+            _spin(nodes[0])
     finally:
         end_ros(*nodes)
     return 0
