@@ -243,6 +243,13 @@ def test_the_first_table_of_the_readme_is_what_was_measured() -> None:
     ours, theirs = re.findall(r"([\d.]+) m\b", cells["hard"])
     assert equals(ours, tenth["adaptive"]["rpe_trans_m"])
     assert equals(theirs, tenth["kiss-icp"]["rpe_trans_m"])
+    rides = {name: ride for name, ride in record("motion.json")["rides"].items() if not name.endswith(", car")}
+    assert cells["motion"].startswith("seven")
+    assert len(rides) == 7
+    span = re.findall(r"(\d+) to (\d+) mm", cells["motion"])
+    for method, (least, most) in zip(("dpm2", "kiss-icp"), span, strict=True):
+        errors = [1e3 * ride[method]["rpe_m"] for ride in rides.values()]
+        assert (round(min(errors)), round(max(errors))) == (int(least), int(most))
     gaps = [drive["adaptive"]["summary"]["all"] for drive in record("gaps.json")["drives"].values()]
     assert f"of {sum(drive['gaps'] for drive in gaps)} gaps" in cells["gaps"]
     assert sum(drive["silently_wrong"] for drive in gaps) == 0
