@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import isfinite
 from statistics import mean, stdev
 
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,6 @@ def paired_gain(without: Sequence[float], with_: Sequence[float], lower_is_bette
     sign = -1 if lower_is_better else 1
     gains = [sign * (b - a) / size for a, b in pairs]
     center, n = mean(gains), len(gains)
-    half = float(student.ppf(0.975, n - 1)) * stdev(gains) / n**0.5 if n > 1 else None
+    half = float(stdtrit(n - 1, 0.975)) * stdev(gains) / n**0.5 if n > 1 else None
     low, high = (None, None) if half is None else (center - half, center + half)
     return Gain(center, low, high, sum(gain > 0 for gain in gains), n)

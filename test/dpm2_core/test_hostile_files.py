@@ -27,7 +27,7 @@ from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.rows import array_bytes, with_crc
 
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x, '', '', '', '' FROM n"
-BOMB = zlib.compress(bytes(300_000_000), 9)
+BOMB = zlib.compress(bytes(300_000_000), 1)
 I4 = array_bytes(np.eye(4))
 NAN = array_bytes(np.full((4, 4), np.nan))
 

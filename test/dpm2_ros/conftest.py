@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,7 @@ def scan(T_world_lidar: Array) -> Points:
     return local[np.einsum("ij,ij->i", local[:, :3], local[:, :3]) < 40.0**2]
 
 
+@cache
 def _street() -> Points:
     rng = np.random.default_rng(0)
     x = np.arange(-60, 120, 0.35, dtype=np.float32)

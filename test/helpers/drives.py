@@ -19,13 +19,14 @@ Drive = tuple[list[Frame], Array]
 
 
 @cache
-def _straight(preset: PresetName) -> World:
+def straight(preset: PresetName) -> World:
+    """200 m of a straight road."""
     return build_world("straight", preset, seed=11, length=200.0)
 
 
 def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start: float = 2.0) -> Drive:
     """A drive at 10 Hz, from `start` s of the way on."""
-    world = _straight(preset)
+    world = straight(preset)
     lidar = Lidar(LidarConfig(columns=1024))
     rng = np.random.default_rng(0)
     poses = np.array([world.drive_pose(start + 0.1 * i) for i in range(frames)])

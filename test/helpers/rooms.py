@@ -36,13 +36,16 @@ def scan(T: Array, hull: Array, things: Array, seed: int) -> Points:
 
 def _distances(T: Array, hull: Array, things: Array) -> Array:
     """Of each ray."""
-    origin, rays = T[..., :3, 3], np.einsum("...ij,...j->...i", T[..., :3, :3], RAYS)
+    # (3, N), so that the largest of three is taken of whole rows.
+    origin = np.atleast_2d(T[..., :3, 3]).T
+    rays = np.ascontiguousarray(np.einsum("...ij,...j->...i", T[..., :3, :3], RAYS).T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.fmax((hull[0] - origin) / rays, (hull[1] - origin) / rays).min(1)
-        for low, high in things:
-            near, far = np.sort(np.stack([(low - origin) / rays, (high - origin) / rays]), 0)
-            entry = near.max(1)
-            distance = np.where((entry < far.min(1)) & (entry > 0), np.minimum(distance, entry), distance)
+        distance = np.fmax(*((corner[:, None] - origin) / rays for corner in hull)).min(0)
+        for thing in things:
+            low, high = ((corner[:, None] - origin) / rays for corner in thing)
+            entry = np.minimum(low, high).max(0)
+            hit = (entry < np.maximum(low, high).min(0)) & (entry > 0)
+            distance = np.where(hit, np.minimum(distance, entry), distance)
     return np.asarray(distance)
 
 

@@ -19,7 +19,7 @@ GROUND = [Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.T
 
 @pytest.mark.slow
 def test_equal_arguments_give_equal_worlds_and_other_seeds_others() -> None:
-    one, same, other = (build_world("random", "suburb", seed, 120) for seed in (5, 5, 6))
+    one, same, other = (build_world("random", "suburb", seed, 60) for seed in (5, 5, 6))
     for name in ("vertices", "faces", "label", "material", "color", "uv", "texture"):
         np.testing.assert_array_equal(getattr(one.static, name), getattr(same.static, name))
     for time in (0.0, 3.3):

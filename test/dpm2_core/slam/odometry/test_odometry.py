@@ -20,7 +20,7 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers import rooms
-from ....helpers.drives import Drive, make_drive
+from ....helpers.drives import Drive, make_drive, straight
 
 
 def run(frames: list[Frame], settings: SlamSettings | None = None) -> list[OdometryResult]:
@@ -111,7 +111,7 @@ def test_follows_a_drive_with_skewed_scans(skewed_drive: Drive) -> None:
 @pytest.mark.parametrize("stamp_at", [-0.05, 0.05])
 def test_a_bump_is_forgotten_whatever_moment_of_a_sweep_is_stamped(stamp_at: float) -> None:
     """Of clouds stamped at their start the odometry swung to and fro for ever after it, 0.15 m, as `tracking`."""
-    world, lidar = build_world("straight", "suburb", seed=11, length=200.0), Lidar(LidarConfig(columns=720))
+    world, lidar = straight("suburb"), Lidar(LidarConfig(columns=720))
     rng = np.random.default_rng(0)
 
     def pose(t: float) -> np.ndarray:
@@ -133,7 +133,7 @@ def test_a_bump_is_forgotten_whatever_moment_of_a_sweep_is_stamped(stamp_at: flo
 @pytest.mark.slow
 def test_a_turn_that_begins_bends_no_scan() -> None:
     """From rest to 90 deg/s in 0.3 s: scans were straightened by the motion before alone, 0.3 m off as `tracking`."""
-    world, lidar = build_world("straight", "suburb", seed=11, length=200.0), Lidar(LidarConfig(columns=720))
+    world, lidar = straight("suburb"), Lidar(LidarConfig(columns=720))
     rng = np.random.default_rng(0)
 
     def pose(t: float) -> np.ndarray:
@@ -452,7 +452,7 @@ def test_fast_start(suburb_drive: Drive) -> None:
 @pytest.mark.parametrize(("x", "yaw"), [(1.1, 7.0), (1.6, -9.0)])
 def test_a_drive_may_begin_in_a_curve(x: float, yaw: float) -> None:
     """Round a corner at 5 Hz (35 and 45 deg/s), from the first scan on."""
-    world, lidar, rng = build_world("straight", "suburb", seed=11, length=200.0), Lidar(), np.random.default_rng(0)
+    world, lidar, rng = straight("suburb"), Lidar(), np.random.default_rng(0)
     T_world_lidar = [world.drive_pose(2.0) @ se3.exp([0, 0, np.radians(yaw * i), x * i, 0, 0]) for i in range(4)]
     frames = [Frame(i * 2 * 10**8, lidar.scan(world, T, 0.0, rng).points) for i, T in enumerate(T_world_lidar)]
     tracked = run(frames)
