@@ -114,6 +114,7 @@ def merge(
         if len(described) > 1:
             raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
         named = list(zip(paths, maps, strict=True))
+        _say_what_is_there_twice(named)
         first = _joined_by_places(named, chosen) if align else maps[0]
         for (path, other), T in zip(named[1:], given, strict=False):
             if (off := off_by_satellites(first, other, T)) > _OFF:
@@ -122,6 +123,17 @@ def merge(
             first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
     Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)
+
+
+def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
+    """Drives that several of the maps hold, as of a file that is named twice, or of two that were continued apart."""
+    known = set[tuple[str, int, bytes]]()
+    for path, data in maps:
+        own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
+        if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
+            said = f"{count} of its {len(data)} keyframes are in a map before it, too: they will be there twice"
+            Console(stderr=True).print(f"{path}: {said}", highlight=False, soft_wrap=True)
+        known |= own
 
 
 def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:

@@ -280,8 +280,8 @@ def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:
 
 
 def trajectory(data: MapData) -> tuple[list[int], Array]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other."""
-    found = ways(data).values()
+    """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other, the earliest first."""
+    found = sorted(ways(data).values(), key=lambda way: way[0][0])
     return [stamp for stamps, _ in found for stamp in stamps], np.concatenate([data.poses[:0], *(T for _, T in found)])
 
 

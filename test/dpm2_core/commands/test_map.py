@@ -188,6 +188,35 @@ def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
     assert "a file already" in done.stderr
 
 
+def test_a_drive_that_both_maps_hold_is_said_to_be_there_twice(tmp_path: Path) -> None:
+    """But not that drives begin at the same time and pose, as those of a simulator do."""
+    one = ring(12)
+    moved = [replace(k, T_odom_kf=k.T_odom_kf @ se3.exp([0, 0, 0, 0.1 * n, 0, 0])) for n, k in enumerate(one.keyframes)]
+    save_as(one, tmp_path / "one")
+    save_as(replace(one, keyframes=moved), tmp_path / "other")
+    for second, said in (("one", True), ("other", False)):
+        both = tmp_path / f"with {second}"
+        done = dpm2("map", "merge", tmp_path / "one", tmp_path / second, "--out", both, "--transform", "10 0 0 90")
+        assert done.returncode == 0
+        assert ("12 of its 12 keyframes are in a map before it, too" in done.stderr) is said
+        assert len(loaded(both)) == 24
+
+
+def test_the_trajectory_of_several_drives_begins_with_the_earliest(tmp_path: Path) -> None:
+    early = ring(12)
+    late = replace(early, keyframes=[replace(k, stamp=k.stamp + 10**12) for k in early.keyframes])
+    save_as(late, tmp_path / "late")
+    save_as(early, tmp_path / "early")
+    both = tmp_path / "both"
+    assert (
+        dpm2("map", "merge", tmp_path / "late", tmp_path / "early", "--out", both, "--transform", "9 0 0 0").returncode
+        == 0
+    )
+    assert dpm2("map", "export", both, tmp_path / "a.tum").returncode == 0
+    keys = list(read_trajectory(tmp_path / "a.tum").keys)
+    assert keys == sorted(k.stamp for k in (*early.keyframes, *late.keyframes))
+
+
 def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Path, map_file: Path) -> None:
     plain, out = tmp_path / "plain.dpm2map", tmp_path / "both.dpm2map"
     plain.write_bytes(map_file.read_bytes())
