@@ -95,6 +95,17 @@ def test_the_figures_in_fog_are_those_of_the_record() -> None:
             assert marks.get(mark, "right") == figures["verdict"], (method, drive)
 
 
+def test_the_figures_of_sweeps_in_motion_are_those_of_the_record() -> None:
+    rides, seen = record("motion.json")["rides"], []
+    for name, *cells in rows("README.md", "| ride | dpm2 | dpm2, points alone | KISS-ICP |"):
+        seen.append(name)
+        for method, cell in zip(("dpm2", "dpm2 geometric", "kiss-icp"), cells, strict=True):
+            meters, degrees = cell.split(", ")
+            assert equals(meters, rides[name][method]["rpe_m"]), (name, method)
+            assert equals(degrees, rides[name][method]["rpe_deg"]), (name, method)
+    assert seen == list(rides)
+
+
 def test_the_figures_of_the_livox_are_those_of_the_record() -> None:
     methods = {"dpm2, `adaptive`": "adaptive", "dpm2, `neural`": "neural", "KISS-ICP": "kiss-icp"}
     (cases,) = record("livox.json")["drives"].values()

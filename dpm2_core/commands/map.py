@@ -64,7 +64,7 @@ def export(
             raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
         with MapStore.open(path) as store:
             count = write_tiles(_tied(_loaded(store), out), out, tiles)
-        Console(stderr=True).print(f"{out} written: {count} tiles", highlight=False, soft_wrap=True)
+        _note(f"{out} written: {count} tiles")
         return
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
     if kind not in _EXPORTS:
@@ -79,7 +79,7 @@ def export(
         raise UsageError(f"{out}: is the map itself")
     with MapStore.open(path) as store:
         write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
-    Console(stderr=True).print(f"{out} written", highlight=False, soft_wrap=True)
+    _note(f"{out} written")
 
 
 @app.command()
@@ -119,10 +119,15 @@ def merge(
         for (path, other), T in zip(named[1:], given, strict=False):
             if (off := off_by_satellites(first, other, T)) > _OFF:
                 doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
-                Console(stderr=True).print(f"{path}: {doubt}", highlight=False, soft_wrap=True)
+                _note(f"{path}: {doubt}")
             first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
-    Console(stderr=True).print(f"{out}: {len(first)} keyframes", highlight=False, soft_wrap=True)
+    _note(f"{out}: {len(first)} keyframes")
+
+
+def _note(text: str) -> None:
+    """To the user, not among the results."""
+    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
 
 
 def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
@@ -132,7 +137,7 @@ def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
         own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
         if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
             said = f"{count} of its {len(data)} keyframes are in a map before it, too: they will be there twice"
-            Console(stderr=True).print(f"{path}: {said}", highlight=False, soft_wrap=True)
+            _note(f"{path}: {said}")
         known |= own
 
 
@@ -155,7 +160,7 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
             raise Dpm2Error(f"{names}: nothing of the other maps was found there; --transform says where they are")
         (path, other), (T, loops) = waiting.pop(number), found
         first = optimized(merge_maps(first, other, T, loops), PoseGraph(settings.pose_graph))
-        Console(stderr=True).print(f"{path}: {len(loops)} loops to what came before", highlight=False, soft_wrap=True)
+        _note(f"{path}: {len(loops)} loops to what came before")
     return first
 
 
@@ -175,7 +180,7 @@ def prune(
         data = load_map(store)
         less = pruned(data, redundant_nodes(data, distance, angle))
         save_as(less, out)
-    Console(stderr=True).print(f"{out}: {len(less)} keyframes of {len(data)}", highlight=False, soft_wrap=True)
+    _note(f"{out}: {len(less)} keyframes of {len(data)}")
 
 
 @app.command()
@@ -246,8 +251,7 @@ def _say_without(out: Path, drive: tuple[str, int], count: int, total: int, reas
     """Say that keyframes of a drive (robot, session) are not in a file."""
     robot, session = drive
     name = f"session {session} of {robot}" if robot else f"session {session}"
-    info = f"{out}: without {count} of the {total} keyframes of {name}: {reason}"
-    Console(stderr=True).print(info, highlight=False, soft_wrap=True)
+    _note(f"{out}: without {count} of the {total} keyframes of {name}: {reason}")
 
 
 def _cloud(data: MapData, out: Path, voxel: float) -> Points:
