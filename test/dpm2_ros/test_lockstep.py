@@ -92,7 +92,7 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
 ) -> None:
     """Bit for bit, images included: here every pose is moved by the image of its cloud."""
     settings = ["slam.visual.sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
-    settings.append("slam.loops.descriptors=false")  # for which the network would be loaded
+    settings += ["slam.registration=geometric", "slam.loops.descriptors=false"]  # else the network would be loaded
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     environment = ros_environment(harness.node.context.get_domain_id())
