@@ -166,11 +166,19 @@ class Diagnostics:
         )
 
     def _odometry(self) -> DiagnosticStatus:
-        synchronizer, health, losses = self._inputs.synchronizer, self._health, self._inputs.losses
-        counts = synchronizer.counts
-        figures = health.figures() | {
+        absence, last = self._absence(), self._health.last
+        if absence is not None or last is None:
+            level, text = absence or (OK, "the first cloud is being processed")
+        else:
+            found = [_tracked(last), *self._beside_tracking(last)]
+            level, text = max(level for level, _ in found), "; ".join(text for _, text in found)
+        return self._status("odometry", level, text, self._odometry_figures())
+
+    def _odometry_figures(self) -> dict[str, str]:
+        synchronizer, counts = self._inputs.synchronizer, self._inputs.synchronizer.counts
+        figures = self._health.figures() | {
             "received": str(synchronizer.received),
-            "lost on the way": str(losses.count),
+            "lost on the way": str(self._inputs.losses.count),
             "dropped (queue full)": str(synchronizer.dropped),
             "rejected (stamp repeated)": str(counts[StampCheck.REPEATED]),
             "rejected (stamp out of order)": str(counts[StampCheck.OUT_OF_ORDER]),
@@ -182,46 +190,47 @@ class Diagnostics:
             figures |= {
                 name: f"{ns * 1e-9:.3f}" for name, ns in zip(("cloud stamp (s)", "clock (s)"), times, strict=True)
             }
-        silence, topic = _silence(synchronizer.last_arrival), self._inputs.calibration.points_topic
-        last = health.last
-        if silence is None and (problem := self._inputs.subscriptions[0].problem):
-            return self._status("odometry", ERROR, problem, figures)
-        if silence is None:
-            found = self._inputs.candidates()
-            hint = f"; point clouds are published on {', '.join(found)}" if found else ""
-            return self._status("odometry", STALE, f"no cloud on {topic} yet{hint}", figures)
-        if silence > SILENT:
-            return self._status("odometry", STALE, f"no cloud on {topic} for {silence:.0f} s", figures)
-        if last is None:
-            return self._status("odometry", OK, "the first cloud is being processed", figures)
-        level, text = _LEVEL[last.state], str(last.state)
-        if not last.registration.ok:
-            level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
-        if last.registration.reason:
-            text += f": {last.registration.reason}"
+        return figures
+
+    def _absence(self) -> tuple[bytes, str] | None:
+        """Why no cloud comes, in words, and how bad that is; None where one has come lately."""
+        topic, silence = self._inputs.calibration.points_topic, _silence(self._inputs.synchronizer.last_arrival)
+        if silence is not None:
+            return (STALE, f"no cloud on {topic} for {silence:.0f} s") if silence > SILENT else None
+        if problem := self._inputs.subscriptions[0].problem:
+            return ERROR, problem
+        found = self._inputs.candidates()
+        hint = f"; point clouds are published on {', '.join(found)}" if found else ""
+        return STALE, f"no cloud on {topic} yet{hint}"
+
+    def _beside_tracking(self, last: OdometryResult) -> list[tuple[bytes, str]]:
+        """What else is to be said of the last result and of the clouds since the last message, and how bad that is."""
+        topic, log, found = self._inputs.calibration.points_topic, self._node.get_logger(), list[tuple[bytes, str]]()
         if last.breaks:
-            text += f"; the way across {last.breaks} pause(s) is not known"
+            found.append((OK, f"the way across {last.breaks} pause(s) is not known"))
         if self.frame_problem:
-            level, text = ERROR, f"{text}; {self.frame_problem}"
+            found.append((ERROR, self.frame_problem))
         if self.tf_problem:
-            level, text = max(level, WARN), f"{text}; {self.tf_problem}"
+            found.append((WARN, self.tf_problem))
         if (count := self._node.count_publishers(topic)) > 1:
-            level, text = max(level, WARN), f"{text}; {count} publishers on {topic}: a drive has one LiDAR"
-        if synchronizer.dropped > self._dropped_before:
-            level, text = max(level, WARN), f"{text}; cannot keep up, {synchronizer.dropped} clouds dropped"
-        self._dropped_before = synchronizer.dropped
+            found.append((WARN, f"{count} publishers on {topic}: a drive has one LiDAR"))
+        if (dropped := self._inputs.synchronizer.dropped) > self._dropped_before:
+            found.append((WARN, f"cannot keep up, {dropped} clouds dropped"))
         if problem := self._frames.time_problem:
-            self._node.get_logger().warning(f"{topic}: {problem}", once=True)
-            text = f"{text}; {problem}"
+            log.warning(f"{topic}: {problem}", once=True)
+            found.append((OK, problem))
         if last.camera:
-            text += f"; {last.camera}"
+            found.append((OK, last.camera))
+        if last.times:
+            log.warning(f"{topic}: {last.times}", once=True)
+            found.append((WARN, last.times))
         if problem := self._clock_problem():
-            self._node.get_logger().warning(problem, once=True)
-            level, text = max(level, WARN), f"{text}; {problem}"
-        if losses.count > self._lost_before:
-            level, text = max(level, WARN), f"{text}; {losses.count} clouds lost on the way"
-        self._lost_before = losses.count
-        return self._status("odometry", level, text, figures)
+            log.warning(problem, once=True)
+            found.append((WARN, problem))
+        if (lost := self._inputs.losses.count) > self._lost_before:
+            found.append((WARN, f"{lost} clouds lost on the way"))
+        self._dropped_before, self._lost_before = dropped, lost
+        return found
 
     def _clock_problem(self) -> str:
         """How the clouds' clock is not that of the node, in words; empty where it is."""
@@ -308,6 +317,14 @@ class Diagnostics:
 
     def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
         return status(self._node, part, level, text, figures)
+
+
+def _tracked(last: OdometryResult) -> tuple[bytes, str]:
+    """The state and its reason, and how bad it is."""
+    level, registration = _LEVEL[last.state], last.registration
+    if not registration.ok:
+        level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
+    return level, f"{last.state}: {registration.reason}" if registration.reason else str(last.state)
 
 
 def _date(stamp: int) -> str:

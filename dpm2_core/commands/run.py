@@ -141,9 +141,9 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
         console.print(f"interrupted after {len(result)} frames; writing what there is", style="yellow")
     for note in source.notes:
         console.print(note, style="yellow", soft_wrap=True)
-    for problem, count in result.imu.items():
-        if problem != "used":
-            console.print(f"IMU: {problem} ({count} of {len(result)} frames)", style="yellow", soft_wrap=True)
+    of_imu = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
+    for problem, count in (of_imu | result.problems).items():
+        console.print(f"{problem} ({count} of {len(result)} frames)", style="yellow", soft_wrap=True)
     if not result.connected:
         console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
     for missing in result.save(out):

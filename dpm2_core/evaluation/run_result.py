@@ -55,6 +55,7 @@ class Result:
         ground_truth_name: what it was read from.
         recorder: the odometry's pose of every frame.
         imu: frames by why the IMU was of no use to them, "used" where it was; empty where there is none.
+        problems: frames by what was wrong with an image or with the times of their points, in words.
         frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
@@ -67,6 +68,7 @@ class Result:
     ground_truth_name: str
     recorder: TrajectoryRecorder = field(default_factory=TrajectoryRecorder)
     imu: Counter[str] = field(default_factory=Counter)
+    problems: Counter[str] = field(default_factory=Counter)
     frame_methods: list[str] = field(default_factory=list)
     frame_states: list[str] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=dict)
@@ -84,6 +86,7 @@ class Result:
         self.frame_states.append(str(tracked.state))
         if tracked.imu is not None:
             self.imu[tracked.imu or "used"] += 1
+        self.problems.update(problem for problem in (tracked.camera, tracked.times) if problem)
         for stage, time in tracked.seconds.items():
             self.seconds.setdefault(stage, []).append(time)
 
@@ -149,6 +152,7 @@ class Result:
             "states": dict(self.states),
             "breaks": self.recorder.breaks,
             **({"imu": dict(self.imu)} if self.imu else {}),
+            **({"problems": dict(self.problems)} if self.problems else {}),
             "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
         }
 

@@ -8,6 +8,9 @@ by half a sweep, and so the next velocity: of clouds stamped at their start such
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import replace
+
 import numpy as np
 
 from dpm2_core.frame import Array, Frame
@@ -16,6 +19,11 @@ from dpm2_core.geometry.deskew import measured_turn
 
 _CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
 _WHOLE = 1.2  # times as long as another one: that one is a part of a sweep
+_LATELY, _OFTEN = 50, 5  # of so many clouds so many: of raw ones, however they were moved, hardly any
+_WRONG = (
+    "the times of the points are not used, the motion contradicts them: clouds that are de-skewed already want "
+    "slam.preprocess.deskew: false"
+)
 
 
 class Sweep:
@@ -23,10 +31,19 @@ class Sweep:
 
     Attributes:
         middle: s after the stamp. span: s from the first to the last point; 0: not known.
+        problem: why the times of the points are not used, in words; empty where they are.
     """
 
     def __init__(self) -> None:
         self.middle = self.span = 0.0
+        self.problem = ""
+        self._contradicted = deque[bool](maxlen=_LATELY)
+
+    def judge(self, contradicted: bool) -> None:
+        """Whether the motion contradicts the times of the last cloud's points; if it does often, they are wrong."""
+        self._contradicted.append(contradicted)
+        if sum(self._contradicted) >= _OFTEN:
+            self.problem = _WRONG
 
     def look(self, frame: Frame) -> float:
         """How long after the stamp of the frame the middle of its sweep is, s."""
@@ -37,7 +54,10 @@ class Sweep:
         return self.middle
 
     def centered(self, frame: Frame) -> Frame:
-        """The frame, timed from the middle of its sweep."""
+        """The frame, timed from the middle of its sweep; without times that are wrong, as if taken at its stamp."""
+        if self.problem:
+            self.middle = self.span = 0.0
+            frame = replace(frame, time_offset=None)
         return frame.later(self.look(frame))
 
     def is_part(self, span: float) -> bool:

@@ -35,8 +35,9 @@ class PreprocessSettings(Settings):
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True
-    """Undo the motion during a sweep, as its points or, where there is one, an IMU (the rotation) show it; only
-    scans with a time per point can be."""
+    """Undo the motion during a sweep, as its points or, where there is one, an IMU (the rotation) show it. Only for
+    scans with a time per point; false for those that are de-skewed already. Times that the motion contradicts are not
+    used."""
 
     @model_validator(mode="after")
     def _ordered(self) -> PreprocessSettings:

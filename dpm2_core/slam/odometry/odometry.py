@@ -102,13 +102,7 @@ class Odometry:
         frame, twist = self._look(frame, motion.seconds + dt)
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
-        pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
-        T_predicted = self._begin_stretch(dt, frame.stepped) if pauses else motion.predicted(twist, dt)
-        match, dt = self._register(frame, scan, T_predicted, dt)
-        self._clock.correct(dt)
-        if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
-            frame = replace(frame, imu=None)
-        match = self._unbent(frame, match, twist, dt)
+        frame, match, dt = self._matched(frame, scan, twist, dt)
         clock.append(perf_counter())
         scan, registration = match.scan, match.result
         enclosed = is_enclosed(scan.points)
@@ -118,6 +112,7 @@ class Odometry:
             registration = registration.because(_ENCLOSED)
         self._update(match, dt)
         if registration.ok:
+            self._sweep.judge(match.contradicted)
             self._repeated.keep(motion.T, self._part.same)
         if registration.method == "first" and registration.ok and frame.time_offset is not None:
             self._first, self._first_sweep = frame, copy(self._sweep)
@@ -144,8 +139,19 @@ class Odometry:
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
+            times=self._sweep.problem,
             camera=IMAGE_PROBLEM if len(frame.images) < images else "",
         )
+
+    def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:
+        """A frame, prepared by a twist (6,), in the map; it, without an IMU that was of no use; and the period, s."""
+        pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
+        T_predicted = self._begin_stretch(dt, frame.stepped) if pauses else self._motion.predicted(twist, dt)
+        match, dt = self._register(frame, scan, T_predicted, dt)
+        self._clock.correct(dt)
+        if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
+            frame = replace(frame, imu=None)
+        return frame, self._unbent(frame, match, twist, dt), dt
 
     def _look(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
         """What an IMU and another odometry say of a frame, `seconds` after the last registered one: the frame with what

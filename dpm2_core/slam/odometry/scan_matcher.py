@@ -34,12 +34,14 @@ class Match(NamedTuple):
         scan: for which the result holds: the given one, or one that was prepared anew.
         result: the registration. led: another odometry has led to it.
         swept: the motion during the sweep, where the points have shown it.
+        contradicted: the points, with their times, show a motion that cannot follow from the one before.
     """
 
     scan: Scan
     result: Registration
     led: bool = False
     swept: Swept | None = None
+    contradicted: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,11 +85,14 @@ class ScanMatcher:
             return match
         seconds, T_predicted = motion.seconds + dt, motion.predicted(twist, dt)
         turn = measured_turn(frame)
-        beginning = motion.beginning(match.result.T_target_source, seconds, half)
+        beginning = without_imu = motion.beginning(match.result.T_target_source, seconds, half)
         if turn is not None and (measured := curve.fitted(turn, half)) is not None:
-            beginning = beginning.turning(measured)
+            beginning = without_imu.turning(measured)
         swept = self.registration.swept(match.scan, match.result, beginning)
         if swept is None:
+            alone = None if turn is None else self.registration.swept(match.scan, match.result, without_imu)
+            timed = match.result.ok and len(match.scan.times) > 0
+            match = match._replace(contradicted=timed and alone is None)
             return match if turn is not None else self._steadied(frame, match, twist, seconds, half)
         if _bent(match.scan, partial(way, motion=twist, turn=turn), swept.motion, half) > _BENT:
             scan = self.registration.prepare(frame, swept.motion)
