@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What README and cards say is what the records in benchmarks/ say; the modules that documents name exist."""
+"""What documents say was measured is what the records in benchmarks/ say; the modules that they name exist."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = (ROOT / "docs").glob("*.md")
-CARD = "dpm2_core/weights/small.md"
+CARD, MEASURED = "dpm2_core/weights/small.md", "docs/measured.md"
 METHODS = {
     "dpm2, odometry": "dpm2 without loops",
     "dpm2, with loops by descriptors": "dpm2",
@@ -55,7 +55,7 @@ def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
     heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"
     keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "t_err_percent", "final_drift_percent", "fps", "cpu_ms")
     drives, seen, drive = record("geometric.json")["drives"], [], ""
-    for cells in rows("README.md", heading):
+    for cells in rows(MEASURED, heading):
         drive = cells[0].partition(",")[0] or drive
         method = METHODS[cells[1]]
         seen.append((drive, method))
@@ -67,7 +67,7 @@ def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
 def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
     methods = {"adaptive": "adaptive", "neural": "neural", "points alone": "geometric", "KISS-ICP": "kiss-icp"}
     drives, drive, seen = record("hard.json")["drives"], "", 0
-    for cells in rows("README.md", "| drive | method | every frame | 3rd | 6th | 10th |"):
+    for cells in rows(MEASURED, "| drive | method | every frame | 3rd | 6th | 10th |"):
         drive = cells[0] or drive
         (method,) = (key for words, key in methods.items() if words in cells[1])
         for every, cell in zip((1, 3, 6, 10), cells[2:], strict=True):
@@ -85,7 +85,7 @@ def test_the_figures_in_fog_are_those_of_the_record() -> None:
         {"!": "silent", "?": "said"},
     )
     drives = record("hard.json")["drives"]
-    found = list(rows("README.md", "| in fog | 00 | 04 | city | suburb |"))
+    found = list(rows(MEASURED, "| in fog | 00 | 04 | city | suburb |"))
     assert len(found) == len(methods)
     for cells in found:
         (method,) = (key for words, key in methods.items() if words in cells[0])
@@ -97,7 +97,7 @@ def test_the_figures_in_fog_are_those_of_the_record() -> None:
 
 def test_the_figures_of_sweeps_in_motion_are_those_of_the_record() -> None:
     rides, seen = record("motion.json")["rides"], []
-    for name, *cells in rows("README.md", "| ride | dpm2 | dpm2, points alone | KISS-ICP |"):
+    for name, *cells in rows(MEASURED, "| ride | dpm2 | dpm2, points alone | KISS-ICP |"):
         seen.append(name)
         for method, cell in zip(("dpm2", "dpm2 geometric", "kiss-icp"), cells, strict=True):
             meters, degrees = cell.split(", ")
@@ -109,7 +109,7 @@ def test_the_figures_of_sweeps_in_motion_are_those_of_the_record() -> None:
 def test_the_figures_of_the_livox_are_those_of_the_record() -> None:
     methods = {"dpm2, `adaptive`": "adaptive", "dpm2, `neural`": "neural", "KISS-ICP": "kiss-icp"}
     (cases,) = record("livox.json")["drives"].values()
-    found = rows("README.md", "| one scan every | 0.5 s | 1.5 s | 3 s | 5 s |")
+    found = rows(MEASURED, "| one scan every | 0.5 s | 1.5 s | 3 s | 5 s |")
     assert [cells[0] for cells in found] == list(methods)
     for cells in found:
         for every, cell in zip((1, 3, 6, 10), cells[1:], strict=True):
@@ -125,16 +125,14 @@ def test_the_figures_of_the_livox_are_those_of_the_record() -> None:
 
 def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> None:
     pairs, seen = record("neural.json")["parts"]["image"]["pairs"], []
-    for cells in rows("README.md", "| | without camera | with | KISS-ICP |"):
+    for cells in rows(MEASURED, "| | without camera | with | KISS-ICP |"):
         of = pairs[f"{cells[0]}, up to 5 m"]
         for cell, method in zip(cells[1:], ("refined without camera", "refined with camera", "kiss-icp"), strict=True):
             assert equals(cell.strip("* m"), of[method]["median_m"]), (cells[0], method)
         seen.append(cells[0])
     assert len(seen) == len(pairs)
     roads = record("relocalise.json")["open_roads"]
-    found = re.findall(
-        r"with a picture (\d+) of (\d+) in the tunnel and (\d+) of (\d+) on the highway", text("README.md")
-    )
+    found = re.findall(r"with a picture (\d+) of (\d+) in the tunnel and (\d+) of (\d+) on the highway", text(MEASURED))
     of = [roads[road]["with images"] for road in ("tunnel", "highway")]
     assert [int(n) for n in found[0]] == [n for r in of for n in (round(r["right"] * r["visits"]), r["visits"])]
     assert [case["wrong"] for road in roads.values() for case in road.values() if isinstance(case, dict)] == [0] * 4
@@ -142,9 +140,9 @@ def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> 
 
 def test_the_times_of_a_relocalization_are_those_of_the_record() -> None:
     found = record("relocalise.json")
-    (times,) = re.findall(r"without any prior in ([\d.]+) s \(p95 ([\d.]+)", text("README.md"))
+    (times,) = re.findall(r"without any prior in ([\d.]+) s \(p95 ([\d.]+)", text(MEASURED))
     assert all(equals(time, found["seconds"][key]) for time, key in zip(times, ("p50", "p95"), strict=True))
-    (times,) = re.findall(r"cm in ([\d.]+) and ([\d.]+) s; the others are said", text("README.md"))
+    (times,) = re.findall(r"cm in ([\d.]+) and ([\d.]+) s; the others are said", text(MEASURED))
     of = [found["open_roads"][road]["with images"]["seconds"]["p50"] for road in ("tunnel", "highway")]
     assert all(map(equals, times, of))
 
@@ -153,16 +151,16 @@ def test_the_figures_of_loops_and_of_the_solver_are_those_of_the_records() -> No
     roads, graph = record("roads.json")["roads"].values(), record("pose-graph.json")
     kinds = [road["loops"][kind] for road in roads for kind in ("same", "reverse", "cross")]
     passed = r"(\d+) of the (\d+) places that are passed again are found, (\d+) of them"
-    (counts,) = re.findall(passed, text("README.md"))
+    (counts,) = re.findall(passed, text(MEASURED))
     reverse = sum(road["loops"]["reverse"]["found"] for road in roads)
     assert [int(n) for n in counts] == [sum(k["found"] for k in kinds), sum(k["revisits"] for k in kinds), reverse]
     assert sum(road["loops"]["wrong"] for road in roads) == 0
-    (shares,) = re.findall(r"error after loops is (\d+) to (\d+) % of that", text("README.md"))
+    (shares,) = re.findall(r"error after loops is (\d+) to (\d+) % of that", text(MEASURED))
     left = [100 * road["slam"]["ape_rmse_m"] / road["odometry"]["ape_rmse_m"] for road in roads]
     assert equals(shares[0], min(left))
     assert equals(shares[1], max(left))
     (written,) = re.findall(
-        r"in ([\d.]+) s: ATE ([\d.]+) m \(odometry ([\d.]+), plain least squares (\d+)\)", text("README.md")
+        r"in ([\d.]+) s: ATE ([\d.]+) m \(odometry ([\d.]+), plain least squares (\d+)\)", text(MEASURED)
     )
     most = graph["kitti_00"]["0.00"]
     of = (most["seconds"], most["ate_m"], most["odometry_ate_m"], most["least_squares"]["ate_m"])
@@ -173,7 +171,7 @@ def test_bold_is_what_is_best() -> None:
     """Of each drive and figure, and nothing else: the reader looks at what is bold."""
     heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"
     drives: dict[str, list[list[str]]] = {}
-    for cells in rows("README.md", heading):
+    for cells in rows(MEASURED, heading):
         drives.setdefault(cells[0] or list(drives)[-1], []).append(cells[2:])
     for table in drives.values():
         for number, column in enumerate(zip(*table, strict=True)):
@@ -184,7 +182,7 @@ def test_bold_is_what_is_best() -> None:
 
 def test_where_kiss_icp_is_ahead_is_said() -> None:
     names = {"t_err_percent": "KITTI's metric", "ape_rmse_m": "the ATE", "final_drift_percent": "the drift"}
-    (message,) = re.findall(r"KISS-ICP is slightly ahead in [^;]*;", text("README.md"))
+    (message,) = re.findall(r"KISS-ICP is slightly ahead in [^;]*;", text(MEASURED))
     drives = record("geometric.json")["drives"]
     for key in ("rpe_trans_m", "rpe_rot_deg", *names):
         ahead = [drive for drive, row in drives.items() if row["kiss-icp"][key] < row["dpm2 without loops"][key]]
@@ -210,7 +208,7 @@ def test_the_card_has_the_figures_of_the_odometry() -> None:
 
 def test_what_refined_adds_on_these_drives_is_said() -> None:
     said = r"`refined` is the points: its errors (?:equal|are) those of `geometric` to ([\d.]+) %"
-    (within,) = {float(number) for path in ("README.md", CARD) for number in re.findall(said, text(path))}
+    (within,) = {float(number) for path in (MEASURED, CARD) for number in re.findall(said, text(path))}
     assert within <= 0.5
     for methods in record("neural.json")["parts"]["odometry"]["drives"].values():
         for key in ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent"):
@@ -220,7 +218,7 @@ def test_what_refined_adds_on_these_drives_is_said() -> None:
 def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
     ratios = record("neural.json")["parts"]["corruption"]["error_ratio"]
     (ratio,) = (value for name, value in ratios.items() if "camera" in name)
-    (message,) = re.findall(r"every image black the shipped weights err ([\d.]+) times", text("README.md"))
+    (message,) = re.findall(r"every image black the shipped weights err ([\d.]+) times", text(MEASURED))
     assert equals(message, ratio)
     (message,) = re.findall(r"\| every image black[^|]*\| ([\d.]+) \|", text(CARD))
     assert equals(message, ratio)
@@ -270,3 +268,46 @@ def test_the_first_table_of_the_readme_is_what_was_measured() -> None:
     assert all(robot["keyframes_missing"] == 0 for robot in robots["robots"].values())
     crash = record("map.json")["crash"]
     assert (crash["kills"], crash["maps_that_open"], crash["most_keyframes_lost"]) == (50, 50, 0)
+
+
+def test_what_the_readme_says_in_short_is_what_was_measured() -> None:
+    geometric, hard, readme = record("geometric.json")["drives"], record("hard.json")["drives"], text("README.md")
+
+    def of(key: str, digits: int, method: str = "dpm2 without loops") -> str:
+        return " and ".join(f"{geometric[drive][method][key]:.{digits}f}" for drive in ("00", "04"))
+
+    kiss = {key: of(key, n, "kiss-icp") for key, n in (("rpe_trans_m", 3), ("cpu_ms", 0), ("t_err_percent", 2))}
+    assert f"errs by {of('rpe_trans_m', 3)} m (KISS-ICP: {kiss['rpe_trans_m']} m) and takes" in readme
+    assert f"takes {of('cpu_ms', 0)} ms of processor time ({kiss['cpu_ms']} ms)" in readme
+    assert f"KISS-ICP is slightly ahead: {kiss['t_err_percent']} %, ours {of('t_err_percent', 2)} %" in readme
+    tenth = [
+        " and ".join(f"{hard[drive]['every 10'][method]['rpe_trans_m']:.3f}" for drive in ("00", "04"))
+        for method in ("adaptive", "kiss-icp")
+    ]
+    assert f"10 and 14 m apart: {tenth[0]} m (KISS-ICP: {tenth[1]} m)" in readme
+    pairs = record("neural.json")["parts"]["image"]["pairs"]["tunnel, up to 5 m"]
+    tunnel = {name: figures["median_m"] for name, figures in pairs.items()}
+    said = f"{tunnel['refined with camera']:.3f} m with a camera, {tunnel['refined without camera']:.2f} m without"
+    assert f"{said} (KISS-ICP: {tunnel['kiss-icp']:.2f} m)" in readme
+    kinds = [road["loops"] for road in record("roads.json")["roads"].values()]
+    found, all_of_them = (
+        sum(loops[kind][count] for loops in kinds for kind in ("same", "reverse", "cross"))
+        for count in ("found", "revisits")
+    )
+    assert f"{found} of the {all_of_them} places that are passed again are found" in readme
+    means = {row["name"]: row["cells"]["mean"]["t_err_percent"] for row in record("kitti.json")["tables"][0]["rows"]}
+    beside = f"(KISS-SLAM: {means['kiss-slam']:.3f} %, KISS-ICP: {means['kiss-icp']:.3f} %)"
+    assert f"{means['dpm2 adaptive']:.3f} % {beside}" in readme
+    node = record("ros.json")["drives"]["04"]
+    latency = f"{node['latency_p50_ms']:.0f} ms from a cloud to its pose (p95 {node['latency_p95_ms']:.0f} ms)"
+    assert f"{latency}, and no cloud lost" in readme
+
+
+def test_the_latencies_are_those_of_the_record() -> None:
+    drives = record("ros.json")["drives"]
+    for number, cells in enumerate(rows(MEASURED, "| from cloud to `/dpm2/odom`, median (p95) | 04 | simulated |")):
+        for drive, cell in zip(("04", "00"), cells[1:], strict=True):
+            of = drives[drive + ("", ", IMU and all topics")[number]]
+            found = re.findall(r"\d+", cell)
+            assert all(map(equals, found, (of["latency_p50_ms"], of["latency_p95_ms"]))), (drive, cell)
+            assert of["dropped"] == 0
