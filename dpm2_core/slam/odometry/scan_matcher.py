@@ -128,9 +128,11 @@ class ScanMatcher:
             steady = self._without_imu(frame, motion.twist, dt)
             if fits_better(steady.result, result):
                 scan, result = steady.scan, steady.result
-        if result.ok or not self.settings.turns:
+        if result.ok:
             return Match(scan, result)
-        starts = turned_starts(T_predicted, self.settings.turns)
+        # What swings, as on legs, may have turned back.
+        back = se3.make(motion.T_registered[:3, :3], T_predicted[:3, 3])
+        starts = [back, *turned_starts(T_predicted, self.settings.turns)]
         turned = motion.gated(self.registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
         return Match(scan, turned if turned.ok else result)
 

@@ -54,6 +54,16 @@ def test_it_may_be_shaken(corridors: World, axis: int) -> None:
     assert off[:, 1].max() < 1
 
 
+@pytest.mark.parametrize(("axis", "degrees"), [(1, 18), (2, 12), (2, 15)])
+def test_what_swings_too_fast_is_found_again(axis: int, degrees: float) -> None:
+    """Outside, where no other headings are tried: scans were looked for where the turn led, ever farther away, and 90 to
+    161 degrees off in the end."""
+    world = build_world("straight", "suburb", seed=3, length=80.0)
+    off = errors(world, np.array(SHAKES)[:, None] * np.radians(degrees) * np.eye(6)[axis], "geometric")
+    assert off[-1, 1] < 0.5
+    assert off[-1, 0] < 0.05
+
+
 def test_the_network_is_not_outweighed_by_a_doubt_about_the_points(corridors: World) -> None:
     """0.3 m to both sides: half of the points fit beside their place. They were as uncertain as it is away, so that the
     network agreed with them."""
