@@ -192,7 +192,7 @@ class OdometryResult:
         comparison: with another odometry, where there is one and the frame was registered.
         imu: why the IMU was of no use, in words, empty where it was; None while there has been none.
         camera: why an image of the frame was left out, in words; empty where none was.
-        times: why the times of the points are doubted, in words; empty where they are not.
+        times: why the times of the points are not used, in words; empty where they are.
     """
 
     stamp: int

@@ -17,17 +17,17 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import String, UInt32MultiArray
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from dpm2_core.data.messages import decode_points, stamp_ns
+from dpm2_core.data.messages import cloud_fields, decode_points, stamp_ns
 from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.active_map import ActiveMap
-from dpm2_ros.conversions import EARLIER, cloud_to_msg, stamp_to_msg, transform_to_msg
+from dpm2_ros.conversions import EARLIER, cloud_to_msg, header, stamp_to_msg, transform_to_msg
 from dpm2_ros.keyframe_messages import BUDGET, received_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
@@ -499,6 +499,22 @@ def test_a_missing_extrinsic_rejects_the_images_and_says_so(rig: Callable[..., R
     status = r.status("camera", saying("no transform from 'camera' to 'lidar'"), since=0)
     assert status.level == DiagnosticStatus.ERROR
     assert "input.T_lidar_cam" in status.message
+
+
+def test_times_that_the_motion_contradicts_are_said(rig: Callable[..., Rig], drive: Any) -> None:
+    """Of a driver that de-skews its clouds and sends the times of their points all the same, on a robot that swings."""
+    r = rig("input.images:=false")
+    for n in range(14):
+        points = scan(se3.exp([0, 0, 0.12 * np.sin(max(n - 3, 0) * np.pi / 6), 0, 0, 0]))
+        columns = {name: points[:, i] for i, name in enumerate(("x", "y", "z"))}
+        around = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+        columns["t"] = (around * drive.period).astype(np.uint32)
+        message = PointCloud2(header=header(drive.stamp(n), "lidar"), **cloud_fields(columns, PointField))
+        before = len(r.odom)
+        r.lidar.publish(message)
+        r.wait(lambda before=before: len(r.odom) > before, f"the odometry of cloud {n}")
+    status = r.status("odometry", saying("slam.preprocess.deskew"))
+    assert status.level == DiagnosticStatus.WARN
 
 
 def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
