@@ -90,9 +90,10 @@ class ScanMatcher:
             beginning = without_imu.turning(measured)
         swept = self.registration.swept(match.scan, match.result, beginning)
         if swept is None:
-            alone = None if turn is None else self.registration.swept(match.scan, match.result, without_imu)
+            if beginning is not without_imu:  # is it the points that contradict it, or the IMU?
+                swept = self.registration.swept(match.scan, match.result, without_imu)
             timed = match.result.ok and len(match.scan.times) > 0
-            match = match._replace(contradicted=timed and alone is None)
+            match = match._replace(contradicted=timed and swept is None)
             return match if turn is not None else self._steadied(frame, match, twist, seconds, half)
         if _bent(match.scan, partial(way, motion=twist, turn=turn), swept.motion, half) > _BENT:
             scan = self.registration.prepare(frame, swept.motion)
@@ -130,9 +131,7 @@ class ScanMatcher:
                 scan, result = steady.scan, steady.result
         if result.ok:
             return Match(scan, result)
-        # What swings, as on legs, may have turned back.
-        back = se3.make(motion.T_registered[:3, :3], T_predicted[:3, 3])
-        starts = [back, *turned_starts(T_predicted, self.settings.turns)]
+        starts = turned_starts(T_predicted, motion.T_registered, self.settings.turns)
         turned = motion.gated(self.registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
         return Match(scan, turned if turned.ok else result)
 

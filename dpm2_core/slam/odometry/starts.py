@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the next scan may be while no motion is known, and where a robot may be that turned on the spot."""
+"""Where the next scan may be while no motion is known, and where it may be that is not where the motion leads."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ def starts_from_rest(T: Array, turns: float) -> Iterator[list[Array]]:
         yield [T @ se3.exp([0, 0, np.radians(yaw), x, 0, 0]) for x, yaw in motions]
 
 
-def turned_starts(T: Array, turns: float) -> Sequence[Array]:
-    """Poses (4, 4) at the place of `T` with other headings."""
-    return [T @ se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in _headings(turns)]
+def turned_starts(T: Array, T_before: Array, turns: float) -> Sequence[Array]:
+    """Poses (4, 4) at the place of `T`: with the attitude of `T_before`, as what swings may have turned back, and with
+    other headings, as of a robot that turned on the spot."""
+    back = se3.make(T_before[:3, :3], T[:3, 3])
+    return [back, *(T @ se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in _headings(turns))]
 
 
 def _headings(most: float) -> list[float]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +20,10 @@ def test_frames_with_a_bad_image_or_bad_times_are_counted(recording: Path) -> No
     """In timing.json; nothing is there where nothing was wrong."""
     source = open_source(recording, InputSettings(images=False))
     result = Result(source, Config(), make_mapper(SlamSettings()), None, "")
-
-    def add(index: int, camera: str = "", times: str = "") -> None:
-        found = Registration(np.eye(4), np.eye(6))
-        state = State.TRACKING
-        result.add(
-            OdometryResult(index, index, np.eye(4), np.eye(6), np.zeros(6), state, found, camera=camera, times=times)
-        )
-
-    add(0)
+    found = Registration(np.eye(4), np.eye(6))
+    good = OdometryResult(0, 0, np.eye(4), np.eye(6), np.zeros(6), State.TRACKING, found)
+    result.add(good)
     assert "problems" not in result.timing
-    add(1, camera="the same image")
-    add(2, camera="the same image", times="wrong times")
+    result.add(replace(good, camera="the same image"))
+    result.add(replace(good, camera="the same image", times="wrong times"))
     assert result.timing["problems"] == {"the same image": 2, "wrong times": 1}
