@@ -35,11 +35,11 @@ hypothesis.settings.load_profile("dpm2")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Markers, before -m selects: `ros` for all in test/dpm2_ros, `slow` for what unpacks the real excerpt."""
+    """Markers, before -m selects: `ros` for all in test/dpm2_ros, `slow` for the long and what unpacks real scans."""
     for item in items:
         if ROS in item.path.parents:
             item.add_marker("ros")
-        if "kitti_root" in getattr(item, "fixturenames", ()):
+        if "kitti_root" in getattr(item, "fixturenames", ()) or item.get_closest_marker("long"):
             item.add_marker("slow")
 
 

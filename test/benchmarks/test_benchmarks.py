@@ -143,8 +143,8 @@ def test_the_covariance_benchmark_has_a_ratio_for_each_method_and_kind_of_pair(s
     }
 
 
+@pytest.mark.long
 @pytest.mark.weights
-@pytest.mark.slow
 def test_the_tilt_benchmark_compares_level_axes_with_those_of_the_sensor(sequence: Path, tmp_path: Path) -> None:
     bench(["tilt"], source=[sequence], out=tmp_path, threads=1, pairs=1)
     tilts = json.loads((tmp_path / "tilt.json").read_text())["drives"][sequence.name]
@@ -239,7 +239,7 @@ def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path) -> 
     assert not list(tmp_path.glob("*.json"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     sequence: Path,
     tmp_path: Path,

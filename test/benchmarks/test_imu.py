@@ -12,7 +12,7 @@ from benchmarks.harness import Options
 from dpm2_core.sim.settings import LidarConfig
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(imu, "WORLDS", {"suburb": ("suburb", 912, 2.0, 90.0)})
     monkeypatch.setattr(imu, "FRAMES", 44)

@@ -11,7 +11,7 @@ from benchmarks import indoor, indoor_places
 from benchmarks.harness import Options
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_few_scans_of_a_building_are_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(indoor, "WORLDS", {"building": ("indoor", 900, 12)})
     monkeypatch.setattr(indoor, "LENGTHS", (0.5,))

@@ -14,7 +14,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.simulated_drive import RIDES
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ride_is_compared_from_scan_to_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motion, "WORLDS", {"suburb": ("suburb", 920, 16, ("walking",))})
     monkeypatch.setattr(motion, "FRAMES", 26)

@@ -30,7 +30,7 @@ def test_a_scan_finds_itself_on_a_short_road(tmp_path: Path) -> None:
     assert results["right"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.weights
 def test_where_every_place_looks_alike_there_is_no_answer_rather_than_a_wrong_one(
     monkeypatch: pytest.MonkeyPatch,

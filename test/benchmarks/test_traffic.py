@@ -14,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.sim.settings import LidarConfig
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_short_drive_is_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traffic, "PLACES", {"suburb": 20.0})
     monkeypatch.setattr(traffic, "FRAMES", 6)

@@ -13,7 +13,7 @@ from dpm2_core.data.packed import open_packed
 from dpm2_core.network.settings import preset
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_sensor_sees_the_same_places(tmp_path: Path) -> None:
     for name in ("16 beams", "rosette"):
         drive(tmp_path / name, "suburb", 5, SENSORS[name], preset("small"), scans=2)

@@ -28,7 +28,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_page_and_every_public_name_is_there(site: Path) -> None:
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert pages <= {path.stem for path in site.glob("*.html")}
@@ -40,7 +40,7 @@ def test_every_page_and_every_public_name_is_there(site: Path) -> None:
     assert "covariance" in api
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
     """Links lead elsewhere only where a reader follows them."""
     for page in site.rglob("*.html"):

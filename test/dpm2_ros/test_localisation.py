@@ -201,6 +201,7 @@ def test_hints_and_services_give_reasons(
     r.stand(3, lambda: again() and r.off(place(recording, 3)) < 0.2, "the robot in the map after the jump")
 
 
+@pytest.mark.long
 def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
     """One node makes a map, finds itself in it, and lets it grow by a session; each response has a message."""
     path = tmp_path / "own.dpm2map"
@@ -234,6 +235,7 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
     assert len({(k.robot, k.id) for k in data.keyframes}) == len(data)
 
 
+@pytest.mark.long
 def test_another_map_by_its_name_while_the_node_runs(
     robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:

@@ -132,6 +132,7 @@ def fleet(request: pytest.FixtureRequest, ros: Callable[..., Any], recording: Pa
     made.close()
 
 
+@pytest.mark.long
 @pytest.mark.weights
 @pytest.mark.timeout(900)  # two of those waits, and others
 @pytest.mark.parametrize("fleet", [GEOMETRIC[:2]], ids=["descriptors"], indirect=True)
@@ -190,6 +191,7 @@ def test_an_outage_costs_nothing(fleet: Fleet) -> None:
     fleet.received("red", 8, "second.dpm2map")
 
 
+@pytest.mark.long
 def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
     """While the mapper stood still: no keyframe is lost, its next start sends them first, then those of the drive that
     goes on. While the mapper listens: what has arrived is deleted from its disk. Each start is a session of its own in

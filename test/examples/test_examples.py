@@ -140,7 +140,7 @@ def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
     assert after[1] < before[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.weights
 def test_the_notebook(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of its cells run, and it is kept without what they print."""

@@ -32,7 +32,7 @@ def quick(packed: Path) -> RegistrationTrainingSettings:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_alternative_is_trained_and_measured_once(packed: Path, tmp_path: Path) -> None:
     """All of tables 3 and 4; a second call trains and measures nothing and finds the same figures."""
     training = quick(packed)

@@ -47,7 +47,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fusion_then_its_attention_maps(kitti: Path, weights: Path, tmp_path: Path) -> None:
     """Every variant starts from what fits it, the biased one from all; figure 7 needs no training of its own."""
     call = (kitti, "--out", tmp_path, "--weights", weights, *QUICK)
@@ -94,7 +94,7 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
     assert not any(figures_of(part, tmp_path / "out") for part in trainings(request))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reference_points(kitti: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every row; 4,096 points would take minutes here."""
     for name in ("uniform", "normal"):

@@ -38,7 +38,7 @@ from test.helpers.maps import ring
 NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: Path) -> None:
     """A drive of another town, a poisonous map and one that is not whole are named; what is added later is found."""
     pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")

@@ -140,7 +140,7 @@ def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have
     assert np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1).max() < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stopped_training_goes_on_to_the_same_weights(
     recording: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:

@@ -331,7 +331,7 @@ def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -
         settings_from(kind, {"start": "w", "data": {key: 3}})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_overfits_four_pairs_to_two_centimeters(packed: Path) -> None:
     """The same 4 pairs over and over are registered to 2 cm within 160 steps: nothing in the chain blocks the signal.
 
@@ -456,7 +456,7 @@ def test_overlap_keeps_what_the_weights_say_of_registration(
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_give_the_gradients_of_one(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """gloo on the CPU, this process and another: each its part of the places, the mean of the losses."""
     one = ranks.gradients(str(packed), tiny())
@@ -485,7 +485,7 @@ train_registration(RegistrationTrainingSettings.model_validate_json(settings), P
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_whole_loop_runs_under_torchrun(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """Two gloo ranks train, log, validate and save once; their losses are not those of one process' smaller batch."""
     script = tmp_path / "loop.py"

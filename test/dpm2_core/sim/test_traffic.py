@@ -33,7 +33,7 @@ def _share_moving(world: World) -> float:
     return float(np.mean(ratios))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
     assert 0.2 < _share_moving(dense) < 0.55
     usual = build_world("straight", "city", seed=2, length=200)

@@ -144,7 +144,7 @@ def test_a_keyframe_carries_its_thumbnail_into_the_map_file(
     assert slam.mapper.keyframes[0].thumbnail is None  # in the file, not in memory
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.weights
 def test_in_a_corridor_keyframes_keep_a_picture_by_which_the_robot_finds_itself(tmp_path: Path) -> None:
     """The whole way: images with the scans, a map file, and a later drive that begins somewhere along it."""

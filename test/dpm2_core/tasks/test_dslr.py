@@ -129,7 +129,7 @@ def test_slam_loss_reaches_the_dynamic_encoder_and_is_zero_for_the_truth(
     assert slam().item() < 1e-20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
     """The loss falls to less than half; stopped in its third stage and resumed it writes the same weights.
 

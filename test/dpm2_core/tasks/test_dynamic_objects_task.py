@@ -51,7 +51,7 @@ class Drive:
         return self.scans[index]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
     """From an IoU of chance to over 0.7, on scans that it has not seen; saved and loaded it says the same."""
     train, val = TaskScans([Drive(seed) for seed in range(4)]), TaskScans([Drive(99)])

@@ -169,7 +169,7 @@ def test_the_slam_loss_reaches_the_network(scans: list[Tensor]) -> None:
     assert float(slope.norm()) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_learns_slopes() -> None:
     """Up to 20 %, in 200 steps; of others 95 % of the variance are explained, and what stands on them is found."""
     torch.manual_seed(0)

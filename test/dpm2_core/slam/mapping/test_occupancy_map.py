@@ -226,6 +226,7 @@ def test_only_what_is_placed_is_drawn_and_taken_back_when_it_no_longer_is() -> N
     assert at(live.grid(), 51.55, 0.05) == OCCUPIED
 
 
+@pytest.mark.long
 def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
     """Counts of 16 bits had no walls after 16,384 keyframes at one place, and nothing after twice as many."""
     settings, count = OccupancySettings(reach=2.0, resolution=0.5), 16_500

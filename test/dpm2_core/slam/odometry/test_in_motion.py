@@ -100,6 +100,7 @@ def test_times_that_the_motion_contradicts_are_not_used() -> None:
         assert not any(result.times for result in tracked(name, 0.0, untouched, "geometric"))
 
 
+@pytest.mark.long
 def test_descriptors_show_no_motion_within_a_sweep_but_that_since_the_last() -> None:
     """By which their scans are prepared anew: by the one before alone the headings were off by 0.59 degrees."""
     off = np.sqrt((steps("walking", registration="neural") ** 2).mean(0))

@@ -138,7 +138,13 @@ def noisy(one: Frame) -> Frame:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("hangs", [lambda i: i > 5, lambda i: i > 5 and i % 2 == 0], ids=["for good", "every other"])
+@pytest.mark.parametrize(
+    "hangs",
+    [
+        pytest.param(lambda i: i > 5, id="for good"),
+        pytest.param(lambda i: i > 5 and i % 2 == 0, id="every other", marks=pytest.mark.long),
+    ],
+)
 def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -> None:
     """By a camera that hangs: it showed a halt, and the error was the way of the vehicle meanwhile, in `tracking`."""
     paint = random_paint(3)
