@@ -16,6 +16,7 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.part import Advance, Figures, Part
 from dpm2_core.frame import Array, Points
 from dpm2_core.slam.build import make_loops
+from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.lazy import LazySequence
 from dpm2_core.slam.store.map_data import MapData, borrowing, load_map
@@ -85,10 +86,12 @@ def verify(
         first, second = _excerpt(a, nodes[0], "one"), _excerpt(b, nodes[1], "other")
         clouds = _Clouds([first, second])
         keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])
+        parts = np.concatenate([first.parts, second.parts + len(first.data)])  # no part of the two in common
         tried: dict[tuple[int, int], Edge] = {}
         for count, keyframe in enumerate(second.keyframes, 1):
             keyframes.append(keyframe)
-            for loop in closer.close(keyframes, clouds, poses[: len(keyframes)]):
+            now = len(keyframes)
+            for loop in closer.close(keyframes, clouds, poses[:now], parts[:now]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
                     tried[ends] = loop.between(*ends)  # later: confirmed by another one
@@ -98,11 +101,12 @@ def verify(
 
 @dataclass(frozen=True, eq=False)
 class _Excerpt:
-    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), and all clouds."""
+    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), parts (N,), all clouds."""
 
     nodes: list[int]
     keyframes: list[Keyframe]
     poses: Array
+    parts: NDArray[np.integer]
     data: MapData
 
 
@@ -118,7 +122,7 @@ def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
         follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
         # Their own names keep the odometry of the two apart; a gap begins another stretch of it.
         keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if follows else None))
-    return _Excerpt(chosen, keyframes, data.poses[chosen], data)
+    return _Excerpt(chosen, keyframes, data.poses[chosen], parts_of(data)[chosen], data)
 
 
 class _Clouds(LazySequence[Points]):

@@ -169,6 +169,11 @@ class PoseGraph:
         """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
         return self._trajectories.part(node, self._loops)
 
+    @property
+    def parts(self) -> NDArray[np.intp]:
+        """(N,) the part of each node."""
+        return self._trajectories.parts(self._loops)
+
     def optimize(self) -> None:
         """Move the poses to the optimum and check the loops: here and now, or (`background`) in another process.
 
@@ -274,7 +279,7 @@ class PoseGraph:
 
     def _located(self) -> NDArray[np.bool_]:
         """(N,) whether each node is in the part whose place on Earth the georeference is."""
-        return self._trajectories.in_part(0, self._loops)
+        return self.parts == 0
 
     def _chosen(self) -> list[int]:
         """The fixes that count."""
@@ -307,7 +312,7 @@ class PoseGraph:
     def _move(self, part: int, T: Array) -> None:
         """All of a part to T @ T_map_kf."""
         T = se3.orthonormalized(T)  # by poses of this graph: else their rounding doubles with each part that is moved
-        for node in np.flatnonzero(self._trajectories.in_part(part, self._loops)):
+        for node in np.flatnonzero(self.parts == part):
             self._poses[node] = T @ self._poses[node]
         self._moved = True
 

@@ -49,9 +49,9 @@ class Trajectories:
         """The oldest trajectory that accepted loops tie a node's to: nodes of two parts have nothing in common."""
         return self._tied(loops)[self.of[node]]
 
-    def in_part(self, part: int, loops: Sequence[Edge]) -> NDArray[np.bool_]:
-        """(N,) whether each node is in that part."""
-        return np.array(self._tied(loops), np.intp)[self.of] == part
+    def parts(self, loops: Sequence[Edge]) -> NDArray[np.intp]:
+        """(N,) the part of each node."""
+        return np.array(self._tied(loops), np.intp)[self.of]
 
     def _tied(self, loops: Sequence[Edge]) -> list[int]:
         """The part of each trajectory."""

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -101,11 +102,14 @@ class LoopCloser:
         except Dpm2Error:  # too few points: no loop begins there, and none ends there
             return keyframe
 
-    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
+    def close(
+        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+    ) -> list[Edge]:
         """Try to close loops with the last keyframe.
 
         Args:
             keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
+            parts: (N,) the part of the map that each is in: where two of them are to each other is not known.
 
         Returns:
             Every candidate, accepted or rejected with its reason; and earlier ones of which it took a second to be
@@ -120,6 +124,7 @@ class LoopCloser:
         node = len(keyframes) - 1
         if self._room is not self._usual:
             self._settings, self._verifier = self._room if is_room(clouds[node]) else self._usual
+        self._consistency.update(poses, parts)
         since = self._path.since(node)
         tried, proposals = self._proposals(node, since, keyframes, poses)
         if self._settings.decided_by == "overlap":
@@ -136,8 +141,7 @@ class LoopCloser:
                 others += [self._verified(p, keyframes, clouds, poses) for p in unseen]
                 if objection := objection_of_others(loop.registration, [o.registration for o in others]):
                     return [*tried, *failed, loop.rejected(objection)]
-            T_expected = se3.inverse(poses[loop.from_node]) @ poses[node]
-            return tried + failed + self._consistency.check(loop, T_expected, self._settings.consistency)
+            return tried + failed + self._consistency.check(loop, self._settings.consistency)
         return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
 
     def _proposals(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -93,6 +94,10 @@ class OdometryChain:
         known = (self._segment[nodes] == self._segment[node]) & (doubt <= _SLACK + _DRIFT * meters)
         return np.where(known, meters, np.inf)
 
+    def of_one_drive(self, a: int, b: int) -> bool:
+        """Whether two nodes are in one segment, though the odometry between them may be unknown."""
+        return bool(self._segment[a] == self._segment[b])
+
     def T(self, a: int, b: int) -> Array:
         """T_a_b (4, 4) by odometry, of two nodes of one segment."""
         return se3.inverse(self._T_odom_kf[a]) @ self._T_odom_kf[b]
@@ -126,23 +131,30 @@ class Consistency:
         self._path = path
         self._accepted: list[Edge] = []
         self._waiting: list[Edge] = []
+        self._poses: Array = np.zeros((0, 4, 4))
+        self._parts: NDArray[np.integer] = np.zeros(0, np.intp)
+
+    def update(self, poses: Array, parts: NDArray[np.integer]) -> None:
+        """The map as it is now: (N, 4, 4) T_map_kf, and the part of it (N,) that each keyframe is in."""
+        self._poses, self._parts = poses, parts
 
     def is_first(self, loop: Edge, settings: ConsistencySettings) -> bool:
         """Whether nothing else says where its ends are to each other: no known odometry, and no accepted loop."""
         known = np.isfinite(self._path.between(loop.from_node, loop.to_node))
         return not known and not self._agrees_with_accepted(loop, settings)
 
-    def check(self, loop: Edge, T_expected: Array, settings: ConsistencySettings) -> list[Edge]:
+    def check(self, loop: Edge, settings: ConsistencySettings) -> list[Edge]:
         """Check a loop that the points have verified.
 
         Args:
-            T_expected: (4, 4) T_from_to as the map has it. settings: for what the loop's new end shows.
+            settings: for what the loop's new end shows.
 
         Returns:
             The loop, accepted or rejected with the reason; if accepted, with those that waited for one like it.
         """
         s = settings
         since = self._path.between(loop.from_node, loop.to_node)
+        T_expected = self._T_in_map(loop.from_node, loop.to_node)
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
@@ -167,12 +179,21 @@ class Consistency:
 
     def _agree(self, one: Edge, other: Edge, s: ConsistencySettings) -> bool:
         """Whether the circle through both closes."""
-        path = self._path
-        there = path.between(one.from_node, other.from_node)
-        back = path.between(one.to_node, other.to_node)
+        there, T_there = self._way(one.from_node, other.from_node)
+        back, T_back = self._way(other.to_node, one.to_node)
         if one.to_node == other.to_node or max(there, back) > s.reach:
             return False
-        around = path.T(one.from_node, other.from_node) @ other.T_from_to @ path.T(other.to_node, one.to_node)
-        meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ around)
+        meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ T_there @ other.T_from_to @ T_back)
         allowed = s.circle + s.circle_drift * (there + back)
         return meters <= allowed and degrees <= 3 * allowed
+
+    def _way(self, a: int, b: int) -> tuple[float, Array]:
+        """Meters and T_a_b (4, 4) from one node to another: by odometry; of two drives through the map, if it has them
+        in one part; else inf."""
+        if self._path.of_one_drive(a, b):
+            return self._path.between(a, b), self._path.T(a, b)
+        T = self._T_in_map(a, b)
+        return float(np.linalg.norm(T[:3, 3])) if self._parts[a] == self._parts[b] else np.inf, T
+
+    def _T_in_map(self, a: int, b: int) -> Array:
+        return se3.inverse(self._poses[a]) @ self._poses[b]

@@ -129,7 +129,7 @@ class Mapper:
     @property
     def placed(self) -> NDArray[np.bool_]:
         """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
-        parts = np.array([self._graph.part(node) for node in range(len(self.keyframes))], np.intp)
+        parts = self._graph.parts
         return np.asarray(parts == parts[:1])
 
     @property
@@ -316,7 +316,8 @@ class Mapper:
 
         `due`: solve it in any case.
         """
-        tried = [self._tied(loop) for loop in self._closer.close(self.keyframes, self._clouds, self.poses)]
+        found = self._closer.close(self.keyframes, self._clouds, self.poses, self._graph.parts)
+        tried = [self._tied(loop) for loop in found]
         self.loops += tried
         self._optimize(due or any(loop.ok for loop in tried))
 

@@ -13,7 +13,7 @@ from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.mapping.parts import frame_of
+from dpm2_core.slam.mapping.parts import frame_of, parts_of
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
@@ -90,13 +90,14 @@ def loops_by(closer: LoopCloser) -> FindLoops:
 
     def find(a: MapData, b: MapData) -> list[Edge]:
         both = merge_maps(a, b, np.eye(4))
-        keyframes = list(a.keyframes)
+        keyframes, parts = list(a.keyframes), parts_of(both)
         out = []
         for node, keyframe in enumerate(b.keyframes):
             # Another name keeps the odometry of the two apart.
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             clouds: Sequence[Points] = both.clouds
-            for loop in closer.close(keyframes, clouds, both.poses[: len(keyframes)]):
+            count = len(keyframes)
+            for loop in closer.close(keyframes, clouds, both.poses[:count], parts[:count]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
                     out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out

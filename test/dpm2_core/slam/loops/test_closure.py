@@ -33,6 +33,7 @@ from dpm2_core.slam.registration.icp import GeometricSettings
 
 FIRM, OFF = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.diag([0.01] * 3 + [0.7] * 3) ** 2
 STREET = np.arange(40.0, 105.0, 5.0)
+ONE_PART = np.zeros(100, np.intp)  # all keyframes are tied together
 
 
 @cache
@@ -77,7 +78,7 @@ def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings:
         edge = Registration(np.eye(4), OFF if i == len(STREET) else FIRM, 1.0, 0.1, "test") if i else None
         clouds.append(scan(*place))
         keyframes.append(Keyframe(i, i, i, odometry[i], clouds[-1], edge, "", described(*place)))
-        loops += search.close(keyframes, clouds, odometry[: i + 1])
+        loops += search.close(keyframes, clouds, odometry[: i + 1], ONE_PART[: i + 1])
     return loops, truth
 
 
@@ -145,7 +146,7 @@ def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -
         clouds.append(cloud)
         known = None if elsewhere else described(STREET[i], 0.0, 0.0)
         keyframes.append(search.described(Keyframe(i, i, i, T, cloud, edge, "", known)))
-        loops = search.close(keyframes, clouds, poses[: i + 1]) if elsewhere else loops
+        loops = search.close(keyframes, clouds, poses[: i + 1], ONE_PART[: i + 1]) if elsewhere else loops
     assert loops
     assert all(not loop.registration.ok and loop.registration.reason for loop in loops)
 
@@ -169,7 +170,7 @@ def test_a_loop_is_clear_among_all_stretches_of_a_broken_drive(away: float, clos
         edge = Registration(np.eye(4), 100 * np.eye(6) if broken else FIRM, 1.0, 0.1, "test") if i else None
         keyframes.append(Keyframe(i, i, i, poses[i], clouds[i], edge, "", described(*place)))
         if i >= 2 * len(STREET):
-            loops += search.close(keyframes, clouds, poses[: i + 1])
+            loops += search.close(keyframes, clouds, poses[: i + 1], ONE_PART[: i + 1])
     assert any(loop.ok for loop in loops) == closed
     alike = [loop for loop in loops if loop.registration.reason.startswith("two places of the map fit alike")]
     assert bool(alike) != closed
@@ -207,7 +208,7 @@ def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
         for i in range(len(at))
     ]
     assert search.described(keyframes[0]).descriptors is None
-    (loop,) = search.close(keyframes, clouds, poses)
+    (loop,) = search.close(keyframes, clouds, poses, ONE_PART[: len(poses)])
     assert loop.registration.ok, loop.registration.reason
     assert errors([loop], truth)[0] < 0.1
 
@@ -216,7 +217,7 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
     search = closer(enabled=False)
     tiny = Keyframe(0, 0, 0, np.eye(4), np.zeros((3, 4), np.float32), None)
     assert search.described(tiny).descriptors is None
-    assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2)) == []
+    assert search.close([tiny, tiny], [tiny.cloud] * 2, np.array([np.eye(4)] * 2), ONE_PART[:2]) == []
 
 
 @pytest.mark.slow
@@ -264,19 +265,21 @@ def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.M
     assert "the overlap head of these weights is not trained" in {loop.registration.reason for loop in loops}
 
 
-def joined(*parts: tuple[float, float]) -> tuple[list[Edge], Array]:
+def joined(*ways: tuple[float, float]) -> tuple[list[Edge], Array]:
     """Loops between two robots in a car park that looks alike everywhere, each of which drives a part of one way, m."""
     world = build_world("loop", "car_park", seed=902, length=120.0)
     lidar = Lidar(real_sensor(LidarConfig(beams=16, height=0.8)))
     search, keyframes, clouds, truth, loops = closer(), list[Keyframe](), list[Points](), list[Array](), list[Edge]()
-    for robot, (start, stop) in zip("ab", parts, strict=True):
+    parts = list[int]()
+    for robot, (start, stop) in zip("ab", ways, strict=True):
         for s in np.arange(start, stop, 4.0):
             truth.append(world.pose_at(s, height=0.8))
             points = lidar.scan(world, truth[-1], 0.5 * s, np.random.default_rng(int(s))).points
             clouds.append(points[voxel_first(points, 0.3, far=40.0)])
             edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if s > start else None
             keyframes.append(search.described(Keyframe(len(truth), 0, 0, truth[-1], clouds[-1], edge, robot)))
-            loops += search.close(keyframes, clouds, np.array(truth))
+            parts.append(int(robot == "b"))
+            loops += search.close(keyframes, clouds, np.array(truth), np.array(parts))
     return loops, np.array(truth)
 
 

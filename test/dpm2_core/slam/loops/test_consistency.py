@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -43,8 +45,16 @@ def expected(path: OdometryChain, a: int, b: int) -> Array:
     return path.T(a, b)
 
 
-def checked_by(consistency: Consistency, candidate: Edge, T_expected: np.ndarray) -> list[Edge]:
-    return consistency.check(candidate, T_expected, ConsistencySettings())
+def knowing(path: OdometryChain, parts: Sequence[int] | None = None) -> Consistency:
+    """With a map of all nodes, tied together or not, by the odometry that begins at the first one."""
+    consistency = Consistency(path)
+    poses = np.array([path.T(0, node) for node in range(len(path))])
+    consistency.update(poses, np.zeros(len(path), np.intp) if parts is None else np.array(parts))
+    return consistency
+
+
+def checked_by(consistency: Consistency, candidate: Edge) -> list[Edge]:
+    return consistency.check(candidate, ConsistencySettings())
 
 
 def test_path_lengths_are_known_within_a_segment_alone() -> None:
@@ -71,41 +81,41 @@ def test_a_stretch_that_is_uncertain_by_less_than_the_drift_does_not_part_a_long
     assert path.between(90, 110) == np.inf  # 100 m of path may drift by 3 m: what lies on both sides is not known
     assert path.between(0, 99) == 495
     assert path.between(104, 200) == 480
-    assert Consistency(path).is_first(loop(0, 200, np.eye(4)), ConsistencySettings()) is not known
+    assert knowing(path).is_first(loop(0, 200, np.eye(4)), ConsistencySettings()) is not known
 
 
 def test_a_loop_that_agrees_with_the_odometry_needs_no_other() -> None:
     path = straight()
     T = expected(path, 0, 100)
-    (checked,) = checked_by(Consistency(path), loop(0, 100, T @ pose(1.5)), T)
+    (checked,) = checked_by(knowing(path), loop(0, 100, T @ pose(1.5)))
     assert checked.ok
 
 
 def test_a_loop_beyond_all_drift_is_rejected() -> None:
     path = straight()
-    consistency = Consistency(path)
+    consistency = knowing(path)
     T = expected(path, 0, 100)
     for off in (pose(12.0), pose(0, 0, np.radians(14))):  # 500 m of path allow 11 m and 13 degrees
-        (checked,) = checked_by(consistency, loop(0, 100, T @ off), T)
+        (checked,) = checked_by(consistency, loop(0, 100, T @ off))
         assert not checked.ok
         assert "from the odometry" in checked.registration.reason
     # what was rejected confirms nothing
-    (checked,) = checked_by(consistency, loop(1, 99, expected(path, 1, 99) @ pose(11.9)), expected(path, 1, 99))
+    (checked,) = checked_by(consistency, loop(1, 99, expected(path, 1, 99) @ pose(11.9)))
     assert not checked.ok
 
 
 def test_two_loops_that_agree_are_accepted_together() -> None:
     path, drift = straight(), BENT
-    consistency = Consistency(path)
+    consistency = knowing(path)
     first = loop(0, 99, drift @ expected(path, 0, 99))
-    (waiting,) = checked_by(consistency, first, expected(path, 0, 99))
+    (waiting,) = checked_by(consistency, first)
     assert not waiting.ok
     assert "waits" in waiting.registration.reason
-    accepted = checked_by(consistency, loop(1, 100, drift @ expected(path, 1, 100)), expected(path, 1, 100))
+    accepted = checked_by(consistency, loop(1, 100, drift @ expected(path, 1, 100)))
     assert [(a.from_node, a.to_node) for a in accepted] == [(1, 100), (0, 99)]
     assert all(a.ok for a in accepted)
     # a third one finds the two accepted, and none is accepted twice
-    third = checked_by(consistency, loop(2, 98, drift @ expected(path, 2, 98)), expected(path, 2, 98))
+    third = checked_by(consistency, loop(2, 98, drift @ expected(path, 2, 98)))
     assert [(a.from_node, a.to_node) for a in third] == [(2, 98)]
 
 
@@ -116,9 +126,9 @@ def test_two_loops_that_agree_are_accepted_together() -> None:
 )
 def test_a_loop_is_not_confirmed_by(a: int, b: int, off: Array) -> None:
     path = straight()
-    consistency = Consistency(path)
-    checked_by(consistency, loop(0, 99, BENT @ expected(path, 0, 99)), expected(path, 0, 99))
-    (checked,) = checked_by(consistency, loop(a, b, off @ expected(path, a, b)), expected(path, a, b))
+    consistency = knowing(path)
+    checked_by(consistency, loop(0, 99, BENT @ expected(path, 0, 99)))
+    (checked,) = checked_by(consistency, loop(a, b, off @ expected(path, a, b)))
     assert "waits" in checked.registration.reason
 
 
@@ -131,37 +141,63 @@ def test_storeys_that_look_alike_are_not_joined() -> None:
         turn = 2 * np.pi * node / lap
         T = se3.exp(np.array([0, 0, 0, 16 * np.sin(turn), -16 * np.cos(turn), height(node)]))
         path.append(keyframe(node, T @ se3.exp(np.array([0, 0, turn, 0, 0, 0])), None if node == 0 else FIRM))
-    consistency = Consistency(path)
+    consistency = knowing(path)
     for node in range(lap, lap + 4):
         T = path.T(node - lap, node)
         T_alike = T.copy()
         T_alike[2, 3] = 0.0
-        (checked,) = checked_by(consistency, loop(node - lap, node, T_alike), T)
+        (checked,) = checked_by(consistency, loop(node - lap, node, T_alike))
         assert "standard deviations from the odometry" in checked.registration.reason
+
+
+def drives(names: str) -> OdometryChain:
+    """Of robots, each of them 20 keyframes straight on in a frame of its own."""
+    path = OdometryChain()
+    for robot in names:
+        for node in range(20):
+            path.append(keyframe(node, pose(5.0 * node), FIRM if node else None, robot))
+    return path
 
 
 def test_between_robots_it_always_takes_two() -> None:
     """Nothing is known of where they are to each other, however well a first loop happens to fit the map."""
-    path = OdometryChain()
-    for node in range(40):
-        robot = "a" if node < 20 else "b"
-        path.append(keyframe(node, pose(5.0 * (node % 20)), None if node % 20 == 0 else FIRM, robot))
-    consistency = Consistency(path)
+    consistency = knowing(drives("ab"), [0] * 20 + [1] * 20)
     T = pose(0.5)
-    (first,) = checked_by(consistency, loop(3, 23, T), np.eye(4))
+    (first,) = checked_by(consistency, loop(3, 23, T))
     assert not first.ok
-    assert len(checked_by(consistency, loop(4, 24, T), np.eye(4))) == 2
+    assert len(checked_by(consistency, loop(4, 24, T))) == 2
+
+
+@pytest.mark.parametrize(
+    ("parts", "off", "agree"),
+    [("001", 0.0, True), ("012", 0.0, False), ("001", 3.0, False)],
+    ids=["tied", "not tied", "elsewhere"],
+)
+def test_loops_to_drives_that_others_have_tied_agree_through_the_map(parts: str, off: float, agree: bool) -> None:
+    """As in a place of many short drives, where each loop may lead to another one of them."""
+    consistency = knowing(drives("abc"), np.repeat([int(part) for part in parts], 20).tolist())
+    ahead = 12.0  # where the third began, 12 m on the way of the first two
+    (first,) = checked_by(consistency, loop(3, 41, pose(ahead + 5.0 - 15.0)))
+    assert not first.ok
+    found = checked_by(consistency, loop(26, 43, pose(ahead + 15.0 - 30.0 + off)))
+    assert [one.ok for one in found] == ([True, True] if agree else [False])
+
+
+def test_loops_of_drives_that_are_tied_agree_through_the_map() -> None:
+    """The first waits; one of another drive that begins beside it says the same, and both place them."""
+    consistency = knowing(drives("abc"), [0] * 20 + [1] * 40)
+    (first,) = checked_by(consistency, loop(3, 22, pose(12.0 + 10.0 - 15.0)))
+    assert not first.ok
+    assert len(checked_by(consistency, loop(4, 43, pose(12.0 + 15.0 - 20.0)))) == 2
 
 
 def test_a_loop_is_the_first_where_neither_odometry_nor_another_loop_ties_its_ends() -> None:
-    path, settings, T = straight(), ConsistencySettings(), pose(0.5)
-    consistency = Consistency(path)
-    assert not consistency.is_first(loop(10, 40, pose(3.0) @ expected(path, 10, 40)), settings)
-    for node in range(101, 121):
-        path.append(keyframe(node, pose(5.0 * (node - 101)), None if node == 101 else FIRM, "b"))
-    assert consistency.is_first(loop(3, 104, T), settings)
-    consistency.check(loop(3, 104, T), np.eye(4), settings)
-    assert consistency.is_first(loop(4, 105, T), settings)  # the other one still waits
-    consistency.check(loop(4, 105, T), np.eye(4), settings)
-    assert not consistency.is_first(loop(5, 106, T), settings)
-    assert consistency.is_first(loop(5, 106, pose(9.0)), settings)
+    path, settings, T = drives("ab"), ConsistencySettings(), pose(0.5)
+    consistency = knowing(path, [0] * 20 + [1] * 20)
+    assert not consistency.is_first(loop(2, 18, pose(3.0) @ expected(path, 2, 18)), settings)
+    assert consistency.is_first(loop(3, 23, T), settings)
+    consistency.check(loop(3, 23, T), settings)
+    assert consistency.is_first(loop(4, 24, T), settings)  # the other one still waits
+    consistency.check(loop(4, 24, T), settings)
+    assert not consistency.is_first(loop(5, 25, T), settings)
+    assert consistency.is_first(loop(5, 25, pose(9.0)), settings)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Edge, Keyframe, Registration
@@ -39,7 +40,9 @@ class KnownLoops(LoopCloser):
     def described(self, keyframe: Keyframe) -> Keyframe:
         return keyframe
 
-    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
+    def close(
+        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+    ) -> list[Edge]:
         node = len(keyframes) - 1
         if node < LAP:
             return []
@@ -87,13 +90,15 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
 class OneWrong(KnownLoops):
     """One of its loops is far off, and is accepted all the same."""
 
-    def close(self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> list[Edge]:
+    def close(
+        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+    ) -> list[Edge]:
         wrong = se3.exp([0, 0, 0.3, 9.0, 0, 0])
         return [
             replace(loop, registration=replace(loop.registration, T_target_source=loop.T_from_to @ wrong))
             if loop.to_node == WRONG
             else loop
-            for loop in super().close(keyframes, clouds, poses)
+            for loop in super().close(keyframes, clouds, poses, parts)
         ]
 
 
