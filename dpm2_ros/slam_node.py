@@ -26,12 +26,13 @@ from dpm2_core.slam.system import Slam
 from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.conversions import BodyMotion, keyframe_to_base, odometry_to_msg
 from dpm2_ros.display import Projection
-from dpm2_ros.health import Diagnostics, Health
+from dpm2_ros.health import Health
 from dpm2_ros.keyframe_sender import KeyframeSender, weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.requests import Requests
 from dpm2_ros.runtime import lower_priority
+from dpm2_ros.slam_diagnostics import Diagnostics
 from dpm2_ros.state import StatePublisher
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import Bundle

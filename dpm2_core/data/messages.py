@@ -6,48 +6,22 @@ Nothing here imports ROS. Message fields are those of sensor_msgs; `transforms.T
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable, Collection, Mapping
 from types import SimpleNamespace
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.point_times import TimeUnit, time_field_of, time_offsets
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
-
-TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
 # sensor_msgs/PointField datatype to numpy, without byte order.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity", "reflectance", "signal")
-# Without underscores and unit: time_stamp is timestamp, time_offset_ns is timeoffset.
-_TIME_NAMES = (
-    "t",
-    "time",
-    "timestamp",
-    "offsettime",
-    "timeoffset",
-    "pointtime",
-    "pointtimeoffset",
-    "relativetime",
-    "deltatime",
-    "reltime",
-    "ts",
-    "dt",
-    "stamp",
-    "times",
-    "timestamps",
-)
-_TIME_NAME = re.compile(r"(?P<name>[a-z_]+?)(?:_?(?P<unit>ns|us|ms|s)|_(?P<long>nsec|usec|msec|sec))?")
 _XYZ = ("x", "y", "z")
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# No sweep is longer, no useful one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
-_LONGEST_SCAN = 2.0
-
-
 _LARGEST_POINT = 1 << 16
 
 
@@ -167,17 +141,19 @@ def decode_points(
     if time_field and time_field not in available:
         raise MessageError(f"PointCloud2 has no time field {time_field}; fields: {', '.join(available)}")
     intensity = _usual(available, _INTENSITY_NAMES)
-    time, unit = _usual_time(available) if time_field is None else (time_field, "auto")
+    time, unit = time_field_of(available) if time_field is None else (time_field, "auto")
     if time_unit == "auto":
         time_unit = unit
     view = cloud_view(msg, [name for name in (*_XYZ, intensity, time) if name])
     points = _points(view, intensity, intensity_max)
-    return points, _time_offset(view[time], points, stamp_ns(msg.header), time_unit) if time else None
+    if not time:
+        return points, None
+    return points, time_offsets(_first(view[time]), returned(points), stamp_ns(msg.header), time_unit)
 
 
 def why_untimed(msg: Any) -> str:
     """Why `decode_points` found no times in a PointCloud2, in words."""
-    time, _ = _usual_time([field.name for field in msg.fields])
+    time, _ = time_field_of([field.name for field in msg.fields])
     if time is None:
         return "no time field"
     values = _first(cloud_view(msg, [time])[time])
@@ -188,19 +164,6 @@ def why_untimed(msg: Any) -> str:
 
 def _usual(available: list[str], names: tuple[str, ...]) -> str | None:
     return next((field for name in names for field in available if field.lower() == name), None)
-
-
-def _usual_time(available: list[str]) -> tuple[str | None, TimeUnit]:
-    """The field with the time of each point and the unit that its name ends in; None without one."""
-    found: dict[str, tuple[str, TimeUnit]] = {}
-    for field in available:
-        name = field.lower()
-        if name.replace("_", "") in _TIME_NAMES:  # whole names first: the s of ts is no unit
-            found.setdefault(name.replace("_", ""), (field, "auto"))
-        elif match := _TIME_NAME.fullmatch(name):
-            unit = match["unit"] or (match["long"] or "auto").removesuffix("ec")
-            found.setdefault(match["name"].replace("_", ""), (field, cast(TimeUnit, unit)))
-    return next((found[name] for name in _TIME_NAMES if name in found), (None, "auto"))
 
 
 def _first(column: NDArray[Any]) -> NDArray[Any]:
@@ -246,60 +209,6 @@ def scale_intensity(points: Points, intensity_max: float | None = None, integer:
 def returned(points: Points) -> NDArray[np.bool_]:
     """(N,) which of (N, 4) points the LiDAR has measured: where nothing came back drivers put NaN, or zeros."""
     return np.asarray(np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1))
-
-
-def _time_offset(time: NDArray[Any], points: Points, stamp: int, unit: TimeUnit) -> Points | None:
-    seen = returned(points)  # drivers often zero the time of a missing return
-    value = _first(time).astype(np.float64)
-    seen &= np.isfinite(value)
-    zero = value == 0
-    if not (seen & ~zero).any():
-        return None
-    first, last = _span(value[seen & ~zero])
-    if 0 < 10 * (last - first) < first:  # by a clock that began long before the scan
-        seen &= ~zero  # of a missing return, although its point may have been moved into another frame since
-    elif (seen & zero).any():
-        first, last = min(first, 0.0), max(last, 0.0)
-    if first == last:
-        return None
-    scale = _SECONDS[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
-    origin, clock = 0.0, stamp * 1e-9 / scale
-    # Of a clock that has begun within 2 s, as in a simulation, absolute times look like relative ones.
-    by_clock = _away(first, last, clock) + (last - first) / 10 < _away(first, last, 0.0)
-    if by_clock or max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
-        origin = clock
-        if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
-            # The sensor's clock is not that of the stamps: the first point is all that can be known.
-            known = value[seen]
-            middle = np.partition(known, len(known) // 2)[len(known) // 2]  # unlike a median always one of them
-            origin = known[np.abs(known - middle) * scale <= _LONGEST_SCAN].min()
-    with np.errstate(invalid="ignore", over="ignore"):
-        offset = (value - origin) * scale
-    valid = seen & (np.abs(offset) <= _LONGEST_SCAN)  # else it means nothing
-    return np.where(valid, offset, 0.0).astype(np.float32) if 2 * valid.sum() > seen.sum() else None
-
-
-def _away(first: float, last: float, time: float) -> float:
-    """How far a time is from the times of a scan."""
-    return max(first - time, time - last, 0.0)
-
-
-def _span(times: NDArray[np.float64]) -> tuple[float, float]:
-    """The earliest and the latest of times (N,) but for one in a hundred at either end: a few may be anything."""
-    few = len(times) // 100
-    ordered = np.partition(times, (few, len(times) - 1 - few))
-    return float(ordered[few]), float(ordered[-1 - few])
-
-
-def _time_scale(first: float, last: float, floating: bool) -> float:
-    """Seconds per unit: by the span, else (a few points only) by size as an epoch, else by type."""
-    for scale in [_SECONDS[unit] for unit in (("s", "ms") if floating else ()) + ("us", "ns")]:
-        if _LONGEST_SCAN / 1000 < (last - first) * scale <= _LONGEST_SCAN:
-            return scale
-    for scale in _SECONDS.values():
-        if 1e8 < abs(last) * scale < 1e11:  # 1973 to 5138
-            return scale
-    return 1.0 if floating else 1e-9
 
 
 def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[..., Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.config import Settings
-from dpm2_core.data.messages import TimeUnit
+from dpm2_core.data.point_times import TimeUnit
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What of a damaged map file is good: row by row, each checked by itself."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from dpm2_core.data.thumbnail import image_of
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Array, Georeference
+from dpm2_core.geometry import se3
+from dpm2_core.slam.store import rows, schema
+from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData, subset
+from dpm2_core.slam.store.rows import RemovedKeyframe, Session
+
+_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
+_BRIDGE_COVARIANCE = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
+
+
+@dataclass
+class Findings:
+    """What a check found.
+
+    Attributes:
+        problems: one line each; empty: the map is sound.
+        keyframes: that can be used. lost: keyframes that cannot. lost_clouds: usable, but without their payload.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    keyframes: int = 0
+    lost: int = 0
+    lost_clouds: int = 0
+
+
+class Salvage:
+    """Reads what can be read of a map."""
+
+    def __init__(self, sql: sqlite3.Connection, size: int, findings: Findings) -> None:
+        """`size`: of the file, bytes."""
+        self._sql, self._most, self._findings = sql, size // _SMALLEST, findings
+
+    def run(self) -> MapData:
+        """All that is good, without gaps."""
+        keyframes, session, loans = self._keyframes()
+        poses = self._poses(keyframes)
+        good = sorted(keyframes)
+        last = max(good, default=-1) + 1
+        moving: list[bytes | None] = [None] * last
+        for node, mask in self._rows("moving"):
+            try:
+                if node in keyframes and (cloud := self._payload(node)[0]) is not None:
+                    unpack_mask(mask, len(unpack_cloud(cloud)))
+                    moving[node] = mask
+            except (ValueError, TypeError) as error:
+                self._problem(f"keyframe {node}: which points move is lost: {error}")
+        self._fixes(keyframes)
+        edges = self._bridged(self._edges(keyframes), keyframes, session)
+        trail = self._trail(keyframes)
+        # A map in the old numbers with holes, of which the good nodes are then taken.
+        nothing = pack_cloud(NO_POINTS)
+        filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
+        whole = MapData(
+            [keyframes.get(node, filler) for node in range(last)],
+            [session.get(node, 1) for node in range(last)],
+            np.array([poses.get(node, np.eye(4)) for node in range(last)]).reshape(-1, 4, 4),
+            [],
+            [],
+            self._sessions(session),
+            CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
+            lambda node: self._payload(node)[2],
+            georeference=self._georeference(),
+        )
+        return subset(whole, good, edges, trail)
+
+    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, int], dict[int, Loan]]:
+        keyframes: dict[int, Keyframe] = {}
+        session: dict[int, int] = {}
+        loans: dict[int, Loan] = {}
+        for row in self._rows("keyframes"):
+            try:
+                node, keyframes[row[0]], session[row[0]], loan = rows.keyframe_of(row)
+            except ValueError as error:
+                self._problem(f"keyframe {row[0]}: {error}")
+                continue
+            if loan is not None:
+                loans[node] = loan
+        end = self._end()
+        if missing := sorted(set(range(end)) - keyframes.keys()):
+            self._problem(f"keyframes lost: {_listed(missing)}")
+            self._findings.lost = len(missing)
+        for node, loan in list(loans.items()):
+            if loan.lender not in keyframes or loan.lender in loans:
+                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
+                del loans[node]
+        without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
+        self._findings.lost_clouds = len(without)
+        for node in keyframes.keys() - set(without) - loans.keys():
+            packed = self._payload(node)[1]
+            descriptors = None if packed is None else rows.unpack_descriptors(packed)
+            keyframes[node] = replace(keyframes[node], descriptors=descriptors)
+        return keyframes, session, loans
+
+    def _payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
+        """Packed cloud, descriptors and thumbnail of a node, if they are good."""
+        try:
+            row = self._row("payloads", node)
+            if row is None:
+                raise ValueError("none there")
+            unpack_cloud(row[1])
+            if row[2] is not None:
+                rows.unpack_descriptors(row[2])
+            return row[1], row[2], self._thumbnail(node, row[3], complain)
+        except (ValueError, TypeError) as error:
+            if complain:
+                self._problem(f"keyframe {node}: its payload is lost: {error}")
+            return None, None, None
+
+    def _thumbnail(self, node: int, jpeg: bytes | None, complain: bool) -> bytes | None:
+        try:
+            if jpeg is not None:
+                image_of(jpeg)
+        except ValueError as error:
+            if complain:
+                self._problem(f"keyframe {node}: {error}")
+            return None
+        return jpeg
+
+    def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
+        """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""
+        stored = dict(self._rows("poses"))
+        poses: dict[int, Array] = {}
+        T_map_odom = np.eye(4)
+        for node in sorted(keyframes):
+            try:
+                if node not in stored:
+                    raise ValueError("lost")
+                T = rows.pose_of(stored[node])
+            except ValueError as error:
+                self._problem(f"keyframe {node}: its optimized pose is {error}")
+                T = T_map_odom @ keyframes[node].T_odom_kf
+            poses[node] = T
+            T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
+        return poses
+
+    def _fixes(self, keyframes: dict[int, Keyframe]) -> None:
+        """Give those that are good to their keyframes."""
+        for row in self._rows("fixes"):
+            try:
+                node, fix = rows.fix_of(row)
+                keyframes[node] = replace(keyframes[node], fix=fix)
+            except (ValueError, KeyError) as error:
+                self._problem(f"keyframe {row[0]}: its fix is lost: {error}")
+
+    def _georeference(self) -> Georeference | None:
+        for row in self._rows("georeference"):
+            try:
+                return rows.georeference_of(row)
+            except ValueError as error:
+                self._problem(f"georeference: {error}")
+        return None
+
+    def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
+        edges = []
+        for row in self._rows("edges"):
+            try:
+                edge = rows.edge_of(row)
+                rows.check_ends(edge, keyframes)
+            except ValueError as error:
+                self._problem(f"edge {row[0]}: {error}")
+            else:
+                edges.append(edge)
+        return edges
+
+    def _trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
+        trail = []
+        for row in self._rows("trail", "rowid"):
+            with suppress(ValueError):
+                if (pruned := rows.removed_of(row)).node in keyframes:
+                    trail.append(pruned)
+                    continue
+            self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
+        return trail
+
+    def _bridged(self, edges: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
+        """With odometry edges over the holes that lost keyframes and edges have left."""
+        tied = {edge.to_node for edge in edges if edge.kind == "odometry"}
+        out = list(edges)
+        for before, node in pairwise(sorted(keyframes)):
+            a, b = keyframes[before], keyframes[node]
+            if node not in tied and (session[node], b.robot) == (session[before], a.robot) and b.id > 0:
+                T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
+                bridge = Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge")
+                out.append(Edge("odometry", before, node, bridge))
+        return out
+
+    def _sessions(self, session: dict[int, int]) -> list[Session]:
+        try:
+            return [rows.session_of(row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
+        except (sqlite3.DatabaseError, ValueError) as error:
+            self._problem(f"sessions: {error}")
+            return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
+
+    def _rows(self, table: str, key: str = "") -> Iterator[tuple[Any, ...]]:
+        """The good rows of a table, each fetched by its key so that a damaged page costs only what is on it."""
+        key = key or schema.CONTENT[table][0]
+        for number in range(self._last(table, key) + 1):
+            try:
+                row = self._row(table, number, key)
+            except ValueError as error:
+                self._problem(f"{table} {number}: {error}")
+                continue
+            if row is not None:
+                yield row
+
+    def _row(self, table: str, number: int, key: str = "") -> tuple[Any, ...] | None:
+        names = schema.CONTENT[table]
+        query = f"SELECT {', '.join(names)}, crc FROM {table} WHERE {key or names[0]} = ?"
+        try:
+            row = self._sql.execute(query, (number,)).fetchone()
+        except (sqlite3.DatabaseError, OverflowError, UnicodeDecodeError) as error:
+            raise ValueError(str(error)) from None
+        if row is None:
+            return None
+        try:
+            intact = schema.row_crc(*row[:-1]) == row[-1]
+        except Exception:  # values of types that no row has
+            intact = False
+        if not intact:
+            raise ValueError("its checksum is wrong")
+        return tuple(row[:-1])
+
+    def _last(self, table: str, key: str) -> int:
+        try:
+            query = f"SELECT coalesce(max({key}), -1), coalesce(min({key}), 0) FROM {table}"
+            last, first = map(int, self._sql.execute(query).fetchone())
+        except (sqlite3.DatabaseError, TypeError, ValueError):
+            return min(self._end() * 10, self._most)  # of edges there are several a keyframe
+        if first < 0:
+            self._problem(f"{table}: rows before 0, from {first}")
+        if last > self._most:
+            self._problem(f"{table}: a row {last} in a file of at most {self._most}")
+        return min(last, self._most)
+
+    def _end(self) -> int:
+        """One more than the last node that any table has."""
+        last = -1
+        for table in ("keyframes", "payloads", "poses"):
+            with suppress(sqlite3.DatabaseError, TypeError, ValueError):
+                last = max(last, int(self._sql.execute(f"SELECT coalesce(max(node), -1) FROM {table}").fetchone()[0]))
+        return min(last, self._most) + 1
+
+    def _problem(self, text: str) -> None:
+        self._findings.problems.append(text)
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

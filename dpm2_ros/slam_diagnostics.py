@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How slam_node is doing, on /diagnostics once a second."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from dpm2_core.data.frames import FrameBuilder
+from dpm2_core.estimates import OdometryResult, State
+from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
+from dpm2_ros.guard import GuardedNode
+from dpm2_ros.health import Health
+from dpm2_ros.keyframe_sender import KeyframeSender
+from dpm2_ros.mapping import BEHIND, MapperThread
+from dpm2_ros.other_odometry import OtherOdometry
+from dpm2_ros.state import SILENT
+from dpm2_ros.subscriptions import Inputs
+from dpm2_ros.synchronizer import StampCheck
+
+OTHER_CLOCK = 1.0
+"""Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
+
+_LEVEL = {
+    State.TRACKING: OK,
+    State.INITIALIZING: OK,
+    State.DEGRADED: WARN,
+    State.RELOCALIZING: WARN,
+    State.RELOCALIZED: OK,
+    State.LOST: ERROR,
+}
+
+
+class Diagnostics:
+    """Publishes the state of odometry, camera and mapper."""
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        inputs: Inputs,
+        frames: FrameBuilder,
+        health: Health,
+        mapper: MapperThread | None,
+        sender: KeyframeSender,
+    ) -> None:
+        self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
+        self._mapper, self._sender = mapper, sender
+        self.frame_problem = ""
+        """What is wrong with the frame that was asked for, in words."""
+        self.tf_problem = ""
+        """Why its pose is not on /tf, in words."""
+        self.other: OtherOdometry | None = None
+        """Another odometry, if there is one."""
+        self._lost_before = self._dropped_before = 0
+        self._publisher = DiagnosticsPublisher(node, self._statuses)
+
+    def publish(self) -> None:
+        """Send it now."""
+        self._publisher.publish()
+
+    def _statuses(self) -> list[DiagnosticStatus]:
+        out = [self._odometry()]
+        known = self._inputs.calibration
+        if known.camera is not None:
+            out.append(self._beside("camera", "image", known.camera.topic))
+        if known.second_camera is not None:
+            out.append(self._beside("second camera", "image", known.second_camera.topic))
+        if known.second_topic:
+            out.append(self._beside("second lidar", "cloud", known.second_topic))
+        if self._inputs.imu_received:
+            out.append(self._imu())
+        if self._inputs.gnss is not None:
+            out.append(self._gnss())
+        if self.other is not None:
+            out.append(self._other_odometry(self.other))
+        if self._mapper is None:
+            arrived, made = self._sender.arrived
+            text = f"{arrived} of {made} keyframes have arrived at the mapper"
+            level = WARN if made - arrived > BEHIND else OK
+            if problem := self._sender.problem:
+                level, text = ERROR, f"{text}; {problem}"
+            out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": arrived}))
+        elif self._mapper.localizing:
+            out.append(self._localization(self._mapper))
+        else:
+            out.append(mapper_status(self._node, self._mapper))
+        return [*out, message_status(self._node)]
+
+    def account(self) -> str:
+        """What became of all clouds that were sent since the first that arrived, in words; for when none is at work."""
+        synchronizer, lost = self._inputs.synchronizer, self._inputs.losses.count
+        received, waiting, processed = synchronizer.received, len(synchronizer), self._health.processed
+        rejected = sum(
+            synchronizer.counts[why] for why in (StampCheck.REPEATED, StampCheck.OUT_OF_ORDER, StampCheck.STRAY)
+        )
+        rare = {
+            "rejected for their stamps": rejected,
+            "still waiting": waiting,
+            "ended by an internal error": received - rejected - synchronizer.dropped - waiting - processed,
+        }
+        return (
+            f"{received + lost} clouds sent: {processed} processed, {synchronizer.dropped} dropped (queue full), "
+            f"{lost} lost on the way" + "".join(f", {count} {what}" for what, count in rare.items() if count)
+        )
+
+    def _odometry(self) -> DiagnosticStatus:
+        absence, last = self._absence(), self._health.last
+        if absence is not None or last is None:
+            level, text = absence or (OK, "the first cloud is being processed")
+        else:
+            found = [_tracked(last), *self._beside_tracking(last)]
+            level, text = max(level for level, _ in found), "; ".join(text for _, text in found)
+        return self._status("odometry", level, text, self._odometry_figures())
+
+    def _odometry_figures(self) -> dict[str, str]:
+        synchronizer, counts = self._inputs.synchronizer, self._inputs.synchronizer.counts
+        figures = self._health.figures() | {
+            "received": str(synchronizer.received),
+            "lost on the way": str(self._inputs.losses.count),
+            "dropped (queue full)": str(synchronizer.dropped),
+            "rejected (stamp repeated)": str(counts[StampCheck.REPEATED]),
+            "rejected (stamp out of order)": str(counts[StampCheck.OUT_OF_ORDER]),
+            "rejected (stray stamp)": str(counts[StampCheck.STRAY]),
+            "restarts": str(counts[StampCheck.RESTARTED]),
+            "waiting": str(len(synchronizer)),
+        }
+        if times := self._inputs.times:
+            figures |= {
+                name: f"{ns * 1e-9:.3f}" for name, ns in zip(("cloud stamp (s)", "clock (s)"), times, strict=True)
+            }
+        return figures
+
+    def _absence(self) -> tuple[bytes, str] | None:
+        """Why no cloud comes, in words, and how bad that is; None where one has come lately."""
+        topic, silence = self._inputs.calibration.points_topic, _silence(self._inputs.synchronizer.last_arrival)
+        if silence is not None:
+            return (STALE, f"no cloud on {topic} for {silence:.0f} s") if silence > SILENT else None
+        if problem := self._inputs.subscriptions[0].problem:
+            return ERROR, problem
+        found = self._inputs.candidates()
+        hint = f"; point clouds are published on {', '.join(found)}" if found else ""
+        return STALE, f"no cloud on {topic} yet{hint}"
+
+    def _beside_tracking(self, last: OdometryResult) -> list[tuple[bytes, str]]:
+        """What else is to be said of the last result and of the clouds since the last message, and how bad that is."""
+        topic, log, found = self._inputs.calibration.points_topic, self._node.get_logger(), list[tuple[bytes, str]]()
+        if last.breaks:
+            found.append((OK, f"the way across {last.breaks} pause(s) is not known"))
+        if self.frame_problem:
+            found.append((ERROR, self.frame_problem))
+        if self.tf_problem:
+            found.append((WARN, self.tf_problem))
+        if (count := self._node.count_publishers(topic)) > 1:
+            found.append((WARN, f"{count} publishers on {topic}: a drive has one LiDAR"))
+        if (dropped := self._inputs.synchronizer.dropped) > self._dropped_before:
+            found.append((WARN, f"cannot keep up, {dropped} clouds dropped"))
+        if problem := self._frames.time_problem:
+            log.warning(f"{topic}: {problem}", once=True)
+            found.append((OK, problem))
+        if last.camera:
+            found.append((OK, last.camera))
+        if last.times:
+            log.warning(f"{topic}: {last.times}", once=True)
+            found.append((WARN, last.times))
+        if problem := self._clock_problem():
+            log.warning(problem, once=True)
+            found.append((WARN, problem))
+        if (lost := self._inputs.losses.count) > self._lost_before:
+            found.append((WARN, f"{lost} clouds lost on the way"))
+        self._dropped_before, self._lost_before = dropped, lost
+        return found
+
+    def _clock_problem(self) -> str:
+        """How the clouds' clock is not that of the node, in words; empty where it is."""
+        stamp, now = self._inputs.times or (0, 0)
+        if abs(now - stamp) <= OTHER_CLOCK * 1e9:
+            return ""
+        if not self._node.get_parameter("use_sim_time").value:
+            text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
+            return f"{text}: a sensor's clock has to be set, a recording wants use_sim_time and /clock"
+        if not now:
+            return "use_sim_time is on, and /clock has no publisher"
+        return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
+
+    def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
+        located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
+        if located is None:
+            return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
+        result, last, state = located.registration, self._health.last, located.state
+        if last is not None and last.state is State.LOST and state is not State.LOST:
+            return self._status("localisation", ERROR, f"{State.LOST}: the odometry is", figures)
+        text = str(state)
+        if result.ok:
+            figures |= {"confidence": f"{result.confidence:.2f}", "worst sigma (m)": f"{result.worst_sigma:.3f}"}
+        else:
+            text += f": {result.reason}"
+        return self._status("localisation", _LEVEL[state], text, figures)
+
+    def _other_odometry(self, other: OtherOdometry) -> DiagnosticStatus:
+        verdict = other.verdict
+        text = f"{verdict}; going on without" if other.problem else verdict or "in use"
+        figures: dict[str, object] = {
+            "clouds with it": other.found,
+            "without": other.missed,
+            "outweighed": other.outweighed,
+        }
+        if not np.isnan(other.slip):
+            figures |= {"its ways too long by (%)": f"{100 * other.slip:.1f}"}
+        return self._status("other odometry", WARN if verdict else OK, text, figures)
+
+    def _imu(self) -> DiagnosticStatus:
+        inputs, last, topic = self._inputs, self._health.last, self._inputs.calibration.imu_topic
+        problem = self._frames.problems.get(topic, "")
+        if not problem and last is not None and last.imu:
+            problem = last.imu
+            self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
+        text = f"{problem}; going on without" if problem else "in use"
+        return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
+
+    def _gnss(self) -> DiagnosticStatus:
+        inputs, located = self._inputs, None
+        problem = self._fix_problem() or self._frames.problems.get(inputs.calibration.gnss_topic)
+        if self._mapper is not None:
+            located = self._mapper.slam.mapper.georeference
+        text = "in use" if located is not None else "the map's place on Earth is not known yet"
+        return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
+
+    def _fix_problem(self) -> str:
+        """Why no fix comes, or none is of use, in words; else empty."""
+        last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
+        if last is None:
+            return f"no fix on {topic} yet"
+        stamp, arrival = last
+        if (silence := time.monotonic() - arrival) > SILENT:
+            return f"no fix on {topic} for {silence:.0f} s"
+        ahead = (stamp - clouds[0]) * 1e-9 if clouds else 0.0
+        return f"stamps of another clock, {ahead:+.0f} s from the clouds'" if abs(ahead) > OTHER_CLOCK + SILENT else ""
+
+    def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
+        """Of a sensor beside the LiDAR and its messages, in words, and their topic."""
+        sensor = self._inputs.synchronizer.sensors[topic]
+        figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
+        silence = _silence(sensor.last_arrival)
+        if silence is None:
+            level, text = WARN, f"no {what} on {topic} yet"
+        elif silence > SILENT:
+            level, text = WARN, f"no {what} on {topic} for {silence:.0f} s"
+        elif problem := self._frames.problems.get(topic):
+            level, text = ERROR, problem
+        elif not sensor.awaited:
+            level, text = WARN, f"{what}s come too late or have stamps of another clock"
+        else:
+            return self._status(part, OK, "in use", figures)
+        return self._status(part, level, f"{text}; going on without", figures)
+
+    def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
+        return status(self._node, part, level, text, figures)
+
+
+def _tracked(last: OdometryResult) -> tuple[bytes, str]:
+    """The state and its reason, and how bad it is."""
+    level, registration = _LEVEL[last.state], last.registration
+    if not registration.ok:
+        level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
+    return level, f"{last.state}: {registration.reason}" if registration.reason else str(last.state)
+
+
+def _date(stamp: int) -> str:
+    """A stamp in ns, for people."""
+    date = datetime.fromtimestamp(stamp // 10**9, UTC)
+    return f"{stamp * 1e-9:.3f} s ({date:%Y-%m-%d %H:%M:%S} UTC)"
+
+
+def _silence(last_arrival: float | None) -> float | None:
+    return None if last_arrival is None else time.monotonic() - last_arrival
