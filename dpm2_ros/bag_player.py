@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
-from dpm2_core.data.bags import CAMERA_INFO, CLOUD
+from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write

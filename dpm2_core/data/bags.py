@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.bag_topics import CLOUDS, IMAGES, PATH, TopicChoice
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
-from dpm2_core.data.image_messages import decode_camera, info_of, is_depth
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
@@ -33,13 +32,6 @@ from dpm2_core.frame import Array, Camera, Frame
 
 Stamps = NDArray[np.int64]
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
-CLOUDS = (CLOUD, *LIVOX)
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-IMU = "sensor_msgs/msg/Imu"
-FIX = "sensor_msgs/msg/NavSatFix"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_TRUTH = ("nav_msgs/msg/Odometry", "nav_msgs/msg/Path")
 _SWEEP = 100_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
 
 
@@ -57,10 +49,11 @@ class BagSource:
         self.name = self.path.resolve().stem
         self._bag = open_bag(self.path)
         self.notes = self._bag.notes
-        self.points_topic = self._choose_points()
+        self._topics = TopicChoice(self._bag, self.path, self._settings)
+        self.points_topic = self._topics.points()
         first = self._bag.first(self.points_topic)
         self.lidar_frame: str = first.header.frame_id if first else ""
-        second = self._second_topic("second_points_topic", self.points_topic, CLOUDS, "point clouds")
+        second = self._topics.second("second_points_topic", self.points_topic, CLOUDS, "point clouds")
         correction = self._recorded_correction()
         self._calibration = Calibration(self.points_topic, second_topic=second, angle_correction_deg=correction)
         self.transforms = self._calibration.transforms
@@ -68,8 +61,8 @@ class BagSource:
         self.T_cam_lidar: Array | None = None
         if topics.GRAY_CAMERA in self.transforms.frames:
             self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
-        self.imu_topic = self._calibration.imu_topic = self._choose_imu()
-        self._calibration.gnss_topic = self._choose_gnss()
+        self.imu_topic = self._calibration.imu_topic = self._topics.imu()
+        self._calibration.gnss_topic = self._topics.gnss()
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
         self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
@@ -138,100 +131,19 @@ class BagSource:
     @cached_property
     def truth(self) -> str:
         """Topic of the ground truth; empty without any."""
-        asked, found = self._settings.ground_truth_topic, self._bag.topics(*_TRUTH)
-        if asked and asked not in found:
-            raise UsageError(f"{self.path}: no Odometry or Path messages on {asked}; {self._contents()}")
-        return next((topic for topic in (asked, *topics.TRUTHS) if topic in found), "")
-
-    def _choose_points(self) -> str:
-        asked, found = self._settings.points_topic, self._bag.topics(*CLOUDS)
-        if asked or not found:
-            if asked in found:
-                return asked
-            hint = "" if asked else "; of a driver's packets make clouds first, by replaying them into it"
-            raise UsageError(
-                f"{self.path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
-            )
-        if len(found) > 1:
-            if topics.POINTS not in found:
-                raise UsageError(f"{self.path}: several PointCloud2 topics, choose one with input.points_topic: "
-                                 + ", ".join(found))  # fmt: skip
-            self.notes.append(f"PointCloud2 topics {', '.join(found)}: {topics.POINTS} was chosen")
-            return topics.POINTS
-        return found[0]
-
-    def _second_topic(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
-        """The topic of a second sensor that a setting names, empty for none."""
-        asked: str = getattr(self._settings, key)
-        if asked and (asked == first or asked not in self._bag.topics(*kinds)):
-            raise UsageError(f"{self.path}: input.{key}: no other {messages} on {asked}; {self._contents()}")
-        return asked
+        return self._topics.truth()
 
     def _choose_cameras(self) -> Camera | None:
         """Find the cameras; returns the first one, None if there is none."""
         settings, known = self._settings, self._calibration
-        second = self._second_topic("second_image_topic", settings.image_topic, IMAGES, "images")
-        if topic := self._choose_image(second):
+        second = self._topics.second("second_image_topic", settings.image_topic, IMAGES, "images")
+        if topic := self._topics.image(second):
             asked = bool(settings.image_topic or settings.camera_info_topic)
-            known.camera = self._camera_topic(topic, settings.camera_info_topic, asked)
+            known.camera = self._topics.camera(topic, settings.camera_info_topic, asked)
         if second:
-            known.second_camera = self._camera_topic(second, "", asked=True)
+            known.second_camera = self._topics.camera(second, "", asked=True)
         cameras = [self._camera(camera) for camera in known.cameras]
         return None if known.camera is None else cameras[0]
-
-    def _choose_image(self, second: str) -> str:
-        """The image topic of the first camera, which is not the second one's; empty for none, or depth alone."""
-        asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
-        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
-        if silent and not asked:
-            self.notes.append(f"no message on the image topic {', '.join(silent)}")
-        depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
-        if depth:
-            self.notes.append(f"depth images are not used: {', '.join(depth)}")
-        found = [topic for topic in found if topic not in depth]
-        usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
-        return self._one_of(found, asked, usual, "image", "images")
-
-    def _choose_imu(self) -> str:
-        """An IMU's topic, empty for none."""
-        if not self._settings.imu:
-            return ""
-        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, topics.IMU, "Imu", "Imu messages")
-
-    def _choose_gnss(self) -> str:
-        """The topic of fixes, empty for none."""
-        asked = self._settings.gnss_topic
-        return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
-
-    def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
-        """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""
-        if asked:
-            if asked not in found:
-                raise UsageError(f"{self.path}: no {messages} on {asked}; {self._contents()}")
-            return asked
-        if len(found) > 1 and usual not in found:
-            key = f"input.{kind.lower()}_topic"
-            self.notes.append(f"{kind} topics {', '.join(found)}: none is used; choose one with {key}")
-            return ""
-        return usual if usual in found else "".join(found)
-
-    def _camera_topic(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
-        """The camera of an image topic with its first CameraInfo of use; None without, which is an error where it is
-        asked for."""
-        info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-        problem = f"no CameraInfo on {info_topic}"
-        for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
-            info = info_of(topic, message)
-            try:
-                decode_camera(info, np.eye(4), info_topic)
-            except MessageError as error:  # drivers send zeros before the calibration is there
-                problem = str(error)
-            else:
-                return CameraTopic(topic, info)
-        if asked:
-            raise UsageError(f"{self.path}: {problem} for {topic}; {self._contents()}")
-        self.notes.append(f"images of {topic} are left out: {problem}")
-        return None
 
     def _camera(self, camera: CameraTopic) -> Camera:
         image = None if camera.info.header.frame_id else self._bag.first(camera.topic)
@@ -301,7 +213,7 @@ class BagSource:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""
         raw = [(time, data) for _, time, data in self._bag.messages([topic])]
         decoded = [self._bag.decode(topic, data) for _, data in raw]
-        is_path = self._bag.types[topic] == _TRUTH[1]
+        is_path = self._bag.types[topic] == PATH
         stamped: list[Any] = decoded[-1].poses if is_path else decoded
         of_items = (stamp_ns(i.header) for i in stamped) if is_path else (serialized_stamp(d, t) for t, d in raw)
         stamps = np.fromiter(of_items, np.int64)
@@ -310,10 +222,6 @@ class BagSource:
         if child and child != self.lidar_frame:
             T = T @ self.transforms.lookup(child, self.lidar_frame)
         return stamps, T
-
-    def _contents(self) -> str:
-        listed = (f"{topic} ({kind}, {self._bag.counts[topic]})" for topic, kind in sorted(self._bag.types.items()))
-        return f"topics: {', '.join(listed) or 'none'}"
 
     def _note_once(self, what: str, detail: str) -> None:
         if not any(note.startswith(what) for note in self.notes):

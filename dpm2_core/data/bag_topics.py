@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a bag are read: those that the settings name, else the usual ones, else the only ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.data import topics
+from dpm2_core.data.bag_file import Bag
+from dpm2_core.data.frames import CameraTopic
+from dpm2_core.data.image_messages import decode_camera, info_of, is_depth
+from dpm2_core.data.livox import LIVOX
+from dpm2_core.data.messages import MessageError
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUDS = (CLOUD, *LIVOX)
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMU = "sensor_msgs/msg/Imu"
+FIX = "sensor_msgs/msg/NavSatFix"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+PATH = "nav_msgs/msg/Path"
+_TRUTH = ("nav_msgs/msg/Odometry", PATH)
+
+
+class TopicChoice:
+    """Chooses the topics of one bag; the bag's `notes` say where there were others.
+
+    Raises:
+        UsageError: by its methods: what the settings ask for is not there, or the choice is the user's.
+    """
+
+    def __init__(self, bag: Bag, path: Path, settings: InputSettings) -> None:
+        self._bag, self._path, self._settings = bag, path, settings
+
+    def points(self) -> str:
+        """Topic of the point clouds."""
+        asked, found = self._settings.points_topic, self._bag.topics(*CLOUDS)
+        if asked or not found:
+            if asked in found:
+                return asked
+            hint = "" if asked else "; of a driver's packets make clouds first, by replaying them into it"
+            raise UsageError(
+                f"{self._path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
+            )
+        if len(found) > 1:
+            if topics.POINTS not in found:
+                raise UsageError(f"{self._path}: several PointCloud2 topics, choose one with input.points_topic: "
+                                 + ", ".join(found))  # fmt: skip
+            self._bag.notes.append(f"PointCloud2 topics {', '.join(found)}: {topics.POINTS} was chosen")
+            return topics.POINTS
+        return found[0]
+
+    def second(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
+        """The topic of a second sensor that a setting names, empty for none."""
+        asked: str = getattr(self._settings, key)
+        if asked and (asked == first or asked not in self._bag.topics(*kinds)):
+            raise UsageError(f"{self._path}: input.{key}: no other {messages} on {asked}; {self._contents()}")
+        return asked
+
+    def image(self, second: str) -> str:
+        """The image topic of the first camera, which is not the second one's; empty for none, or depth alone."""
+        asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
+        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
+        if silent and not asked:
+            self._bag.notes.append(f"no message on the image topic {', '.join(silent)}")
+        depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
+        if depth:
+            self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
+        found = [topic for topic in found if topic not in depth]
+        usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
+        return self._one_of(found, asked, usual, "image", "images")
+
+    def imu(self) -> str:
+        """An IMU's topic, empty for none."""
+        if not self._settings.imu:
+            return ""
+        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, topics.IMU, "Imu", "Imu messages")
+
+    def gnss(self) -> str:
+        """The topic of fixes, empty for none."""
+        asked = self._settings.gnss_topic
+        return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
+
+    def camera(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
+        """The camera of an image topic with its first CameraInfo of use; None without, which is an error where it is
+        asked for."""
+        info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        problem = f"no CameraInfo on {info_topic}"
+        for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
+            info = info_of(topic, message)
+            try:
+                decode_camera(info, np.eye(4), info_topic)
+            except MessageError as error:  # drivers send zeros before the calibration is there
+                problem = str(error)
+            else:
+                return CameraTopic(topic, info)
+        if asked:
+            raise UsageError(f"{self._path}: {problem} for {topic}; {self._contents()}")
+        self._bag.notes.append(f"images of {topic} are left out: {problem}")
+        return None
+
+    def truth(self) -> str:
+        """Topic of the ground truth, empty without any."""
+        asked, found = self._settings.ground_truth_topic, self._bag.topics(*_TRUTH)
+        if asked and asked not in found:
+            raise UsageError(f"{self._path}: no Odometry or Path messages on {asked}; {self._contents()}")
+        return next((topic for topic in (asked, *topics.TRUTHS) if topic in found), "")
+
+    def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
+        """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""
+        if asked:
+            if asked not in found:
+                raise UsageError(f"{self._path}: no {messages} on {asked}; {self._contents()}")
+            return asked
+        if len(found) > 1 and usual not in found:
+            key = f"input.{kind.lower()}_topic"
+            self._bag.notes.append(f"{kind} topics {', '.join(found)}: none is used; choose one with {key}")
+            return ""
+        return usual if usual in found else "".join(found)
+
+    def _contents(self) -> str:
+        listed = (f"{topic} ({kind}, {self._bag.counts[topic]})" for topic, kind in sorted(self._bag.types.items()))
+        return f"topics: {', '.join(listed) or 'none'}"
