@@ -64,6 +64,15 @@ def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
     assert sorted(seen) == sorted((d, m) for d in drives for m in METHODS.values() if m in drives[d])
 
 
+def test_the_figures_beside_wheels_are_those_of_the_record() -> None:
+    worlds, seen = record("beside.json")["worlds"], []
+    for world, *cells in rows(MEASURED, "| | without wheels | that slip | that slip and jump |"):
+        seen.append(world)
+        for kind, cell in zip(("own", "slip", "slip and jump"), cells, strict=True):
+            assert equals(cell, worlds[world][kind]["ape_rmse_m"]), (world, kind)
+    assert seen == list(worlds)
+
+
 def test_the_figures_at_few_frames_per_second_are_those_of_the_record() -> None:
     methods = {"adaptive": "adaptive", "neural": "neural", "points alone": "geometric", "KISS-ICP": "kiss-icp"}
     drives, drive, seen = record("hard.json")["drives"], "", 0
