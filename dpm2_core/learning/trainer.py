@@ -26,6 +26,8 @@ from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
+_DIVERGED = 100  # steps in a row without a finite gradient: the weights, which none of them changes, do not recover
+
 
 class OptimizerSettings(Settings):
     """Optimisation."""
@@ -157,7 +159,7 @@ class Trainer:
 
         Raises:
             UsageError: nothing to resume, or it has more steps than are wanted.
-            Dpm2Error: no step had a finite gradient.
+            Dpm2Error: no step had a finite gradient, or none of the last hundred.
         """
         keep_memory()
         with process_group() as (rank, world, device):
@@ -173,7 +175,7 @@ class Trainer:
             if self.settings.compile:
                 wrapped.compile(dynamic=False)
             log = Log(self.out, start) if rank == 0 else None
-            learned = not steps
+            skipped = 0  # steps in a row without a finite gradient
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             with Progress(*columns, disable=rank != 0) as progress:
                 task = progress.add_task("training", total=self.settings.steps, completed=start)
@@ -182,7 +184,9 @@ class Trainer:
                     batch = next(batches)
                     waited = time.perf_counter() - begin
                     figures = self._step(wrapped, ema, optimizer, to_device(batch, device), step)
-                    learned |= math.isfinite(figures["norm"])
+                    skipped = 0 if math.isfinite(figures["norm"]) else skipped + 1
+                    if skipped == _DIVERGED:
+                        raise Dpm2Error(f"diverged: no finite gradient since step {step + 1 - skipped} of {steps.stop}")
                     figures |= {"seconds": time.perf_counter() - begin, "waited": waited}
                     progress.update(task, advance=1, description=f"loss {figures['loss']:.3f}")
                     if log is not None:
@@ -190,7 +194,7 @@ class Trainer:
                         self._keep(ema, optimizer, log, step + 1, last=step == steps[-1])
             if log is not None:
                 log.close()
-                if not learned:
+                if steps and skipped == len(steps):
                     raise Dpm2Error(f"none of {len(steps)} steps had a finite gradient: nothing was learned")
                 self.save(ema)
 

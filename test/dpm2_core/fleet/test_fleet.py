@@ -191,7 +191,7 @@ def test_faults_cost_only_what_they_hit(cluster: Cluster, drives: list[Path], al
     assert sorted(path.name for path in out.iterdir()) == [SUMMARY, "killed", "one"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_kills_every_worker_ends_with_a_reason(cluster: Cluster) -> None:
     """And a bug is one line, with its place; the other jobs go on."""
     divide = import_module("fleet_work").divide
@@ -242,7 +242,7 @@ def test_weights_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.M
     assert part.inputs == [tmp_path / "own.safetensors"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_of_this_machine_is_not_reached_from_others(tmp_path: Path) -> None:
     """In a process of its own, as a command is: Ray reads once, when it is imported, where it is to listen."""
     pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")

@@ -9,7 +9,7 @@ import shutil
 import socket
 import subprocess
 import sys
-from itertools import repeat
+from itertools import count, repeat
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +134,22 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
     training = Trainer(Broken(2, 1), lambda start, rank: repeat((torch.ones(2),)), steps, tmp_path, saved.append)
     with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
         training.run()
+    assert not saved
+
+
+def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
+    """The other steps were skipped, for hours, and weights of the few first ones written as if all was well."""
+
+    class Diverging(torch.nn.Linear):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss = super().forward(x).square().sum() * (1.0 if float(x[0]) < 7 else torch.nan)
+            return loss, {"loss": loss.detach()}
+
+    saved: list[torch.nn.Module] = []
+    batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
+    steps = OptimizerSettings(steps=400, compile=False, bf16=False)
+    with pytest.raises(Dpm2Error, match="diverged: no finite gradient since step 7 of 400"):
+        Trainer(Diverging(2, 1), batches, steps, tmp_path, saved.append).run()
     assert not saved
 
 
