@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does a loop agree with what is known already? With the odometry between its ends, or with another loop nearby.
 
-Two loops and the odometry between their ends make a circle, after which one must be where one was: J. Mangelson et al.,
-"Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging", ICRA 2018.
+Two loops and the ways between their ends, by odometry or through the map, make a circle, after which one must be where
+one was: J. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging",
+ICRA 2018.
 """
 
 from __future__ import annotations
@@ -179,9 +180,13 @@ class Consistency:
 
     def _agree(self, one: Edge, other: Edge, s: ConsistencySettings) -> bool:
         """Whether the circle through both closes."""
+        if one.to_node == other.to_node:
+            return False
         there, T_there = self._way(one.from_node, other.from_node)
+        if there > s.reach:  # as of most pairs of a long drive
+            return False
         back, T_back = self._way(other.to_node, one.to_node)
-        if one.to_node == other.to_node or max(there, back) > s.reach:
+        if back > s.reach:
             return False
         meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ T_there @ other.T_from_to @ T_back)
         allowed = s.circle + s.circle_drift * (there + back)
