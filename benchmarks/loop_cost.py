@@ -38,28 +38,27 @@ def bench_loop_cost(options: Options) -> Report:
     loops = make_loops(settings)
     poses = np.tile(np.eye(4), (max(SIZES) + _MEASURED, 1, 1))
     poses[:, 0, 3] = 5.0 * np.arange(len(poses))  # a straight road of 100 km
-    part = np.zeros(len(poses), np.intp)
-    keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[: SIZES[0]])]
-    make_loops(settings).close(
-        keyframes, [cloud] * len(keyframes), poses[: SIZES[0]], part[: SIZES[0]]
-    )  # torch takes its memory
+    parts = np.zeros(len(poses), np.intp)  # all are tied together
+    few = SIZES[0]
+    keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[:few])]
+    make_loops(settings).close(keyframes, [cloud] * few, poses[:few], parts[:few])  # torch takes its memory
     empty = resident_mb()
     with Progress(transient=True) as progress:
-        for node in progress.track(range(SIZES[0], len(poses)), description="map"):
+        for node in progress.track(range(few, len(poses)), description="map"):
             keyframes.append(_keyframe(node, poses[node], rng))
     for size in SIZES:
         clouds = [cloud] * len(keyframes)
         seconds = []
-        loops.close(keyframes[:size], clouds, poses[:size], part[:size])  # takes in all that is new
+        loops.close(keyframes[:size], clouds, poses[:size], parts[:size])  # takes in all that is new
         for last in range(size + 1, size + _MEASURED):
             started = process_time()
-            loops.close(keyframes[:last], clouds, poses[:last], part[:last])
+            loops.close(keyframes[:last], clouds, poses[:last], parts[:last])
             seconds.append(process_time() - started)
         cost[str(size)] = round(1e3 * float(np.median(seconds)), 1)
     results: dict[str, Any] = {
         "cpu_ms": cost,
-        "ratio": round(cost[str(SIZES[-1])] / cost[str(SIZES[0])], 2),
-        "rss_kb_a_keyframe": round(1e3 * (resident_mb() - empty) / (len(keyframes) - SIZES[0]), 1),
+        "ratio": round(cost[str(SIZES[-1])] / cost[str(few)], 2),
+        "rss_kb_a_keyframe": round(1e3 * (resident_mb() - empty) / (len(keyframes) - few), 1),
     }
     return Report(results, Group(str(results)))
 

@@ -90,8 +90,8 @@ def verify(
         tried: dict[tuple[int, int], Edge] = {}
         for count, keyframe in enumerate(second.keyframes, 1):
             keyframes.append(keyframe)
-            now = len(keyframes)
-            for loop in closer.close(keyframes, clouds, poses[:now], parts[:now]):
+            end = len(keyframes)
+            for loop in closer.close(keyframes, clouds, poses[:end], parts[:end]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
                     tried[ends] = loop.between(*ends)  # later: confirmed by another one

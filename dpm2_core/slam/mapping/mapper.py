@@ -13,7 +13,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -23,6 +23,7 @@ from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
 from dpm2_core.slam.mapping.restore import restore_solved
+from dpm2_core.slam.mapping.session_start import SessionStart
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import NO_POINTS, Thumbnail, borrowing, load_map, map_cloud
@@ -59,15 +60,6 @@ class _Robot:
     offset: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """Where a session in a loaded map begins: see `Mapper.start_session`."""
-
-    T_map_odom: Array
-    covariance: Array
-    node: int | None
-
-
 class Mapper:
     """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
 
@@ -94,7 +86,7 @@ class Mapper:
         self._clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
-        self._start: _Start | None = None
+        self._start: SessionStart | None = None
         if store is not None:
             self._load(store)
         self.session_start = len(self.keyframes)
@@ -174,7 +166,7 @@ class Mapper:
             covariance: (6, 6) of the first keyframe's pose relative to that of `node`, to which an edge will tie it.
             node: of the map, whose frame is the new session's first one; None: the nearest whose place is known.
         """
-        self._start = _Start(T_map_odom, covariance, node)
+        self._start = SessionStart(T_map_odom, covariance, node)
 
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, if loops are searched with them and its registration made none."""
@@ -286,7 +278,7 @@ class Mapper:
             covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             result = replace(result, T_target_source=T_before_this, covariance=covariance)
         elif node == self.session_start and self._start is not None:
-            return [self._tie(node, self._start, self._start.T_map_odom @ keyframe.T_odom_kf)]
+            return [self._begin_session(self._start, node, keyframe)]
         else:
             self._graph.add_node(keyframe.T_odom_kf)
             return []
@@ -294,22 +286,15 @@ class Mapper:
         self._graph.add_node(self._graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
 
-    def _tie(self, node: int, start: _Start, T: Array) -> Edge:
-        """The first node of a session, at T (4, 4), and the edge that ties it to the map."""
-        other = self._nearest(T) if start.node is None else start.node
-        result = Registration(se3.inverse(self._graph.pose(other)) @ T, start.covariance)
-        if start.node is None:
-            self._graph.add_node(T)
-            return self._tied(Edge("loop", other, node, result))
-        edge = Edge("odometry", other, node, result)
-        self._graph.add_node(T, edge)
-        return edge
-
-    def _nearest(self, T_map_kf: Array) -> int:
-        """The node of a known place that is nearest."""
-        placed = np.flatnonzero(self.placed)
-        distance = np.linalg.norm(self.poses[placed, :3, 3] - T_map_kf[:3, 3], axis=1)
-        return int(placed[distance.argmin()])
+    def _begin_session(self, start: SessionStart, node: int, keyframe: Keyframe) -> Edge:
+        """The first node of a session, and the edge that ties it to the map."""
+        T = start.T_map_odom @ keyframe.T_odom_kf
+        edge = start.edge(node, T, self.poses, self.placed)
+        if edge.kind == "odometry":
+            self._graph.add_node(T, edge)
+            return edge
+        self._graph.add_node(T)
+        return self._tied(edge)
 
     def _close_loops(self, due: bool) -> None:
         """Loops of the last keyframe: into the graph, unless they were rejected there or before.

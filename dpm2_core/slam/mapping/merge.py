@@ -96,8 +96,8 @@ def loops_by(closer: LoopCloser) -> FindLoops:
             # Another name keeps the odometry of the two apart.
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             clouds: Sequence[Points] = both.clouds
-            count = len(keyframes)
-            for loop in closer.close(keyframes, clouds, both.poses[:count], parts[:count]):
+            end = len(keyframes)
+            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
                     out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out

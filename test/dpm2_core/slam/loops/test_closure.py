@@ -270,7 +270,6 @@ def joined(*ways: tuple[float, float]) -> tuple[list[Edge], Array]:
     world = build_world("loop", "car_park", seed=902, length=120.0)
     lidar = Lidar(real_sensor(LidarConfig(beams=16, height=0.8)))
     search, keyframes, clouds, truth, loops = closer(), list[Keyframe](), list[Points](), list[Array](), list[Edge]()
-    parts = list[int]()
     for robot, (start, stop) in zip("ab", ways, strict=True):
         for s in np.arange(start, stop, 4.0):
             truth.append(world.pose_at(s, height=0.8))
@@ -278,8 +277,8 @@ def joined(*ways: tuple[float, float]) -> tuple[list[Edge], Array]:
             clouds.append(points[voxel_first(points, 0.3, far=40.0)])
             edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if s > start else None
             keyframes.append(search.described(Keyframe(len(truth), 0, 0, truth[-1], clouds[-1], edge, robot)))
-            parts.append(int(robot == "b"))
-            loops += search.close(keyframes, clouds, np.array(truth), np.array(parts))
+            of_robots = np.array([keyframe.robot == "b" for keyframe in keyframes], np.intp)
+            loops += search.close(keyframes, clouds, np.array(truth), of_robots)
     return loops, np.array(truth)
 
 
