@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.frame import Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
@@ -15,6 +16,8 @@ from dpm2_core.slam.store.rows import NO_POINTS, Session
 
 SPACING = 5.0
 """m between keyframes."""
+GEOREFERENCE = Georeference(np.array([49.0, 8.4, 110.0]), se3.exp(np.array([0, 0, 1.0, 2, 3, 4])))
+FIX = Fix(5, np.array([49.0, 8.4, 110.5]), np.diag([4.0, 4, 16]), np.array([0.1, 0, 1.5]))
 
 
 def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -> MapData:

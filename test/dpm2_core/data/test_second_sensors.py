@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A second LiDAR and a second camera in a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import cloud_fields
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from test.helpers.recordings import IMAGE, POINTS, Message, by_time, clouds, rig
+
+# --- a second LiDAR
+
+
+def test_clouds_of_a_second_lidar_join_in_the_frame_of_the_first(bags: Any, tmp_path: Path) -> None:
+    """It stands 2 m to the left, and is 40 ms late: its points say when they were taken."""
+    second = [(t + 0.04, "/second", bags.cloud(t + 0.04, x=10 * t, frame="left")) for t in (1, 1.1, 1.3)]
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", by_time([*clouds(bags, [1, 1.1, 1.2, 1.3]), *second, tree]))
+    settings = InputSettings(points_topic=POINTS, second_points_topic="/second")
+    frames = list(BagSource(bag, settings).frames())
+    assert [len(frame.points) for frame in frames] == [120, 120, 60, 120]
+    for n, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.points[:60], [[n, 2, 3, 0.5]] * 60, rtol=1e-6)
+    np.testing.assert_allclose(frames[1].points[60:], [[11, 4, 3, 0.5]] * 60, rtol=1e-6)
+    assert frames[1].time_offset is not None
+    np.testing.assert_allclose(frames[1].time_offset, [0.0] * 60 + [0.04] * 60, atol=1e-6)
+    assert frames[2].time_offset is None
+
+
+def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any, tmp_path: Path) -> None:
+    """Drivers send zeros for them, or NaN. Their times go with them."""
+    columns = {name: np.full(60, value, np.float32) for name, value in (("x", 5.0), ("y", 2.0), ("z", 3.0))}
+    columns["t"] = np.linspace(0, 0.1, 60, dtype=np.float32)
+    for name in "xyz":
+        columns[name][:20], columns[name][20:30] = 0, np.nan
+    fields = cloud_fields(columns, bags.store.types["sensor_msgs/msg/PointField"])
+    second = bags.new("sensor_msgs/PointCloud2", header=bags.header(1, "left"), **fields)
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), (1, "/second", second), tree])
+    (frame,) = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second")).frames()
+    np.testing.assert_allclose(frame.points[60:], [[5, 4, 3, 0]] * 30, rtol=1e-6)
+    assert frame.time_offset is not None
+    np.testing.assert_allclose(frame.time_offset, [*[0] * 60, *columns["t"][30:]], atol=1e-6)  # float32 of 0.1 s
+
+
+@pytest.mark.parametrize(("ahead", "missing"), [(0, 0), (0.08, 4), (1000, 4)])
+def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
+    bags: Any, tmp_path: Path, ahead: float, missing: int
+) -> None:
+    """Too far apart, or stamps of another clock: as of a camera, nothing else says that its points are missing."""
+    times = [1, 1.2, 1.4, 1.6]
+    second = [(t + 0.01, "/second", bags.cloud(t + ahead, frame="left")) for t in times]
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", by_time([tree, *clouds(bags, times), *second]))
+    source = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second"))
+    assert [len(frame.points) for frame in source.frames()] == [60 if missing else 120] * 4
+    said = [note for note in source.notes if "/second" in note]
+    assert said == ["4 of 4 frames have no cloud of /second (within 0.05 s)"] * bool(missing)
+
+
+def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -> None:
+    second = [(1.01, "/second", bags.cloud(1.01, frame="left"))]
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), *second])
+    source = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second"))
+    assert [len(frame.points) for frame in source.frames()] == [60]
+    assert "/second: no transform from 'left' to 'velo_link'" in source.notes[0]
+    assert "going on without the second LiDAR" in source.notes[0]
+    for wrong in ("/third", POINTS):
+        with pytest.raises(UsageError, match=rf"second_points_topic: no other point clouds on {wrong}; topics: "):
+            BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic=wrong))
+
+
+# --- a second camera
+
+REAR, REAR_INFO = "/rear/image_raw", "/rear/camera_info"
+
+
+def of_frame(message: Any, frame: str) -> Any:
+    message.header.frame_id = frame
+    return message
+
+
+def rear(bags: Any, times: list[float]) -> list[Message]:
+    """A camera 1 m behind the LiDAR; its values are 100 and up."""
+    images = [(t, REAR, of_frame(bags.image(t, 100 + n), "rear")) for n, t in enumerate(times)]
+    info, place = of_frame(bags.info(1), "rear"), bags.transform("velo_link", "rear", (-1, 0, 0))
+    return [(1, REAR_INFO, info), (1, "/tf_static", place), *images]
+
+
+def all_seen(source: BagSource) -> list[list[int]]:
+    """The gray values of each frame's images."""
+    return [[int(image.pixels[0, 0, 0]) for image in frame.images] for frame in source.frames()]
+
+
+TWO = InputSettings(second_image_topic=REAR)
+
+
+def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: Path) -> None:
+    """Out of phase; each misses some clouds, which costs the other nothing. The second alone is one more camera."""
+    times = [1.0, 1.1, 1.2, 1.3, 1.4]
+    ahead = [(t, IMAGE, bags.image(t, n)) for n, t in enumerate((1.01, 1.11, 1.41))]
+    recorded = [*clouds(bags, times), *rig(bags), *ahead, *rear(bags, [0.97, 1.17, 1.27, 1.37])]
+    bag = bags.write(tmp_path / "b", by_time(recorded))
+    source = BagSource(bag, TWO)
+    frames = list(source.frames())
+    assert all_seen(source) == [[0, 100], [1], [101], [102], [2, 103]]
+    assert [image.camera.T_lidar_cam[0, 3] for image in frames[0].images] == [0.2, -1]
+    assert [image.camera.name for image in frames[0].images] == [IMAGE, REAR]
+    assert source.camera is not None
+    assert source.camera.T_lidar_cam[0, 3] == 0.2
+    assert f"2 of 5 frames have no image of {IMAGE} (within 0.05 s)" in source.notes
+    assert f"1 of 5 frames have no image of {REAR} (within 0.05 s)" in source.notes
+    assert all_seen(BagSource(bag, InputSettings(image_topic=IMAGE))) == [[0], [1], [], [], [2]]
+    assert all_seen(BagSource(bag, InputSettings(image_topic=REAR))) == [[100], [], [101], [102], [103]]
+    placed = InputSettings(second_image_topic=REAR, T_lidar_cam=(0.5, 0, 0, 0, 0, 0, 1))  # of the first one alone
+    (first, *_) = BagSource(bag, placed).frames()
+    assert [image.camera.T_lidar_cam[0, 3] for image in first.images] == [0.5, -1]
+    alone = bags.write(tmp_path / "alone", by_time([*clouds(bags, times), *rear(bags, times)]))
+    assert all_seen(BagSource(alone, TWO)) == [[100 + n] for n in range(5)]
+
+
+def test_a_second_camera_that_cannot_be_used_is_named(bags: Any, tmp_path: Path) -> None:
+    """It was asked for: an error, as of a camera that is; images that cannot be read cost themselves."""
+    first = [*clouds(bags, [1, 2]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (2, IMAGE, bags.image(2, 8))]
+    second = rear(bags, [1, 2])
+    cases: list[tuple[list[Message], str]] = [
+        ([], f"input.second_image_topic: no other images on {REAR}; topics: "),
+        (second[1:], f"no CameraInfo on {REAR_INFO} for {REAR}"),
+        ([second[0], *second[2:]], f"camera {REAR}: no transform from 'rear' to 'velo_link'; .*; publish it on /tf_st"),
+        (
+            [(1, REAR_INFO, bags.info(1)), *second[1:]],
+            f"camera {REAR}: its frame 'cam' is that of {IMAGE}: two cameras",
+        ),
+    ]
+    for n, (messages, problem) in enumerate(cases):
+        bag = bags.write(tmp_path / str(n), by_time([*first, *messages]))
+        with pytest.raises(UsageError, match=problem):
+            BagSource(bag, TWO)
+        assert len(BagSource(bag, InputSettings(image_topic=IMAGE))) == 2
+    with pytest.raises(UsageError, match=rf"second_image_topic: no other images on {IMAGE}"):
+        BagSource(tmp_path / "0", InputSettings(image_topic=IMAGE, second_image_topic=IMAGE))
+    assert all_seen(BagSource(tmp_path / "0", InputSettings(images=False, second_image_topic=REAR))) == [[], []]
+    odd = of_frame(bags.image(1, 9, encoding="yuv411"), "rear")
+    source = BagSource(bags.write(tmp_path / "odd", by_time([*first, *second[:2], (1, REAR, odd), second[3]])), TWO)
+    assert all_seen(source) == [[7], [8, 101]]
+    assert any(note.startswith(f"{REAR}: image encoding 'yuv411' is not supported") for note in source.notes)
