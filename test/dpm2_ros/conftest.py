@@ -35,6 +35,7 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.runtime import end_ros, ros_context
+from test.helpers.rig import Rig
 from tools.replay import ros_environment
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_DISCOVERY_RANGE"]
@@ -373,3 +374,10 @@ def domains() -> Iterator[int]:
 def drive() -> Drive:
     """The drive, scan by scan."""
     return Drive()
+
+
+@pytest.fixture
+def rig(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
+    """Makes a Rig whose node sends diagnostics ten times a second."""
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    return lambda *parameters, **options: Rig(ros, drive, *parameters, **options)

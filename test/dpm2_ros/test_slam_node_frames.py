@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where slam_node finds its base: /tf_static, early, late or never; and clocks that do not fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
+from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.geometry import se3
+from dpm2_ros.conversions import transform_to_msg
+from dpm2_ros.tf import TFMessage
+from test.helpers.rig import ACCURATE, Rig, publish_static
+
+from ..helpers.diagnostics import figures, saying
+
+T_BASE_SENSOR, T_SENSOR_LIDAR = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5]), se3.exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.04])
+
+
+def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.publish_tf_odom:=false", "ros.publish_tf_map:=false")
+    assert r.node.count_publishers("/tf") == 0
+
+
+def test_a_namespace_holds_a_robot(rig: Callable[..., Rig]) -> None:
+    r = rig("input.points_topic:=/kitti/velo/pointcloud", namespace="/robot_1")
+    keyframes = r.harness.hear(PointCloud2, "/robot_1/dpm2/keyframe")
+    r.wait(lambda: r.node.count_subscribers("/robot_1/dpm2/keyframe"), "the subscription")
+    r.send_and_wait(0, 1)
+    r.wait(lambda: keyframes, "a keyframe")
+    assert keyframes[0].header.frame_id == "robot_1/kf_0"
+    assert r.status("odometry", bool).name == "robot_1/slam_node: odometry"
+
+
+def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) -> None:
+    """The pose of base_link, which starts at the origin, although the LiDAR is mounted ahead, above and turned."""
+    T_base_lidar = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5])
+    r = rig()
+    static = r.harness.publisher(TFMessage, "/tf_static", latched=True)
+    static.publish(TFMessage(transforms=[transform_to_msg(T_base_lidar, 0, "base_link", "lidar")]))
+    r.wait(lambda: "lidar" in r.node.calibration.transforms.frames, "/tf_static")
+    r.send_and_wait(*range(8))
+    for n, message in enumerate(r.odom):
+        assert message.child_frame_id == "base_link"
+        expected = T_base_lidar @ drive.pose(n) @ se3.inverse(T_base_lidar)
+        assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+
+
+def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
+    rig: Callable[..., Rig], drive: Any
+) -> None:
+    """The driver's part of /tf_static comes first, that of the robot with the base three clouds later."""
+    r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
+    keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
+    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "subscriptions")
+    publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
+    for n in range(3):
+        r.send(n)
+    note = "no transform from 'lidar' to 'base_link'; frames known: lidar, os_sensor"
+    assert r.status("odometry", saying(note), since=0).level == DiagnosticStatus.ERROR
+    r.processed(3)
+    assert (r.odom, tf, keyframes) == ([], [], [])
+    publish_static(r, "base_link", "os_sensor", T_BASE_SENSOR)
+    r.send(3)
+    r.wait(lambda: len(r.odom) == 4 and keyframes, "the poses that were held back")
+    assert r.stamps() == [drive.stamp(n) for n in range(4)]
+    T_base_lidar = T_BASE_SENSOR @ T_SENSOR_LIDAR
+    for n, message in enumerate(r.odom):
+        assert message.child_frame_id == "base_link"
+        expected = T_base_lidar @ drive.pose(n) @ se3.inverse(T_base_lidar)
+        assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+    np.testing.assert_allclose(transform_matrix(keyframes[0].pose.pose), np.eye(4), atol=1e-9)
+    children = lambda: {t.child_frame_id for message in tf for t in message.transforms}  # noqa: E731
+    r.wait(lambda: children() == {"odom", "base_link"}, "/tf")
+
+
+def test_poses_kept_for_a_base_are_bounded(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then the drive begins anew: what is published at last is a whole drive from its first pose on."""
+    monkeypatch.setattr("dpm2_ros.slam_node.HELD", 3)
+    r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0")
+    for n in range(5):
+        r.send(n)
+    r.processed(5)
+    publish_static(r, "base_link", "lidar", np.eye(4))
+    r.send(5)
+    r.wait(lambda: len(r.odom) == 2, "the poses")
+    assert r.stamps() == [drive.stamp(4), drive.stamp(5)]
+    np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose), np.eye(4), atol=1e-9)
+
+
+def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
+    """No base is asked for, and the driver's part of /tf_static comes first. odom and map go on as they are."""
+    r = rig()
+    tf = r.harness.hear(TFMessage, "/tf")
+    publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
+    r.send_and_wait(*range(4))
+    publish_static(r, "base_link", "os_sensor", T_BASE_SENSOR)
+    r.send_and_wait(*range(4, 8))
+    for n, message in enumerate(r.odom):
+        T_odom_sensor = T_SENSOR_LIDAR @ drive.pose(n) @ se3.inverse(T_SENSOR_LIDAR)
+        expected = T_odom_sensor if n < 4 else T_odom_sensor @ se3.inverse(T_BASE_SENSOR)
+        assert message.child_frame_id == ("os_sensor" if n < 4 else "base_link")
+        np.testing.assert_allclose(transform_matrix(message.pose.pose), expected, atol=ACCURATE)
+
+    def since() -> set[str]:
+        return {t.child_frame_id for m in tf for t in m.transforms if stamp_ns(t.header) >= drive.stamp(4)}
+
+    r.wait(lambda: "base_link" in since(), "/tf")
+    assert "os_sensor" not in since()  # it has a parent
+
+
+def test_the_lidars_own_frame_is_the_base_where_tf_static_does_not_name_it(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.tf_timeout:=0.2")
+    publish_static(r, "base_link", "camera", np.eye(4))
+    r.send_and_wait(0, 1)
+    assert [message.child_frame_id for message in r.odom] == ["lidar", "lidar"]
+
+
+def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
+    """A recording without /clock, or a sensor whose clock is not set: a warning with both values."""
+    r = rig()
+    r.send_and_wait(0, 1, 2)
+    status = r.status("odometry", saying("tracking; clouds are stamped"), since=0)
+    assert status.level == DiagnosticStatus.WARN
+    stamp, _, message = status.message.partition(" s (2023-11-14 22:13:20 UTC), the clock of this machine says")
+    assert stamp.startswith("tracking; clouds are stamped 1700000000.")
+    assert message.endswith("a recording wants use_sim_time and /clock")
+    values = figures(status)
+    assert stamp.endswith(values["cloud stamp (s)"])
+    assert abs(float(values["clock (s)"]) - time.time()) < 60
+
+
+def test_sim_time_without_a_clock_is_reported(rig: Callable[..., Rig]) -> None:
+    r = rig("use_sim_time:=true")
+    r.send_and_wait(0, 1, 2)
+    status = r.status("odometry", lambda s: s.message.endswith("use_sim_time is on, and /clock has no publisher"), 0)
+    assert status.level == DiagnosticStatus.WARN
