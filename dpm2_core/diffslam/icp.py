@@ -73,6 +73,12 @@ def register(source: Cloud, target: Cloud, T_init: Tensor, settings: IcpSettings
     return solve(_Matching(source, target, settings), T_init.detach().double()[:, None], settings.solver)[:, 0]
 
 
+@torch.no_grad()
+def matched(source: Cloud, target: Cloud, T: Tensor, settings: IcpSettings) -> Tensor:
+    """(B,) share of the source's weight that has a counterpart at T_target_source (B, 4, 4); without gradient."""
+    return problem(source, target, settings).associate(T[:, None]).total / source.weights.sum(1).clamp(min=1e-9)
+
+
 def problem(source: Cloud, target: Cloud, settings: IcpSettings) -> _Matching:
     """What `register` solves, for `soft_lm.iterates`."""
     return _Matching(source, target, settings)

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Annotated, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from dpm2_core.config import Settings
 from dpm2_core.diffslam.clouds import window
-from dpm2_core.diffslam.icp import Cloud, IcpSettings, register
+from dpm2_core.diffslam.icp import Cloud, IcpSettings, matched, register
 from dpm2_core.diffslam.relaxation import relax
 from dpm2_core.diffslam.soft_lm import SoftLmSettings
 from dpm2_core.errors import UsageError
@@ -33,8 +34,8 @@ class SlamLossSettings(Settings):
     """Of a scan, at most."""
     voxel: float = Field(default=0.5, gt=0)
     """A scan of more points is downsampled to one in each voxel of this edge first, m."""
-    spans: tuple[int, ...] = Field(default=(1,), min_length=1)
-    """Scans this far apart are registered. More than one span makes a pose graph, which is relaxed."""
+    spans: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(1,), min_length=1)
+    """Scans this far apart are registered. More than the span of 1 makes a pose graph, which is relaxed."""
     graph: SoftLmSettings = SoftLmSettings(iterations=5)
     """Of that relaxation."""
     rotation_weight: float = Field(default=25.0, ge=0)
@@ -43,11 +44,18 @@ class SlamLossSettings(Settings):
     """Both trajectories start where that of the target scans has ended, instead of at the guess: for scans so far apart
     that the iterations do not converge from there. What has not converged has a gradient that says little."""
     truncate: int = Field(default=0, ge=0)
-    """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass."""
+    """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass.
+    Only with spans of 1: in a pose graph there is no way along which they pass."""
 
     placebo: bool = False
     """For experiments: a window is compared with the trajectory of the window before; the first, with its own, which
     costs nothing. The same loss and bound, without what it has to say."""
+
+    @model_validator(mode="after")
+    def _check_truncate(self) -> Self:
+        if self.truncate and set(self.spans) != {1}:
+            raise ValueError("truncate needs spans of 1: a pose graph has no chain to cut")
+        return self
 
 
 def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 25.0) -> Tensor:
@@ -74,7 +82,8 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
              settings: SlamLossSettings | None = None, name: str = "scans") -> Tensor:  # fmt: skip
     """Trajectory (T, 4, 4) T_first_scan float64 of T contiguous scans, differentiable in points and weights.
 
-    All pairs are registered at once, each from the guess. A pair without evidence (weights of zero) keeps its guess.
+    Steps are registered at once, each from the guess; longer spans then, from where the steps have led. A pair without
+    evidence (weights of zero) keeps its start, and counts for nothing where there are longer spans.
 
     Args:
         guess: (4, 4) or (T - 1, 4, 4) motion from a scan to the next, T_scan_next, without gradient; identity if None.
@@ -85,17 +94,17 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
     settings = settings or SlamLossSettings()
     points, w = window(clouds, weights, settings.points, settings.voxel, name)
     scans = Cloud(points, w, settings.icp.normal_neighbours)
-    steps = _guessed_steps(guess, points)
-    guessed = _chain(steps, 0)
-    spans = sorted({1, *settings.spans})
-    edges = torch.tensor([(i, i + span) for span in spans for i in range(len(points) - span)])
-    target, source = edges[:, 0].to(points.device), edges[:, 1].to(points.device)
-    found = register(scans.select(source.tolist()), scans.select(target.tolist()),
-                     se3_torch.inverse(guessed[target]) @ guessed[source], settings.icp)  # fmt: skip
-    poses = _chain(found[: len(points) - 1], settings.truncate)
-    if len(edges) == len(points) - 1:
+    steps = _edges([1], len(points))
+    found, evidence = _register(scans, steps, _guessed_steps(guess, points), settings.icp)
+    poses = _chain(found, settings.truncate)
+    longer = _edges(sorted(set(settings.spans) - {1}), len(points))
+    if not len(longer):
         return poses
-    return relax(poses.detach(), edges, found, None, settings.rotation_weight, settings.graph)
+    start = poses.detach()
+    led_to = se3_torch.inverse(start[longer[:, 0]]) @ start[longer[:, 1]]
+    farther, seen = _register(scans, longer, led_to, settings.icp)
+    edges, measured, shares = torch.cat([steps, longer]), torch.cat([found, farther]), torch.cat([evidence, seen])
+    return relax(start, edges, measured, shares, settings.rotation_weight, settings.graph)
 
 
 class SlamLoss(torch.nn.Module):
@@ -172,6 +181,18 @@ def check_contiguous(frames: Sequence[tuple[str, int]], length: int) -> None:
     gaps = {b - a for a, b in pairwise(numbers)}
     if len(gaps) != 1 or min(gaps) < 1:
         raise UsageError(f"window: frames {list(numbers)} of sequence {names[0]} are not contiguous")
+
+
+def _edges(spans: Sequence[int], scans: int) -> Tensor:
+    """(E, 2) pairs (target, source) of scans so far apart."""
+    return torch.tensor([(i, i + span) for span in spans for i in range(scans - span)], dtype=torch.int64).view(-1, 2)
+
+
+def _register(scans: Cloud, edges: Tensor, T_init: Tensor, settings: IcpSettings) -> tuple[Tensor, Tensor]:
+    """T_target_source (E, 4, 4) of pairs of scans, and (E,) how much of each source was matched, 0..1."""
+    target, source = scans.select(edges[:, 0].tolist()), scans.select(edges[:, 1].tolist())
+    found = register(source, target, T_init, settings)
+    return found, matched(source, target, found.detach(), settings)
 
 
 def _guessed_steps(guess: Tensor | None, points: Tensor) -> Tensor:

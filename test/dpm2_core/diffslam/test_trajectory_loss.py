@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from torch import Tensor
 
 from dpm2_core.diffslam import SlamLoss, SlamLossSettings, trajectory_loss
@@ -137,6 +138,31 @@ def test_spans_make_a_graph_that_averages_noise(noisy: list[Tensor], motion: Ten
     graph = odometry(noisy, settings=CONVERGED.model_copy(update={"spans": (1, 2)}))
     assert float((graph - chain).abs().max()) > 1e-6
     torch.testing.assert_close(graph, requested, atol=0.02, rtol=0)  # noise of 1 cm on 600 points, three steps
+
+
+def test_a_scan_that_shows_nothing_does_not_move_the_others(scans: list[Tensor], motion: Tensor) -> None:
+    """Its pairs count for nothing; the pair around it holds the trajectory together. It stays where its guess leads."""
+    requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    weights = [torch.ones(len(scan)).double() for scan in scans]
+    weights[2] = torch.zeros(len(scans[2])).double()
+    found = odometry(scans, weights, settings=CONVERGED.model_copy(update={"spans": (1, 2)}))
+    torch.testing.assert_close(found[[0, 1, 3]], requested[[0, 1, 3]], atol=2e-3, rtol=0)
+    torch.testing.assert_close(found[2], found[1], atol=2e-3, rtol=0)
+
+
+def test_scans_far_apart_are_registered_from_where_the_steps_have_led(scans: list[Tensor], motion: Tensor) -> None:
+    """Three steps of 0.8 m are too far for two iterations from the identity."""
+    requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
+    graph = odometry(scans, settings=SlamLossSettings(spans=(1, 3)))
+    chain = odometry(scans)
+    torch.testing.assert_close(graph, requested, atol=max(2e-3, 2 * float((chain - requested).abs().max())), rtol=0)
+    assert torch.equal(odometry(scans, settings=SlamLossSettings(spans=(1, 10))), chain)  # no scans are so far apart
+
+
+@pytest.mark.parametrize("settings", [{"spans": (1, 2), "truncate": 2}, {"spans": (0,)}, {"spans": ()}])
+def test_spans_that_make_no_sense_are_rejected(settings: dict) -> None:
+    with pytest.raises(ValidationError):
+        SlamLossSettings(**settings)
 
 
 def test_reference_is_kept_by_frame(noisy: list[Tensor], scans: list[Tensor]) -> None:
