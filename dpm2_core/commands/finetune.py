@@ -30,6 +30,7 @@ def finetune(
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """
     from dpm2_core.data.open import open_source
+    from dpm2_core.data.packed import open_packed, packed_digest
     from dpm2_core.experiments.begun import begin_or_resume
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
@@ -38,12 +39,16 @@ def finetune(
 
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
-    begin_or_resume(out, resume, chosen, [start], {"SRC": [str(path.resolve()) for path in src]})
+    data: dict[str, object] = {"SRC": [str(path.resolve()) for path in src]}
+    if chosen.rehearsal:
+        data["content of rehearsal"] = packed_digest(open_packed(Path(chosen.rehearsal)))
+    begin_or_resume(out, resume, chosen, [start], data)
     network = load_network(chosen.weights, threads=2).settings
     sources = [open_source(path, chosen.input) for path in src]
     console = Console(stderr=True)
     with console.status("") as status:
-        finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update)
+        for note in finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update):
+            console.print(note, soft_wrap=True)
         status.update("measuring")
         before = work.measure(start, chosen, out)
     written = work.finetune(chosen, out, resume)

@@ -23,8 +23,8 @@ NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
 SUCCESS = (0.6, 1.5)  # m, deg
 
 
-def _has_pair(poses: Array, low: float, high: float) -> bool:
-    """Whether two of (N, 4, 4) poses are so far apart, m."""
+def has_pair(poses: Array, low: float, high: float) -> bool:
+    """Whether two of (N, 4, 4) poses are so far apart, m; those that are NaN are not looked at."""
     distance = pdist(poses[:, :3, 3])
     return bool(((distance > low) & (distance <= high)).any())
 
@@ -45,7 +45,7 @@ class PairSet:
         self._scale: list[float] = []
         bounds = (0.0, NEAR), (NEAR, farthest)
         for low, high in bounds:
-            if not any(_has_pair(drive.poses, low, high) for drive in self.drives):
+            if not any(has_pair(drive.poses, low, high) for drive in self.drives):
                 raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
         while len(self.pairs) < pairs:
             d = int(noise.integers(len(self.drives)))

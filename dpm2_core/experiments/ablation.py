@@ -5,7 +5,7 @@ and measured on the same unseen pairs."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from statistics import mean
@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import Field
 
 from dpm2_core.config import Settings, dump_settings, merged
+from dpm2_core.data.packed import open_packed, packed_digest
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.experiments.begun import begin_training
 from dpm2_core.experiments.paired import Gain, paired_gain
@@ -90,9 +91,10 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     training = settings.training.model_copy(update={"network": network, "optimiser": optimiser})
     folder = out / name.replace(" ", "_") / str(seed)
     weights, known = folder / "weights.safetensors", folder / "figures.json"
-    asked = {"measure": settings.measure, "pairs": settings.pairs}
+    asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
     read = [Path(training.start)] if training.start else []
-    resume = begin_training(folder, dump_settings(training), weights.name, read)
+    text = dump_settings(training) + "".join(f"# {line}\n" for line in _content(training.data.packed))
+    resume = begin_training(folder, text, weights.name, read)
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():
@@ -107,6 +109,11 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     with atomic_write(known) as file:
         file.write(json.dumps({"asked": asked, "figures": figures}))
     return figures
+
+
+def _content(folders: Iterable[str]) -> list[str]:
+    """What folders of packed drives hold, so that others in their place are noticed."""
+    return [f"{folder}: {packed_digest(open_packed(Path(folder)))}" for folder in folders]
 
 
 def gains(table: Table) -> dict[str, dict[str, dict[str, Any]]]:

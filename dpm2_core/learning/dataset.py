@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -23,9 +23,20 @@ from dpm2_core.learning.augment import AugmentSettings, augment
 from dpm2_core.network.pyramid import MIN_POINTS, PointBatch, Pyramid, build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import Views, collate_views
+from dpm2_core.sim.settings import PRESET_NAMES
 
 _LEAST = 8 * MIN_POINTS  # points of a scan that is learnt from
 _PLACES = 100  # that are tried
+
+
+def _check_place(name: str) -> str:
+    if name not in PRESET_NAMES:
+        raise ValueError(f"no preset of the synthetic city; there are {', '.join(PRESET_NAMES)}")
+    return name
+
+
+Place = Annotated[str, AfterValidator(_check_place)]
+"""Name of a preset of the synthetic city."""
 
 
 class PackedSettings(Settings):
@@ -33,7 +44,7 @@ class PackedSettings(Settings):
 
     packed: dict[str, NonNegativeFloat] = Field({})
     """Folders of packed drives (`dpm2 train pack`) and the weight of each in the mixture."""
-    emphasis: dict[str, NonNegativeFloat] = Field({})
+    emphasis: dict[Place, NonNegativeFloat] = Field({})
     """Factor on the weight of drives of a preset of the synthetic city, such as {tunnel: 3}."""
     groups: int = Field(4, gt=0)
     """Places in a batch, per process."""
@@ -56,7 +67,7 @@ class DataSettings(GroupSettings):
     """Frames of each place: one, and others within `radius` of it."""
     radius: float = Field(20.0, gt=0)
     """m."""
-    radii: dict[str, PositiveFloat] = Field({})
+    radii: dict[Place, PositiveFloat] = Field({})
     """The same for drives of a preset of the synthetic city, such as {tunnel: 15}: what looks alike all along shows
     from afar nothing to learn from."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.pair_set import NEAR
+from dpm2_core.evaluation.pair_set import FAR, NEAR, has_pair
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.generate import check_same, generate, pack
@@ -48,15 +48,18 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
 def prepare(
     sources: Sequence[Source], settings: FinetuneSettings, network: NetworkSettings, slam: SlamSettings, out: Path,
     advance: Callable[[str], None] = lambda what: None,
-) -> None:  # fmt: skip
+) -> list[str]:  # fmt: skip
     """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
+
+    Returns:
+        Notes: of which drives the part that is held out has nothing to measure.
 
     Raises:
         UsageError: the SLAM could hardly follow a drive, or one that is there is another one or of other settings.
     """
     common = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
     slam = slam.model_copy(update={"registration": settings.reference})
-    names = [f"{i:02d}_{source.name.replace('/', '_')}" for i, source in enumerate(sources)]
+    notes, names = list[str](), [f"{i:02d}_{source.name.replace('/', '_')}" for i, source in enumerate(sources)]
     for kept in (out / DRIVES, out / HELD_OUT):
         if left := sorted({path.name for path in kept.glob("*/")} - set(names)):
             raise UsageError(f"{kept / left[0]}: of a drive that is not asked for; remove it, or choose another folder")
@@ -70,16 +73,19 @@ def prepare(
         if len(known) < 2 * settings.frames:
             raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
         cut = round(len(source) * (1 - settings.held_out))
-        for folder, part in ((HELD_OUT, range(cut, len(source))), (DRIVES, range(cut))):
-            if folder == DRIVES or _reaches_far(referenced.poses[part.start :]):
-                packing = partial(advance, f"{name}: packing")
-                pack(referenced, out / folder / name, network, part, packing, asked)
+        packing = partial(advance, f"{name}: packing")
+        if _is_measurable(referenced.poses[cut:]):
+            pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, asked)
+        elif cut < len(source):
+            lacks = f"no pairs up to {NEAR:g} m and {NEAR:g} to {FAR:g} m apart, as are measured"
+            notes.append(f"{name}: the {len(source) - cut} scans that are held out have {lacks}")
+        pack(referenced, out / DRIVES / name, network, range(cut), packing, asked)
     if settings.rehearsal_share > 0 and not settings.rehearsal:
         worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
         generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))
+    return notes
 
 
-def _reaches_far(poses: Array) -> bool:
-    """Whether pairs of every distance that `PairSet` wants can be drawn from a drive (N, 4, 4)."""
-    at = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
-    return len(at) > 1 and float(np.linalg.norm(at - at[0], axis=1).max()) > 2 * NEAR
+def _is_measurable(poses: Array) -> bool:
+    """Whether pairs of every distance that `PairSet` draws are among (N, 4, 4) poses."""
+    return has_pair(poses, 0.0, NEAR) and has_pair(poses, NEAR, FAR)

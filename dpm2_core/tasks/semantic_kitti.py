@@ -102,6 +102,8 @@ class _KittiRun:
             raise UsageError(f"{path}: {error.strerror}") from None
         if size % _BYTES[kind]:
             raise UsageError(f"{path}: {size} bytes are not whole points of {_BYTES[kind]}; damaged or cut off")
+        if size == 0:
+            raise UsageError(f"{path}: the file is empty")
         return size // _BYTES[kind]
 
     def _values(self, kind: str, number: int, dtype: DTypeLike) -> np.ndarray:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.experiments.ablation import MIXTURES, TABLE_4, AblationSettings, ablation, ablation_tables, gains
 from dpm2_core.learning.dataset import DataSettings
@@ -89,6 +90,29 @@ def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
             ablation(other, tmp_path)
     (after,) = ablation(other, tmp_path).values()
     assert after["same"]["near_m"] != before["same"]["near_m"]
+
+
+@pytest.mark.slow
+def test_other_drives_in_a_folder_are_learned_from_and_measured_anew(
+    packed: Path, samples: list[Sample], tmp_path: Path
+) -> None:
+    """The record had the figures of drives that were no longer there."""
+    measured, out = tmp_path / "val", tmp_path / "out"
+    write_packed(measured / "world", samples, {"source": "boxes"})
+    variants = {"no camera": {"image": {"backbone": "none"}}}
+    settings = AblationSettings(
+        training=quick(packed), variants=variants, seeds=1, measure={"unseen": str(measured)}, pairs=2
+    )
+    (before,) = ablation(settings, out).values()
+    (weights,) = out.rglob("weights.safetensors")
+    trained = weights.stat().st_mtime_ns
+    write_packed(measured / "another", samples[::2], {"source": "boxes"})
+    (after,) = ablation(settings, out).values()
+    assert after["unseen"]["near_m"] != before["unseen"]["near_m"]
+    assert weights.stat().st_mtime_ns == trained
+    write_packed(packed / "another", samples[::2], {"source": "boxes"})
+    ablation(settings, out)
+    assert weights.stat().st_mtime_ns > trained
 
 
 def test_a_gain_is_of_the_same_seeds() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from dpm2_core.data.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
@@ -142,6 +143,13 @@ def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None
         places = [settings.draw(drive, np.random.default_rng(seed)) for seed in range(50)]
         apart = [abs(place[1:] - place[0]).max() for place in places]
         assert 0.8 * farthest < max(apart) <= farthest
+
+
+@pytest.mark.parametrize("setting", [{"emphasis": {"citty": 100}}, {"radii": {"tunel": 1}}])
+def test_a_place_that_is_none_is_rejected(setting: dict) -> None:
+    """It was taken, and changed nothing."""
+    with pytest.raises(ValidationError, match="there are city, suburb, rural"):
+        DataSettings(**setting)
 
 
 def test_a_lonely_frame_is_its_own_group() -> None:

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from dpm2_core.data.open import open_source
-from dpm2_core.data.packed import open_packed
+from dpm2_core.data.packed import Sample, open_packed, write_packed
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.learning.finetune import draw_road_segment, finetune, window_trajectories
-from dpm2_core.learning.finetune_data import prepare, refer
+from dpm2_core.learning.finetune_data import Referenced, prepare, refer
 from dpm2_core.learning.finetune_settings import FinetuneOptimizer, FinetuneSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.tokens import Tokens
@@ -177,6 +177,26 @@ def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
 
 
 @pytest.mark.slow
+def test_a_held_out_part_is_measured_where_it_has_pairs_and_named_where_it_has_none(
+    recording: Path, tmp_path: Path, settings: FinetuneSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last four scans are within 5 m, the last ten are not; scans that are 7 m apart have no near pair."""
+    network = load_model(Path(settings.weights)).settings
+    for held_out, every, measured in ((0.15, 1, False), (0.4, 1, True), (0.5, 8, False)):
+        source = open_source(recording)
+        poses = _truth(recording).copy()
+        poses[:, :3, 3] *= every
+        chosen = settings.model_copy(update={"held_out": held_out})
+        out = tmp_path / f"{held_out}"
+        reference = Referenced(source, poses)
+        monkeypatch.setattr("dpm2_core.learning.finetune_data.refer", lambda *_, r=reference: r)
+        notes = prepare([source], chosen, network, SlamSettings(), out)
+        assert (out / "held_out").exists() is measured
+        assert [" that are held out have no pairs up to 5 m" in note for note in notes] == ([] if measured else [True])
+        assert sum(len(packed) for packed in open_packed(out / "drives")) == round(24 * (1 - held_out))
+
+
+@pytest.mark.slow
 def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: FinetuneSettings) -> None:
     for arguments, message in (
         ([str(tmp_path / "none")], "none"),
@@ -188,3 +208,16 @@ def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: F
         assert done.returncode == 2
         assert message in done.stderr
         assert done.stderr.count("\n") == 1
+
+
+def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
+    packed: Path, samples: list[Sample], tmp_path: Path, settings: FinetuneSettings
+) -> None:
+    """Packed again, with another drive, they gave other weights without a word."""
+    asked = ["finetune", tmp_path / "none", "--out", tmp_path / "o", "--set", f"weights={settings.weights}"]
+    asked += ["--set", f"rehearsal={packed}"]
+    assert "none: no such file" in dpm2(*asked).stderr  # after what was asked for has been written
+    (tmp_path / "o" / "checkpoint.pt").touch()
+    assert "none: no such file" in dpm2(*asked, "--resume").stderr
+    write_packed(packed / "another", samples[:2], {"source": "boxes"})
+    assert "began with content of rehearsal" in dpm2(*asked, "--resume").stderr

@@ -95,6 +95,8 @@ def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Pat
         ("velodyne", "000001.bin", -16, "1600 labels for 1599 points"),
         ("velodyne", "000001.bin", -7, "not whole points"),
         ("static", "000005.bin", -1, "not whole points"),
+        ("static", "000005.bin", 0, "the file is empty"),
+        ("velodyne", "000004.bin", 0, "the file is empty"),
         ("labels", "000000.label", None, "No such file"),
         ("static", "000003.bin", None, "No such file"),
     ],
