@@ -39,7 +39,7 @@ class TerminalView(View):
 
     def begun(self, names: Sequence[str]) -> None:
         """As `View`."""
-        self._names = list(names)
+        self._names, self._ended = list(names), {}  # a merge begins several times
 
     def running(self, status: Mapping[str, Status]) -> None:
         """As `View`."""
