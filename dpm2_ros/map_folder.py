@@ -46,7 +46,7 @@ class MapFolder:
 
     def free(self, requested: Path) -> Iterator[Path]:
         """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds."""
-        for path in _numbered(self.of_robot(requested)):
+        for path in _numbered(self.of_robot(requested), requested.suffix):
             if not path.exists() and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
@@ -84,7 +84,9 @@ def _age(path: Path) -> float:
     return path.stat().st_mtime
 
 
-def _numbered(path: Path) -> Iterator[Path]:
-    """The path, and without end the same with -2, -3, ... before its suffix."""
+def _numbered(path: Path, suffix: str = "") -> Iterator[Path]:
+    """The path, and without end the same with -2, -3, ... before that suffix; a folder has none, though its name may
+    have a dot."""
     yield path
-    yield from (path.with_name(f"{path.stem}-{n}{path.suffix}") for n in count(2))
+    stem = path.name.removesuffix(suffix)
+    yield from (path.with_name(f"{stem}-{n}{suffix}") for n in count(2))
