@@ -86,7 +86,8 @@ def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[s
     if not settled:
         out.append("the results had not come to rest; these are the last ones")
     if figures["trajectories"] > max(1, 0.1 * figures["vertices"]):
-        out.append(f"{figures['trajectories']} trajectories: most vertices are not tied to the one before by an edge")
+        untied = f"{figures['trajectories'] - 1} of {figures['vertices']} vertices"
+        out.append(f"{figures['trajectories']} trajectories: {untied} are not tied to the one before by an edge")
     if figures["kept"] < 0.5 * figures["loops"]:
         out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the rest was left out")
     if undecided:
