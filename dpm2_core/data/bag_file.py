@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from heapq import merge
 from io import BufferedReader, FileIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ class Bag:
         types: topic to message type, such as sensor_msgs/msg/PointCloud2.
         counts: topic to number of messages.
         notes: messages for the user (salvaged, damaged).
+        start: log time of the first message, ns; 0 where it is not known.
     """
 
     path: Path
@@ -51,11 +53,12 @@ class Bag:
     counts: dict[str, int]
     _read: Callable[[Collection[str]], Iterator[RawMessage]]
     notes: list[str] = field(default_factory=list)
+    start: int = 0
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """(topic, log time in ns, serialized message) of some topics, in order of log time.
 
-        Where the file turns out damaged the messages end, and `notes` says so.
+        Where a file turns out damaged its messages end, and `notes` says so.
         """
         requested = [topic for topic in topics if topic in self.types]
         if not requested:
@@ -99,32 +102,61 @@ class Bag:
 
 
 def open_bag(path: Path) -> Bag:
-    """Open a rosbag2 folder, or a .mcap, .db3 or ROS 1 .bag file. A truncated MCAP file gives what is whole.
+    """Open a rosbag2 folder, or a .mcap, .db3 or ROS 1 .bag file. A truncated MCAP file gives what is whole; a file of
+    a folder that cannot be read is left out, with a note.
 
     Raises:
         UsageError: there is nothing that can be read, and why.
     """
     if path.suffix == ".bag" and path.is_file():
         return _open_ros1(path)
-    attempts: list[list[Path]] = [[path]]
-    files = [path]
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
-        attempts = [[path], files] if (path / "metadata.yaml").is_file() else [files]
+    if not path.is_dir():
+        return _open_file(path)
+    files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3") and file.is_file())
     if not files:
         raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
-    reasons = []
-    for paths in attempts:
+    missing = "no metadata.yaml"
+    if (path / "metadata.yaml").is_file():
         try:
-            bag = _open_indexed(path, paths)
-        except Exception as error:  # rosbags raises ReaderError, TypeError, apsw.Error... by the kind of damage
-            reasons.append(_reason(error))
-            continue
-        if path.is_dir() and paths is files:
-            missing = f"metadata.yaml is unusable ({reasons[0]})" if reasons else "no metadata.yaml"
-            bag.notes.append(f"{path}: {missing}; read {', '.join(file.name for file in files)}")
-        return bag
-    return _salvage(path, files, reasons[-1])
+            return _open_indexed(path)
+        except Exception as error:  # as in _open_file
+            missing = f"metadata.yaml is unusable ({_reason(error)})"
+    bag = _open_files(path, files)
+    if not bag.notes:  # a damaged file is what makes the metadata unusable, and is named
+        bag.notes.append(f"{path}: {missing}; read {', '.join(file.name for file in files)}")
+    return bag
+
+
+def _open_files(path: Path, files: list[Path]) -> Bag:
+    """Several files of one recording as one bag. What cannot be read of one of them costs nothing of the others."""
+    parts, problems = list[Bag](), list[str]()
+    for file in files:
+        try:
+            parts.append(_open_file(file))
+        except (UsageError, OSError) as error:
+            problems.append(str(error))
+    if not parts:
+        raise UsageError(problems[0])
+    notes = [f"{problem}; read without it" for problem in problems] + [note for part in parts for note in part.notes]
+    types, counts = dict[str, str](), Counter[str]()
+    for part in parts:
+        types |= part.types
+        counts.update(part.counts)
+        part.notes = notes
+    return Bag(path, types, counts, partial(_read_parts, parts), notes)
+
+
+def _read_parts(parts: list[Bag], topics: Collection[str]) -> Iterator[RawMessage]:
+    """The messages of all in order of log time; a file is opened when its first message is due."""
+    streams = (chain([("", part.start, b"")], part.messages(topics)) for part in parts)
+    return (message for message in merge(*streams, key=lambda message: message[1]) if message[0])
+
+
+def _open_file(file: Path) -> Bag:
+    try:
+        return _open_indexed(file)
+    except Exception as error:  # rosbags raises ReaderError, TypeError, apsw.Error... by the kind of damage
+        return _salvage(file, _reason(error))
 
 
 def _reason(error: Exception) -> str:
@@ -137,30 +169,28 @@ def _jazzy() -> Typestore:
 
 
 @contextmanager
-def _opened(paths: list[Path]) -> Iterator[list[Reader]]:
-    for path in paths:
-        for file in path.glob("*.db3") if path.is_dir() else [path]:
-            if file.suffix == ".db3":
-                check_plain(file)
-    with ExitStack() as stack:
-        yield [stack.enter_context(Reader(path)) for path in paths]
+def _opened(path: Path) -> Iterator[Reader]:
+    for file in path.glob("*.db3") if path.is_dir() else [path]:
+        if file.suffix == ".db3":
+            check_plain(file)
+    with Reader(path) as reader:
+        yield reader
 
 
-def _open_indexed(path: Path, paths: list[Path]) -> Bag:
-    with _opened(paths) as readers:
-        connections = [connection for reader in readers for connection in reader.connections]
+def _open_indexed(path: Path) -> Bag:
+    with _opened(path) as reader:
+        connections, start = list(reader.connections), reader.start_time
     types = {connection.topic: connection.msgtype for connection in connections}
     counts = Counter(dict.fromkeys(types, 0))
     for connection in connections:
         counts[connection.topic] += connection.msgcount
-    return Bag(path, types, dict(counts), partial(_read_indexed, paths))
+    return Bag(path, types, counts, partial(_read_indexed, path), start=start)
 
 
-def _read_indexed(paths: list[Path], topics: Collection[str]) -> Iterator[RawMessage]:
-    with _opened(paths) as readers:
-        requested = [[c for c in reader.connections if c.topic in topics] for reader in readers]
-        streams = [reader.messages(connections=c) for reader, c in zip(readers, requested, strict=True) if c]
-        for connection, time, data in merge(*streams, key=lambda message: message[1]):
+def _read_indexed(path: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+    with _opened(path) as reader:
+        requested = [connection for connection in reader.connections if connection.topic in topics]
+        for connection, time, data in reader.messages(connections=requested):
             yield connection.topic, time, data
 
 
@@ -191,46 +221,43 @@ def _as_ros2(data: bytes, kind: str) -> bytes:
     return b""
 
 
-def _salvage(path: Path, files: list[Path], reason: str) -> Bag:
-    """What can be read of MCAP files from their start, without the index at their end."""
-    for file in files:
-        with file.open("rb") as stream:
-            head = stream.read(len(_MCAP_MAGIC))
-        if not head:
-            raise UsageError(f"{file}: the file is empty")
-        if head != _MCAP_MAGIC:
-            kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
-            raise UsageError(f"{file}: {kind}: {reason}")
-    types: dict[str, str] = {}
-    counts: Counter[str] = Counter()
-    for topic, kind, _, _ in _whole_messages(files):
+def _salvage(file: Path, reason: str) -> Bag:
+    """What can be read of an MCAP file from its start, without the index at its end, in the order of the file."""
+    with file.open("rb") as stream:
+        head = stream.read(len(_MCAP_MAGIC))
+    if not head:
+        raise UsageError(f"{file}: the file is empty")
+    if head != _MCAP_MAGIC:
+        kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
+        raise UsageError(f"{file}: {kind}: {reason}")
+    types, counts, start = dict[str, str](), Counter[str](), _LATEST
+    for topic, kind, time, _ in _whole_messages(file):
         types[topic] = kind
         counts[topic] += 1
+        start = min(start, time)
     if not types:
-        raise UsageError(f"{path}: truncated before its first message ({reason})")
-    bag = Bag(path, types, dict(counts), partial(_read_whole, files))
-    bag.notes.append(f"{path}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved")
-    return bag
+        raise UsageError(f"{file}: truncated before its first message ({reason})")
+    note = f"{file}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved"
+    return Bag(file, types, counts, partial(_read_whole, file), [note], start)
 
 
-def _read_whole(files: list[Path], topics: Collection[str]) -> Iterator[RawMessage]:
-    return ((topic, time, data) for topic, _, time, data in _whole_messages(files) if topic in topics)
+def _read_whole(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+    return ((topic, time, data) for topic, _, time, data in _whole_messages(file) if topic in topics)
 
 
-def _whole_messages(files: list[Path]) -> Iterator[tuple[str, str, int, bytes]]:
-    """(topic, type, log time, data) in the order of the files, up to where each is cut."""
-    for file in files:
-        schemas: dict[int, str] = {}
-        channels: dict[int, tuple[str, str]] = {}
-        # The cut raises anything from EOFError to the decompressor's own errors.
-        with _WholeReads(FileIO(file)) as stream, suppress(Exception):
-            for record in StreamReader(stream, record_size_limit=file.stat().st_size).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, Channel):
-                    channels[record.id] = (record.topic, schemas[record.schema_id])
-                elif isinstance(record, Message):
-                    yield (*channels[record.channel_id], record.log_time, record.data)
+def _whole_messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
+    """(topic, type, log time, data) up to where the file is cut."""
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+    # The cut raises anything from EOFError to the decompressor's own errors.
+    with _WholeReads(FileIO(file)) as stream, suppress(Exception):
+        for record in StreamReader(stream, record_size_limit=file.stat().st_size).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = (record.topic, schemas[record.schema_id])
+            elif isinstance(record, Message):
+                yield (*channels[record.channel_id], record.log_time, record.data)
 
 
 class _WholeReads(BufferedReader):

@@ -120,3 +120,56 @@ def test_a_damaged_chunk_ends_the_drive_and_says_so(bags: Any, tmp_path: Path) -
     assert [frame.points[0, 0] for frame in frames] == list(range(len(frames)))
     assert 0 < len(frames) < len(source) == 100
     assert any(f"damaged after {len(frames)} messages of /points" in note for note in source.notes)
+
+
+# --- split recordings
+
+
+def split(bags: Any, folder: Path, plugin: str = "MCAP", zstd: bool = False) -> list[Path]:
+    """Twelve files of two clouds each whose numbers have no zeros before them, and no metadata.yaml."""
+    folder.mkdir()
+    for n in range(12):
+        times = [1 + 0.2 * n, 1.1 + 0.2 * n]
+        messages = [(t, POINTS, bags.cloud(t, x=2.0 * n + i)) for i, t in enumerate(times)]
+        part = bags.write(folder.with_name(f"part_{n}"), messages, plugin, zstd=zstd)
+        (file,) = (file for file in part.iterdir() if file.suffix != ".yaml")
+        file.rename(folder / f"drive_{n}{file.suffix}")
+    return sorted(folder.iterdir(), key=lambda file: int(file.stem.removeprefix("drive_")))
+
+
+@pytest.mark.parametrize(
+    ("plugin", "keep", "count", "note"),
+    [
+        ("MCAP", 0.99, 24, r"drive_11\.mcap: truncated or never closed \(.*\); 2 messages of it could be saved"),
+        ("MCAP", 0.1, 22, r"drive_11\.mcap: truncated before its first message \(.*\); read without it"),
+        ("MCAP", 0, 22, r"drive_11\.mcap: the file is empty; read without it"),
+        ("SQLITE3", 0.5, 22, r"drive_11\.db3: cannot be read as a bag: .*; read without it"),
+    ],
+)
+def test_a_split_recording_whose_last_file_is_cut(
+    bags: Any, tmp_path: Path, plugin: str, keep: float, count: int, note: str
+) -> None:
+    """All that is whole, in order of time, and the file that is not is named."""
+    last = split(bags, tmp_path / "drive", plugin)[-1]
+    last.write_bytes(last.read_bytes()[: int(keep * last.stat().st_size)])
+    source = BagSource(last.parent)
+    assert [frame.points[0, 0] for frame in source.frames()] == list(range(count))
+    assert len(source) == count
+    assert re.search(note, source.notes[0])
+
+
+def test_a_split_recording_without_metadata_is_read_in_order_of_time(bags: Any, tmp_path: Path) -> None:
+    split(bags, tmp_path / "drive")
+    source = BagSource(tmp_path / "drive")
+    assert [frame.points[0, 0] for frame in source.frames()] == list(range(24))
+    assert "no metadata.yaml; read drive_0.mcap, drive_1.mcap" in source.notes[0]
+
+
+def test_a_damaged_chunk_costs_the_messages_of_its_file_alone(bags: Any, tmp_path: Path) -> None:
+    files = split(bags, tmp_path / "drive", zstd=True)
+    whole = files[5].read_bytes()
+    chunk = whole.index(b"\x28\xb5\x2f\xfd")  # where a zstd frame begins
+    files[5].write_bytes(whole[:chunk] + bytes(20) + whole[chunk + 20 :])
+    source = BagSource(tmp_path / "drive")
+    assert [frame.points[0, 0] for frame in source.frames()] == [*range(10), *range(12, 24)]
+    assert any(re.search(r"drive_5\.mcap: damaged after 0 messages of /points", note) for note in source.notes)
