@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.scan_file import chosen, image_of, image_size, images_of, numbered_scans, read_scan
 from dpm2_core.data.settings import InputSettings
@@ -136,12 +137,15 @@ class KittiSource:
         return checked_correction(message, str(note))
 
     def _stamps(self) -> NDArray[np.int64]:
-        """(len,) ns, continued at a steady pace where times.txt ends early."""
+        """(len,) ns by times.txt, continued at a steady pace where it ends early; else by the names of the scans where
+        those are times since 1970."""
         path, n = self.path / "times.txt", len(self)
         times = read_numbers(path, 1)
         seconds = self._of_each_scan(times)[:, 0]
         known = np.isfinite(seconds)
         if not known.any():
+            if named := name_times(self._scans):
+                return np.array(named, np.int64)
             since = self.numbers - self.numbers[0]
             return self._settings.steady_stamps(since, f"{path}: missing or too short", self.notes)
         if not known.all():

@@ -16,7 +16,8 @@ from dpm2_core.frame import Camera, Image, Points
 
 def numbered_scans(folder: Path) -> list[Path]:
     """NNNNNN.bin, in the order of their numbers; other files are left out."""
-    return [scan for scan in sorted(folder.glob("*.bin")) if scan.stem.isdecimal()]
+    scans = (scan for scan in folder.glob("*.bin") if scan.stem.isdecimal())
+    return sorted(scans, key=lambda scan: (int(scan.stem), scan.name))
 
 
 def read_scan(path: Path) -> tuple[Points, str | None]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -67,6 +67,30 @@ def test_numbers_need_not_start_at_zero_nor_follow_each_other(kitti_folder: Make
     poses = KittiSource(folder).poses
     assert poses is not None
     np.testing.assert_allclose(poses[:, 0, 3], [40, 42, 46])
+
+
+def rename_scans(folder: Path, names: Sequence[int]) -> None:
+    for scan, name in zip(sorted((folder / "velodyne").iterdir()), names, strict=True):
+        scan.rename(scan.with_name(f"{name}.bin"))
+
+
+def test_numbers_without_zeros_before_them_are_in_their_order(kitti_folder: MakeFolder) -> None:
+    folder = kitti_folder(numbers=range(12), images=False)
+    rename_scans(folder, range(12))
+    source = KittiSource(folder)
+    assert [frame.index for frame in source.frames()] == list(range(12))
+    np.testing.assert_array_equal(source.stamps, np.arange(12) * 100_000_000)
+    assert source.notes == []
+
+
+def test_names_that_are_times_are_the_stamps_where_there_is_no_times_txt(kitti_folder: MakeFolder) -> None:
+    folder, times = kitti_folder(images=False), [1_700_000_000_000_000_000 + n * 104_000_000 for n in range(5)]
+    rename_scans(folder, times)
+    assert KittiSource(folder).stamps.tolist() == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
+    (folder / "times.txt").unlink()
+    source = KittiSource(folder)
+    assert source.stamps.tolist() == times
+    assert source.notes == []
 
 
 def test_root_folder_with_one_and_several_sequences(kitti_folder: MakeFolder) -> None:
