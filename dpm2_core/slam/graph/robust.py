@@ -233,30 +233,40 @@ def _poses(values: Any, count: int) -> Array:
 
 
 def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:
-    """Poses with each trajectory placed rigidly where most of its loops to those before agree that it is.
+    """Poses with each trajectory placed rigidly where most of its loops to those placed before agree that it is.
 
-    Without it a trajectory whose own frame is far away or turned would have to find its place by many small steps.
+    Without it a trajectory whose own frame is far away or turned would have to find its place by many small steps. The
+    order is that in which the places follow: from fixed nodes on, each time the one with most loops to what is placed.
     """
     number = trajectories(graph)
     if number[-1] == 0:
         return poses
-    poses = poses.copy()
-    ends_number = number[graph.ends]
-    for this in range(1, number[-1] + 1):
-        own = number == this
-        ties = np.flatnonzero(used & (ends_number.max(1) == this) & (ends_number.min(1) < this))
-        if not len(ties) or own[graph.fixed].any() or own[graph.placed].any():
+    poses, ends_number = poses.copy(), number[graph.ends]
+    used = used & ~np.isin(ends_number, number[graph.placed]).any(1) & (ends_number[:, 0] != ends_number[:, 1])
+    known = np.isin(np.arange(number[-1] + 1), number[graph.fixed])
+    while not known.all():
+        new = used & (known[ends_number].sum(1) == 1)
+        if not new.any():  # a part of the graph begins
+            known[np.argmin(known)] = True
             continue
-        ends, T = graph.ends[ties], graph.T_from_to[ties]
-        swap = ends_number[ties, 0] == this
-        before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
-        T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)
-        moves = se3.orthonormalized(poses[before] @ T_before_after @ se3.inverse(poses[after]))  # else rounding doubles
-        trials = np.concatenate([np.eye(4)[None], moves])
-        costs = []
-        for move in trials:
-            moved = se3.inverse(T_before_after) @ se3.inverse(poses[before]) @ move @ poses[after]
-            chi2 = mahalanobis(se3.log(moved), graph.covariances[ties])
-            costs.append(np.log1p(chi2 / kernel**2).sum())
-        poses[own] = trials[int(np.argmin(costs))] @ poses[own]
+        ends = ends_number[new]
+        this = int(np.bincount(ends[~known[ends]]).argmax())
+        ties = np.flatnonzero(new & (ends_number == this).any(1))
+        poses[number == this] = _move(graph, poses, ties, ends_number[ties, 0] == this, kernel) @ poses[number == this]
+        known[this] = True
     return poses
+
+
+def _move(graph: GraphData, poses: Array, ties: NDArray[np.intp], swap: NDArray[np.bool_], kernel: float) -> Array:
+    """(4, 4) that takes a trajectory to where most of its `ties` agree that it is; `swap`: they begin at it."""
+    ends, T = graph.ends[ties], graph.T_from_to[ties]
+    before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
+    T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)
+    moves = se3.orthonormalized(poses[before] @ T_before_after @ se3.inverse(poses[after]))  # else rounding doubles
+    trials = np.concatenate([np.eye(4)[None], moves])
+    costs = []
+    for move in trials:
+        moved = se3.inverse(T_before_after) @ se3.inverse(poses[before]) @ move @ poses[after]
+        chi2 = mahalanobis(se3.log(moved), graph.covariances[ties])
+        costs.append(np.log1p(chi2 / kernel**2).sum())
+    return np.asarray(trials[int(np.argmin(costs))])

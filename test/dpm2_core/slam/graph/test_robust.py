@@ -109,6 +109,25 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
     assert rmse(result.poses, poses) < 0.6  # odometry noise: 0.02 m per step and 0.002 rad at a lever of 20 m
 
 
+@pytest.mark.parametrize("fixed", [[], [60]], ids=["nothing fixed", "one of the second fixed"])
+def test_a_trajectory_is_placed_by_its_loops_to_what_is_placed_however_they_are_numbered(fixed: list[int]) -> None:
+    """The last one is tied to the first by three loops, and by eight to the second, whose place follows."""
+    poses, graph = laps(150)
+    chained, moved = graph.chained.copy(), graph.poses.copy()
+    steps, covariances = graph.steps.copy(), graph.step_covariances.copy()
+    for first, frame in ((50, [0, 0, 2.5, 60, -40, 0]), (100, [0, 0, -1.5, -50, 70, 0])):
+        chained[first], steps[first], covariances[first] = False, np.eye(4), 0
+        moved[first : first + 50] = se3.exp(np.array(frame, float)) @ graph.poses[first : first + 50]
+    ends = [(k, 100 + (k + 5) % 50) for k in range(0, 48, 16)] + [(50 + k, 100 + k) for k in range(0, 48, 6)]
+    rng = np.random.default_rng(0)
+    a = np.concatenate([rng.integers(0, 50, 2), rng.integers(50, 100, 5)])
+    false = list(zip(a.tolist(), rng.integers(100, 150, 7).tolist(), strict=True))
+    T = np.concatenate([right_loops(poses, ends), se3.exp(rng.normal(size=(7, 6)) * [0.1, 0.1, 0.8, 1.5, 1.5, 0.3])])
+    graph = with_loops(GraphData(moved, chained, steps, covariances), ends + false, T)
+    result = optimize(replace(graph, fixed=np.array(fixed, np.intp)), RobustSettings())
+    np.testing.assert_array_equal(result.kept, np.arange(len(T)) < len(ends))
+
+
 def test_covariance_grows_along_the_chain_as_its_steps_add_up() -> None:
     _, graph = laps(20)
     joint = joint_covariance(graph, graph.poses, np.zeros(0, np.bool_), np.array([19]))
