@@ -158,13 +158,13 @@ class Mapper:
         """Where on Earth the map is, by the fixes of its keyframes; None while that is not known."""
         return self._graph.georeference
 
-    def start_session(self, T_map_odom: Array, covariance: Array, node: int | None = None) -> None:
+    def start_session(self, T_map_odom: Array | None, covariance: Array, node: int | None = None) -> None:
         """Before the first keyframe of a session in a loaded map: where its odometry begins. Else only a loop tells.
 
         Args:
-            T_map_odom: (4, 4).
+            T_map_odom: (4, 4); None: the first keyframe is where `node` is, whose frame it is of.
             covariance: (6, 6) of the first keyframe's pose relative to that of `node`, to which an edge will tie it.
-            node: of the map, whose frame is the new session's first one; None: the nearest whose place is known.
+            node: of the map, from which the odometry goes on; None: the nearest whose place is known.
         """
         self._start = SessionStart(T_map_odom, covariance, node)
 
@@ -288,7 +288,7 @@ class Mapper:
 
     def _begin_session(self, start: SessionStart, node: int, keyframe: Keyframe) -> Edge:
         """The first node of a session, and the edge that ties it to the map."""
-        T = start.T_map_odom @ keyframe.T_odom_kf
+        T = start.T_map_kf(keyframe.T_odom_kf, self.poses)
         edge = start.edge(node, T, self.poses, self.placed)
         if edge.kind == "odometry":
             self._graph.add_node(T, edge)

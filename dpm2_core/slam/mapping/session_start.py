@@ -17,9 +17,16 @@ from dpm2_core.geometry import se3
 class SessionStart:
     """As `Mapper.start_session` is told it, which says what is what."""
 
-    T_map_odom: Array
+    T_map_odom: Array | None
     covariance: Array
     node: int | None
+
+    def T_map_kf(self, T_odom_kf: Array, poses: Array) -> Array:
+        """(4, 4) of the first keyframe; poses: (N, 4, 4) of the map."""
+        if self.T_map_odom is None:
+            assert self.node is not None
+            return np.asarray(poses[self.node])
+        return self.T_map_odom @ T_odom_kf
 
     def edge(self, first: int, T_map_kf: Array, poses: Array, placed: NDArray[np.bool_]) -> Edge:
         """The edge to the first keyframe of the session: a loop to the nearest one, or odometry from `node`.

@@ -180,6 +180,26 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
         assert len([e for e in data.edges if e.kind == "odometry"]) == LAP - 1
 
 
+def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(tmp_path: Path) -> None:
+    """However the odometry begins: level where an IMU has told what is up, so that a tilted LiDAR was tilted twice."""
+    path, drive = tmp_path / "a.dpm2map", laps(1)
+    with MapStore.create(path) as store:
+        store.begin_session()
+        mapper = make(store)
+        for keyframe in drive[:8]:
+            mapper.add(keyframe)
+    with MapStore.open(path, read_only=False) as store:
+        store.begin_session()
+        mapper = make(store)
+        mapper.start_session(None, SIGMA, 7)
+        assert mapper.T_map_odom is None
+        T_odom_first = se3.exp([0, 0.1, 0, 0, 0, 0])
+        mapper.add(replace(drive[7], id=0, T_odom_kf=T_odom_first, edge=None))
+        np.testing.assert_allclose(mapper.poses[8], mapper.poses[7], atol=1e-9)
+        assert mapper.T_map_odom is not None
+        np.testing.assert_allclose(mapper.T_map_odom @ T_odom_first, mapper.poses[7], atol=1e-9)
+
+
 def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> None:
     """All said that the map was saved in a file that was not there."""
     path, elsewhere = tmp_path / "town.dpm2map", tmp_path / "elsewhere.dpm2map"
