@@ -116,7 +116,7 @@ class Slam:
             self.odometry.cross_breaks(localizer.found)
         result = self.odometry.process(frame)
         if localizer is not None and result.state is State.LOST:
-            localizer.odometry_lost(frame.stamp)
+            localizer.odometry_lost(self.odometry.next_keyframe)
         if result.keyframe is None:
             return result
         self._underway = frame.stamp

@@ -45,7 +45,7 @@ class Localizer:
         T_map_odom: (4, 4), the last that was verified; it means nothing before `state.located`.
         state: RELOCALISING before the first result, which makes it RELOCALISED; the next one TRACKING; DEGRADED where
             the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
-        found: stamp (ns) of the last keyframe that was found in the map; None before the first.
+        found: id of the last keyframe that was found in the map; None before the first.
     """
 
     def __init__(self, relocalizer: FindsPlaces, max_failures: int = 3) -> None:
@@ -57,34 +57,36 @@ class Localizer:
         self._T_last: Array | None = None
         self._far: Array | None = None  # T_map_odom by the last result that was far off, while tracking
         self._stamp: int | None = None
+        self._last = -1  # id of the last keyframe
         self.found: int | None = None
         self.T_map_odom: Array = np.eye(4)
         self._state = State.RELOCALIZING
-        self._broken = 0  # stamp of the last frame whose odometry was lost, ns
+        self._broken = 0  # id of the first keyframe after the odometry was lost
 
     @property
     def state(self) -> State:
         """As of the last keyframe, or LOST if the odometry has been lost since: it may have been carried off."""
-        broken = self._stamp is not None and self._broken > self._stamp
-        return State.LOST if broken and self._state.located else self._state
+        return State.LOST if self._last < self._broken and self._state.located else self._state
 
-    def odometry_lost(self, stamp: int) -> None:
-        """The odometry was lost at that stamp (ns): later keyframes may be anywhere, wherever it leads.
+    def odometry_lost(self, following: int) -> None:
+        """The odometry was lost: keyframes from that id on may be anywhere, wherever it leads. Ids tell the order, not
+        stamps: a clock may be set back.
 
         May be called in another thread than the other methods: a keyframe from before, which still waits, is found as
         ever, and the state stays LOST.
         """
-        self._broken = stamp
+        self._broken = following
 
     def wants(self, stamp: int) -> bool:
         """Whether to ask for a keyframe now (ns): once a second, also at a halt, until another confirms the place."""
-        return self.state is not State.TRACKING and (self._stamp is None or stamp - self._stamp >= _PATIENCE)
+        return self.state is not State.TRACKING and (self._stamp is None or abs(stamp - self._stamp) >= _PATIENCE)
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
-        self.T_map_odom, self._state, self._broken = np.eye(4), State.RELOCALIZING, 0
+        self.T_map_odom, self._state = np.eye(4), State.RELOCALIZING
         self._failures, self._distrust, self._far = 0, 0.0, None
         self._T_last, self._stamp, self.found = None, None, None
+        self._last, self._broken = -1, 0
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
@@ -96,10 +98,10 @@ class Localizer:
         Raises:
             Dpm2Error: the map cannot be read. It does not confirm the odometry then, as where nothing fits.
         """
-        broken = self._stamp is not None and self._stamp < self._broken < keyframe.stamp
+        broken = self._last < self._broken <= keyframe.id
         if broken or (keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN):
             self._state = State.LOST if self._state.located else self._state  # its odometry may have been
-        self._stamp = keyframe.stamp
+        self._stamp, self._last = keyframe.stamp, keyframe.id
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
@@ -159,5 +161,5 @@ class Localizer:
     def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
         self._state = State.RELOCALIZED if jumped else State.TRACKING
-        self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.stamp
+        self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.id
         return LocalizationResult(result.T_target_source, result.covariance, self._state, result, jumped)

@@ -58,6 +58,11 @@ class KeyframeSelector:
         self._fix: tuple[Fix, Array] | None = None  # the last one, and T_odom_lidar when it was measured
         self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
+    @property
+    def next_id(self) -> int:
+        """Of the next keyframe."""
+        return 0 if self._last is None else self._last.id + 1
+
     def take_over(self, before: KeyframeSelector) -> None:
         """Go on after the keyframes of another one."""
         self._last, self._uncertainty, self._requested = before._last, before._uncertainty, before._requested
@@ -100,13 +105,12 @@ class KeyframeSelector:
             covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]
-        keyframe_id = 0 if last is None else last.id + 1
         known = scan.descriptors if scan.description is not None and scan.description.made else None
         if (T_scan_lidar != _SAME).any():
             T_lidar_scan = se3.inverse(T_scan_lidar)
             cloud = se3.transform(T_lidar_scan, cloud)
             known = None if known is None else known.moved(T_lidar_scan)
-        keyframe = Keyframe(keyframe_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
+        keyframe = Keyframe(self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
         if self._fix is not None:
             fix, T_odom_then = self._fix
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))

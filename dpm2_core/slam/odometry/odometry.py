@@ -70,13 +70,18 @@ class Odometry:
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
-        self._broken = 0  # stamp of the last break, ns
+        self._broken = 0  # id of the first keyframe after the last break
         self._registration.clear()
         self._keyframes.reset()
 
-    def cross_breaks(self, stamp: int) -> None:
-        """A map has shown where the sensor was at that stamp (ns): the way across the breaks before it is known."""
-        if self._breaks and stamp > self._broken:
+    @property
+    def next_keyframe(self) -> int:
+        """Id that the next keyframe will have."""
+        return self._keyframes.next_id
+
+    def cross_breaks(self, found: int) -> None:
+        """A map has shown where the keyframe of that id is: the way across the breaks before it is known."""
+        if self._breaks and found >= self._broken:
             self._breaks = 0
 
     def take_over(self, before: Odometry, frame: Frame) -> None:
@@ -226,7 +231,7 @@ class Odometry:
         if bridge.tries >= self._settings.restart_after and motion.twist is not None:
             self._keyframes.add_uncertainty(motion.covariance)
             self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
-            self._broken = (self._clock.stamp or 0) - round(self._sweep.middle * 1e9)
+            self._broken = self.next_keyframe
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T

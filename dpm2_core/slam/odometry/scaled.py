@@ -45,9 +45,14 @@ class ScaledOdometry:
         """Make a keyframe of the next registered scan, however short the way."""
         self._active.request_keyframe()
 
-    def cross_breaks(self, stamp: int) -> None:
-        """A map has shown where the sensor was at that stamp (ns)."""
-        self._active.cross_breaks(stamp)
+    @property
+    def next_keyframe(self) -> int:
+        """Id that the next keyframe will have."""
+        return self._active.next_keyframe
+
+    def cross_breaks(self, found: int) -> None:
+        """A map has shown where the keyframe of that id is."""
+        self._active.cross_breaks(found)
 
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""

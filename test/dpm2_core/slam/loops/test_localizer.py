@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,7 +83,7 @@ def test_after_the_odometry_was_lost_a_place_that_fits_is_not_enough() -> None:
     for node in range(2):
         localizer.add(halt(node))
     assert localizer.state is State.TRACKING
-    localizer.odometry_lost(2 * 10**9 + 1)
+    localizer.odometry_lost(3)
     assert localizer.state is State.LOST
     waiting = localizer.add(halt(2))  # made before the loss; in the node it is found in another thread, later
     assert (waiting.state, localizer.state) == (State.TRACKING, State.LOST)
@@ -89,8 +91,27 @@ def test_after_the_odometry_was_lost_a_place_that_fits_is_not_enough() -> None:
     assert (found.state, found.jumped, localizer.state) == (State.RELOCALIZED, True, State.RELOCALIZED)
     assert localizer.T_map_odom[0, 3] == 30.0
     localizer.restart()
-    localizer.odometry_lost(4 * 10**9)
+    localizer.odometry_lost(4)
     assert localizer.state is State.RELOCALIZING  # there is no place to lose
+
+
+def set_back(node: int) -> Keyframe:
+    """`halt` by a clock that was set back by 100 s."""
+    return replace(halt(node), stamp=(node - 100) * 10**9)
+
+
+def test_a_clock_that_is_set_back_ends_no_loss_and_prolongs_none() -> None:
+    """Ids tell the order. It was `lost` for ever, and at a halt no keyframe was asked for until the time came again."""
+    localizer = Localizer(Places(0.0, 0.0, 0.0, confirms=True))
+    localizer.add(halt(0))
+    localizer.odometry_lost(1)
+    assert localizer.wants(-99 * 10**9)
+    assert localizer.state is State.LOST
+    states = [localizer.add(set_back(node)).state for node in (1, 2)]
+    assert states == [State.RELOCALIZED, State.TRACKING]
+    assert localizer.state is State.TRACKING
+    localizer.odometry_lost(3)
+    assert localizer.state is State.LOST
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
-from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.build import make_odometry, make_slam
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
@@ -381,13 +381,25 @@ def test_a_map_that_knows_the_way_ends_the_doubt_of_a_break(suburb_drive: Drive)
     later = [replace(frame, stamp=frame.stamp + 3 * 10**9) for frame in suburb_drive[0][8:]]  # carried, as it were
     odometry = make_odometry(SlamSettings())
     tracked = [odometry.process(frame) for frame in (*suburb_drive[0][:8], *later[:-2])]
-    broken = next(t.stamp for t in tracked if t.breaks)
-    odometry.cross_breaks(broken)
+    first = next(t.keyframe.id for t in tracked if t.breaks and t.keyframe)
+    odometry.cross_breaks(first - 1)
     doubtful = odometry.process(later[-2])
     assert (doubtful.breaks, doubtful.state) == (1, State.DEGRADED)
-    odometry.cross_breaks(broken + 1)
+    odometry.cross_breaks(first)
     known = odometry.process(later[-1])
     assert (known.breaks, known.state) == (0, State.TRACKING)
+
+
+@pytest.mark.slow
+def test_after_a_pause_of_a_month_the_map_goes_on_behind_a_break(suburb_drive: Drive) -> None:
+    """Of three days and more the keyframe was rejected, which ended the run; the edge after it was firm."""
+    month, elsewhere = 30 * 86_400 * 10**9, np.array([1, -1, 1, 1], np.float32)
+    frames = [replace(f, points=f.points * elsewhere, stamp=f.stamp + month) for f in suburb_drive[0][8:]]
+    slam = make_slam(SlamSettings.model_validate({"registration": "geometric", "loops": {"enabled": False}}))
+    tracked = [slam.process(frame).odometry for frame in (*suburb_drive[0][:8], *frames)]
+    assert tracked[-1].breaks == 1
+    sigmas = [np.sqrt(edge.registration.covariance[3, 3]) for edge in slam.mapper.edges]
+    assert max(sigmas) > 1e4
 
 
 @pytest.mark.slow
