@@ -12,9 +12,11 @@ OPEN = 0.9
 """Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""
 _FREE = 0.05  # m: the speed tells nothing where it leads less far
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
+_LONGEST = 3600.0  # s: after it nothing more is to be forgotten
 _STEPS = 10  # of a motion that changes
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
 _TILT = 0.1  # of the heading's: slopes
+_ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of a heading of which nothing is known
 
 
 def predicted(T: Array, twist: Array, seconds: float) -> Array:
@@ -50,12 +52,15 @@ def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float,
     return dt + float(np.clip(off @ way / (way @ way), 0.0, 1.0)) * (usual[0] - dt)
 
 
-def covariance(speed: float, seconds: float, acceleration: float, of_velocity: Array) -> Array:
+def covariance(speed: float, seconds: float, acceleration: float, of_velocity: Array, turn: float = 0.0) -> Array:
     """Covariance (6, 6) [rad, m] of the pose that `predicted` gives, of a velocity with the covariance `of_velocity`
-    (3, 3) [m/s]; no heading is worse than any heading."""
+    (3, 3) [m/s] and a rate of turn that is off by `turn`, rad/s, about any axis; no heading is worse than any heading,
+    and no pause longer than an hour."""
+    seconds = min(seconds, _LONGEST)
     meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
-    heading = min(_TURN * seconds, np.pi / np.sqrt(3))
+    swing, heading = (min(rate * seconds, _ANY_TURN) for rate in (turn, _TURN))
     result = np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
+    result[:3, :3] += swing**2 * np.eye(3)
     result[3:, 3:] += of_velocity * seconds**2
     return result
 

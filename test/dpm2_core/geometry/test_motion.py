@@ -46,6 +46,20 @@ def test_a_heading_of_which_nothing_is_known_is_uniform() -> None:
     assert np.sqrt(covariance(10.0, 60.0, 10.0, OF_VELOCITY)[2, 2]) == pytest.approx(np.pi / np.sqrt(3))
 
 
+def test_a_pause_of_more_than_an_hour_is_one_of_an_hour() -> None:
+    """A map takes no keyframe whose place is less certain than 1000 km: after three days none was taken."""
+    hour = covariance(10.0, 3600.0, 10.0, OF_VELOCITY)
+    np.testing.assert_array_equal(covariance(10.0, 1e9, 10.0, OF_VELOCITY), hour)
+
+
+def test_what_swings_is_uncertain_about_every_axis() -> None:
+    """By 0.5 rad/s for 0.2 s, more than a car is about its heading; and never by more than any turn."""
+    sigma = np.sqrt(np.diag(covariance(1.0, 0.2, 10.0, OF_VELOCITY, turn=0.5)))
+    assert (sigma[:3] >= 0.1).all()
+    assert (sigma[:3] < 0.12).all()
+    assert covariance(1.0, 60.0, 10.0, OF_VELOCITY, turn=0.5)[0, 0] < 2 * np.pi**2 / 3
+
+
 def test_an_unknown_velocity_makes_the_prediction_uncertain_along_it() -> None:
     """10 m/s along x for 3 s: 30 m, and what the vehicle may have done since."""
     sigma = np.sqrt(np.diag(covariance(0.0, 3.0, 1.0, np.diag([10.0, 0, 0]) ** 2)))
