@@ -210,18 +210,32 @@ class BagSource:
             self._unsound[topic] = left_out + 1, why
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
-        """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts."""
-        raw = [(time, data) for _, time, data in self._bag.messages([topic])]
-        decoded = [self._bag.decode(topic, data) for _, data in raw]
-        is_path = self._bag.types[topic] == PATH
-        stamped: list[Any] = decoded[-1].poses if is_path else decoded
-        of_items = (stamp_ns(i.header) for i in stamped) if is_path else (serialized_stamp(d, t) for t, d in raw)
-        stamps = np.fromiter(of_items, np.int64)
-        T = np.array([transform_matrix(item.pose if is_path else item.pose.pose) for item in stamped]).reshape(-1, 4, 4)
-        child = "" if is_path or not decoded else decoded[0].child_frame_id
+        """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts.
+        What cannot be decoded, or is no rigid transform, is left out, with a note."""
+        decoded, stamps, T, problems = list[tuple[int, Any]](), list[int](), list[Array](), list[str]()
+        for _, time, data in self._bag.messages([topic]):
+            try:
+                decoded.append((serialized_stamp(data, time), self._bag.decode(topic, data)))
+            except MessageError as error:
+                problems.append(str(error))
+        if is_path := self._bag.types[topic] == PATH:
+            poses = [(stamp_ns(item.header), item.pose) for _, message in decoded[-1:] for item in message.poses]
+        else:
+            poses = [(stamp, message.pose.pose) for stamp, message in decoded]
+        for stamp, pose in poses:
+            try:
+                T.append(transform_matrix(pose))
+                stamps.append(stamp)
+            except UsageError as error:
+                problems.append(f"at {stamp * 1e-9:.3f} s: {error}")
+        if problems:
+            what = f"{topic}: {len(problems)} poses left out"
+            self._note_once(what, f"the first: {printable(problems[0])}")
+        T_world_lidar = np.array(T).reshape(-1, 4, 4)
+        child = "" if is_path or not decoded else decoded[0][1].child_frame_id
         if child and child != self.lidar_frame:
-            T = T @ self.transforms.lookup(child, self.lidar_frame)
-        return stamps, T
+            T_world_lidar = T_world_lidar @ self.transforms.lookup(child, self.lidar_frame)
+        return np.array(stamps, np.int64), T_world_lidar
 
     def _note_once(self, what: str, detail: str) -> None:
         if not any(note.startswith(what) for note in self.notes):

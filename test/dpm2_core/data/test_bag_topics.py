@@ -158,6 +158,25 @@ def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
     np.testing.assert_allclose(unstamped[:, 0, 3], [10, 20])
 
 
+@pytest.mark.parametrize(("damaged", "why"), [(False, "no rigid transform"), (True, "is damaged")])
+def test_a_true_pose_that_is_none_costs_itself(bags: Any, tmp_path: Path, damaged: bool, why: str) -> None:
+    """A cloud there gets the pose between those of its neighbors."""
+    truth = [bags.odometry(1 + 0.5 * i, x) for i, x in enumerate((0.0, 99.0, 10.0))]
+    if damaged:
+        truth[1].header.frame_id = "no text"
+    else:
+        truth[1].pose.pose.orientation.w = 0.0
+    sent = [(1 + 0.5 * i, "/ground_truth/odom", message) for i, message in enumerate(truth)]
+    file = bags.write(tmp_path / "b", by_time([*clouds(bags, [1, 1.5, 2]), *sent])) / "b.mcap"
+    file.write_bytes(file.read_bytes().replace(b"no text", b"\xff" * 7))
+    source = BagSource(file)
+    assert source.poses is not None
+    np.testing.assert_allclose(source.poses[:, 0, 3], [0, 5, 10], atol=1e-9)
+    (note,) = source.notes
+    assert note.startswith("/ground_truth/odom: 1 poses left out (the first: ")
+    assert why in note
+
+
 def test_a_path_is_ground_truth(bags: Any, tmp_path: Path) -> None:
     stamped = [bags.new("geometry_msgs/PoseStamped", header=o.header, pose=o.pose.pose)
                for o in (bags.odometry(1, 5.0), bags.odometry(2, 6.0))]  # fmt: skip
@@ -165,5 +184,10 @@ def test_a_path_is_ground_truth(bags: Any, tmp_path: Path) -> None:
     source = BagSource(bags.write(tmp_path / "b", [*clouds(bags, [1, 2]), (1, "/kitti/ground_truth/path", path)]))
     assert source.poses is not None
     np.testing.assert_array_equal(source.poses[:, 0, 3], [5, 6])
+    stamped[0].pose.orientation.w = 0.0
+    source = BagSource(bags.write(tmp_path / "c", [*clouds(bags, [1, 2]), (1, "/kitti/ground_truth/path", path)]))
+    assert source.poses is not None
+    np.testing.assert_array_equal(source.poses[:, 0, 3], [np.nan, 6])
+    assert source.notes[0].startswith("/kitti/ground_truth/path: 1 poses left out")
     with pytest.raises(UsageError, match="no Odometry or Path messages on /odom"):
         _ = BagSource(tmp_path / "b", InputSettings(ground_truth_topic="/odom")).poses
