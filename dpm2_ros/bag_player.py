@@ -131,7 +131,7 @@ class BagPlayer:
 
     def _publish_latched(self) -> None:
         """Every latched message at once: calibration is wanted before the first cloud, from wherever one starts."""
-        for topic, _, data in self._bag.messages([topic for topic in self._latched if topic in self._publishers]):
+        for topic, _, data in self._bag.playable([topic for topic in self._latched if topic in self._publishers]):
             self._publishers[topic].publish(bytes(data))
 
     def _await_subscribers(self) -> None:
@@ -209,7 +209,7 @@ class BagPlayer:
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the stretch that is asked for."""
         origin = first = last = None
-        for topic, log_time, data in self._bag.messages(self._timed):
+        for topic, log_time, data in self._bag.playable(self._timed):
             if origin is None or first is None:
                 origin, first = log_time, log_time + round(self._options.start * 1e9)
                 last = None if self._options.duration is None else first + round(self._options.duration * 1e9)

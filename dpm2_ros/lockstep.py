@@ -111,7 +111,7 @@ class Lockstep:
         """Before the first message: the calibration of each camera, which `dpm2 run` has from the start."""
         for topic, publisher in self._publishers.items():
             if self._bag.types[topic] == CAMERA_INFO:
-                for _, _, data in islice(self._bag.messages([topic]), 1):
+                for _, _, data in islice(self._bag.playable([topic]), 1):
                     publisher.publish(bytes(data))
 
     def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:

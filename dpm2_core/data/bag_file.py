@@ -73,6 +73,16 @@ class Bag:
                 f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({_reason(error)})"
             )
 
+    def playable(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """`messages` without those of ROS 1 that cannot become one of ROS 2; `notes` has their topics."""
+        for topic, time, data in self.messages(topics):
+            if data:
+                yield topic, time, data
+                continue
+            note = f"{self.path}: {topic}: messages that are no {self.types[topic]} of ROS 2 Jazzy are left out"
+            if note not in self.notes:
+                self.notes.append(note)
+
     def decode(self, topic: str, data: bytes) -> Any:
         """A message object of rosbags; a Livox CustomMsg as a PointCloud2.
 

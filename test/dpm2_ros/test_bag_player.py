@@ -250,3 +250,23 @@ def test_a_type_is_imported_from_the_packages_of_ros_alone(
     assert "1 messages played" in info.err
     assert "imported" not in info.out
     assert "evil" not in sys.modules
+
+
+def test_messages_of_ros1_that_ros2_defines_differently_are_left_out(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """They were sent empty. A Range has a variance since."""
+    from rosbags.rosbag1 import Writer as Ros1Writer
+
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    header = noetic.types["std_msgs/msg/Header"](0, noetic.types["builtin_interfaces/msg/Time"](1, 0), "sonar")
+    sonar = noetic.types["sensor_msgs/msg/Range"](header, 0, 0.1, 0.1, 5.0, 2.0)
+    with Ros1Writer(tmp_path / "b.bag") as writer:
+        for topic, message in (("/sonar", sonar), ("/said", noetic.types["std_msgs/msg/String"]("here"))):
+            connection = writer.add_connection(topic, message.__msgtype__, typestore=noetic)
+            for time_ns in (1, 2):
+                writer.write(connection, time_ns, noetic.serialize_ros1(message, message.__msgtype__))
+    assert play_here(str(tmp_path / "b.bag"), "--wait", "0") == 0
+    said = capfd.readouterr().err
+    assert said.count("/sonar: messages that are no sensor_msgs/msg/Range of ROS 2 Jazzy are left out") == 1
+    assert "2 messages played" in said
