@@ -26,6 +26,7 @@ REQUIREMENTS = [
     "typer>=0.12,<1",  # command line
     "rich>=13,<16",  # progress bars and tables
     "rosbags>=0.11,<0.12",  # bags without ROS; 0.x releases change the interface
+    "backports.zstd>=1,<2",  # messages that are compressed one by one; rosbags has it as well
     "mcap>=1.2,<2",  # salvages bags whose recording was cut off
     "opencv-python-headless>=4.9,<6",  # image decoding; headless: no Qt beside RViz
 ]

@@ -9,30 +9,34 @@ has them (CDR), so that all that follows is the same.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from heapq import merge
-from io import BufferedReader, FileIO
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePath
+from shlex import quote
 from typing import Any
 
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+import yaml
+from backports.zstd import ZstdDecompressor, ZstdError, get_frame_info
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dpm2_core.data.livox import LIVOX, cloud_of_custom, custom_of_ros1
+from dpm2_core.data.mcap_salvage import whole_messages
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import RawMessage
 from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_STORAGES, _PACKED = (".mcap", ".db3"), ".zstd"
+_LARGEST = 1 << 29  # bytes of a message: an image of 67 million pixels may have 6 bytes each
 _LATEST = 2**63 - 1  # ns; MCAP allows twice that
 
 
@@ -67,7 +71,7 @@ class Bag:
         try:
             for topic, time, data in self._read(requested):
                 count += 1
-                yield topic, min(time, _LATEST), data
+                yield topic, min(time, _LATEST), _unpacked(data)
         except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
             self.notes.append(
                 f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({_reason(error)})"
@@ -121,24 +125,60 @@ def open_bag(path: Path) -> Bag:
     if path.suffix == ".bag" and path.is_file():
         return _open_ros1(path)
     if not path.is_dir():
+        _check_unpacked([path])
         return _open_file(path)
-    files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3") and file.is_file())
+    files = sorted(file for file in path.iterdir() if file.suffix in _STORAGES and file.is_file())
+    _check_unpacked(path.iterdir())
     if not files:
         raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
-    missing = "no metadata.yaml"
-    if (path / "metadata.yaml").is_file():
-        try:
-            return _open_indexed(path)
-        except Exception as error:  # as in _open_file
-            missing = f"metadata.yaml is unusable ({_reason(error)})"
-    bag = _open_files(path, files)
-    if not bag.notes:  # a damaged file is what makes the metadata unusable, and is named
-        bag.notes.append(f"{path}: {missing}; read {', '.join(file.name for file in files)}")
+    types, missing = dict[str, str](), ""
+    try:
+        files, types = _recorded(path)
+    except UsageError as error:
+        missing = str(error)
+    bag = _open_files(path, files, types)
+    if missing and not bag.notes:  # a file that is damaged was not closed, and there are no metadata then
+        bag.notes.append(f"{missing}; read {', '.join(file.name for file in files)}")
     return bag
 
 
-def _open_files(path: Path, files: list[Path]) -> Bag:
-    """Several files of one recording as one bag. What cannot be read of one of them costs nothing of the others."""
+def _recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
+    """The files that metadata.yaml names, and topic to message type, also of topics without a message.
+
+    Raises:
+        UsageError: it does not say, or they are not there.
+    """
+    try:
+        text = (folder / "metadata.yaml").read_text(encoding="utf-8")
+        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        files = [folder / PurePath(name.removesuffix(_PACKED)).name for name in about["relative_file_paths"]]
+        topics = [topic["topic_metadata"] for topic in about["topics_with_message_count"]]
+        types = {str(topic["name"]): str(topic["type"]) for topic in topics}
+    except FileNotFoundError:
+        raise UsageError(f"{folder}: no metadata.yaml") from None
+    except Exception as error:  # anything from YAMLError to TypeError by the kind of damage
+        raise UsageError(f"{folder}: metadata.yaml is unusable ({_reason(error)})") from None
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        raise UsageError(f"{folder}: metadata.yaml is unusable (no file {', '.join(missing)})")
+    return files, types
+
+
+def _check_unpacked(files: Iterable[Path]) -> None:
+    """They are not unpacked here: a megabyte may be a terabyte, and whether there is room is for the user to say."""
+    endings = tuple(f"{storage}{_PACKED}" for storage in _STORAGES)
+    for file in files:
+        if file.name.endswith(endings) and not file.with_suffix("").is_file():
+            command = f"zstd -d {quote(str(file.parent))}/*{_PACKED}"
+            raise UsageError(f"{file}: compressed as a whole (--compression-mode file); unpack it: {command}")
+
+
+def _open_files(path: Path, files: list[Path], types: dict[str, str]) -> Bag:
+    """Several files of one recording as one bag; what cannot be read of one of them costs nothing of the others.
+
+    Args:
+        types: topic to message type, of those that are known to have been recorded.
+    """
     parts, problems = list[Bag](), list[str]()
     for file in files:
         try:
@@ -148,7 +188,7 @@ def _open_files(path: Path, files: list[Path]) -> Bag:
     if not parts:
         raise UsageError(problems[0])
     notes = [f"{problem}; read without it" for problem in problems] + [note for part in parts for note in part.notes]
-    types, counts = dict[str, str](), Counter[str]()
+    counts = Counter(dict.fromkeys(types, 0))
     for part in parts:
         types |= part.types
         counts.update(part.counts)
@@ -179,26 +219,25 @@ def _jazzy() -> Typestore:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Reader]:
-    for file in path.glob("*.db3") if path.is_dir() else [path]:
-        if file.suffix == ".db3":
-            check_plain(file)
-    with Reader(path) as reader:
+def _opened(file: Path) -> Iterator[Reader]:
+    if file.suffix == ".db3":
+        check_plain(file)
+    with Reader(file) as reader:
         yield reader
 
 
-def _open_indexed(path: Path) -> Bag:
-    with _opened(path) as reader:
+def _open_indexed(file: Path) -> Bag:
+    with _opened(file) as reader:
         connections, start = list(reader.connections), reader.start_time
     types = {connection.topic: connection.msgtype for connection in connections}
     counts = Counter(dict.fromkeys(types, 0))
     for connection in connections:
         counts[connection.topic] += connection.msgcount
-    return Bag(path, types, counts, partial(_read_indexed, path), start=start)
+    return Bag(file, types, counts, partial(_read_indexed, file), start=start)
 
 
-def _read_indexed(path: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-    with _opened(path) as reader:
+def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+    with _opened(file) as reader:
         requested = [connection for connection in reader.connections if connection.topic in topics]
         for connection, time, data in reader.messages(connections=requested):
             yield connection.topic, time, data
@@ -231,6 +270,18 @@ def _as_ros2(data: bytes, kind: str) -> bytes:
     return b""
 
 
+def _unpacked(data: bytes) -> bytes:
+    """A message that was compressed by itself, or another as it is; no bytes where it is damaged or too large."""
+    if data[:4] != _ZSTD_MAGIC:  # no message of ROS 2 begins so
+        return data
+    with suppress(ZstdError):
+        unpacker, size = ZstdDecompressor(), get_frame_info(data).decompressed_size
+        if size is not None and size <= _LARGEST:
+            message = unpacker.decompress(data, size + 1)
+            return message if unpacker.eof else b""
+    return b""
+
+
 def _salvage(file: Path, reason: str) -> Bag:
     """What can be read of an MCAP file from its start, without the index at its end, in the order of the file."""
     with file.open("rb") as stream:
@@ -241,7 +292,7 @@ def _salvage(file: Path, reason: str) -> Bag:
         kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
         raise UsageError(f"{file}: {kind}: {reason}")
     types, counts, start = dict[str, str](), Counter[str](), _LATEST
-    for topic, kind, time, _ in _whole_messages(file):
+    for topic, kind, time, _ in whole_messages(file):
         types[topic] = kind
         counts[topic] += 1
         start = min(start, time)
@@ -252,29 +303,4 @@ def _salvage(file: Path, reason: str) -> Bag:
 
 
 def _read_whole(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-    return ((topic, time, data) for topic, _, time, data in _whole_messages(file) if topic in topics)
-
-
-def _whole_messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
-    """(topic, type, log time, data) up to where the file is cut."""
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
-    # The cut raises anything from EOFError to the decompressor's own errors.
-    with _WholeReads(FileIO(file)) as stream, suppress(Exception):
-        for record in StreamReader(stream, record_size_limit=file.stat().st_size).records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                channels[record.id] = (record.topic, schemas[record.schema_id])
-            elif isinstance(record, Message):
-                yield (*channels[record.channel_id], record.log_time, record.data)
-
-
-class _WholeReads(BufferedReader):
-    """The mcap package takes a short read at the end of the file for the whole record."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        if size is not None and len(data) < size:
-            raise EOFError
-        return data
+    return ((topic, time, data) for topic, _, time, data in whole_messages(file) if topic in topics)

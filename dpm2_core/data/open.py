@@ -33,9 +33,10 @@ def sequences_below(path: Path | str) -> list[str]:
 
 
 def is_rosbag2(path: Path) -> bool:
-    """A .mcap or .db3 file, or a folder with one or with the metadata of one."""
+    """A .mcap or .db3 file, also a compressed one, or a folder with one or with the metadata of one."""
     files = [path] if path.is_file() else path.iterdir()
-    return any(file.suffix in (".mcap", ".db3") or file.name == "metadata.yaml" for file in files)
+    endings = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+    return any(file.name.endswith(endings) or file.name == "metadata.yaml" for file in files)
 
 
 def _is_kitti_raw(path: Path) -> bool:

@@ -107,13 +107,15 @@ class BagMaker:
         plugin: str = "MCAP",
         silent: Sequence[tuple[str, str]] = (),
         zstd: bool = False,
+        compression: str = "STORAGE",
     ) -> Path:
-        """Messages as (log time in s, topic, message or bytes of a cloud); `silent`: (topic, type) without any."""
+        """Messages as (log time in s, topic, message or bytes of a cloud); `silent`: (topic, type) without any;
+        `compression`: what `zstd` compresses, STORAGE (the chunks), MESSAGE or FILE."""
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin[plugin])
         if zstd:
-            writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         with writer:
             connections: dict[str, Any] = {}
             for topic, kind in silent:

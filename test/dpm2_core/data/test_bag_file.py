@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from backports import zstd
 
+from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
+from dpm2_core.data.open import open_source
 from dpm2_core.errors import UsageError
 from test.helpers.recordings import POINTS, clouds
 
@@ -125,13 +128,13 @@ def test_a_damaged_chunk_ends_the_drive_and_says_so(bags: Any, tmp_path: Path) -
 # --- split recordings
 
 
-def split(bags: Any, folder: Path, plugin: str = "MCAP", zstd: bool = False) -> list[Path]:
+def split(bags: Any, folder: Path, plugin: str = "MCAP", compressed: bool = False) -> list[Path]:
     """Twelve files of two clouds each whose numbers have no zeros before them, and no metadata.yaml."""
     folder.mkdir()
     for n in range(12):
         times = [1 + 0.2 * n, 1.1 + 0.2 * n]
         messages = [(t, POINTS, bags.cloud(t, x=2.0 * n + i)) for i, t in enumerate(times)]
-        part = bags.write(folder.with_name(f"part_{n}"), messages, plugin, zstd=zstd)
+        part = bags.write(folder.with_name(f"part_{n}"), messages, plugin, zstd=compressed)
         (file,) = (file for file in part.iterdir() if file.suffix != ".yaml")
         file.rename(folder / f"drive_{n}{file.suffix}")
     return sorted(folder.iterdir(), key=lambda file: int(file.stem.removeprefix("drive_")))
@@ -166,10 +169,53 @@ def test_a_split_recording_without_metadata_is_read_in_order_of_time(bags: Any, 
 
 
 def test_a_damaged_chunk_costs_the_messages_of_its_file_alone(bags: Any, tmp_path: Path) -> None:
-    files = split(bags, tmp_path / "drive", zstd=True)
+    files = split(bags, tmp_path / "drive", compressed=True)
     whole = files[5].read_bytes()
     chunk = whole.index(b"\x28\xb5\x2f\xfd")  # where a zstd frame begins
     files[5].write_bytes(whole[:chunk] + bytes(20) + whole[chunk + 20 :])
     source = BagSource(tmp_path / "drive")
     assert [frame.points[0, 0] for frame in source.frames()] == [*range(10), *range(12, 24)]
     assert any(re.search(r"drive_5\.mcap: damaged after 0 messages of /points", note) for note in source.notes)
+
+
+# --- compressed recordings
+
+
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+def test_messages_that_are_compressed_one_by_one(bags: Any, tmp_path: Path, plugin: str, metadata: bool) -> None:
+    """Also where no metadata.yaml says that they are."""
+    bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]), plugin, zstd=True, compression="MESSAGE")
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    frames = list(BagSource(bag).frames())
+    assert [(frame.points[0, 0], frame.problem) for frame in frames] == [(0, None), (1, None), (2, None)]
+
+
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+def test_files_that_are_compressed_are_named_with_what_unpacks_them(
+    bags: Any, tmp_path: Path, plugin: str, metadata: bool
+) -> None:
+    """And are read once they are unpacked."""
+    bag = bags.write(tmp_path / "a bag", clouds(bags, [1, 2, 3]), plugin, zstd=True, compression="FILE")
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    (packed,) = bag.glob("*.zstd")
+    for path in (bag, packed):
+        with pytest.raises(UsageError, match=r"\.zstd: compressed as a whole .*: zstd -d '.*a bag'/\*\.zstd"):
+            open_source(path)
+    packed.with_suffix("").write_bytes(zstd.decompress(packed.read_bytes()))
+    source = open_source(bag)
+    assert [frame.points[0, 0] for frame in source.frames()] == [0, 1, 2]
+    assert any("no metadata.yaml" in note for note in source.notes) != metadata
+
+
+def test_files_that_metadata_does_not_name_are_not_read(bags: Any, tmp_path: Path) -> None:
+    """Such as a copy that is cut to size. Topics without a message are those of the metadata."""
+    bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]), silent=[("/scan", "sensor_msgs/msg/LaserScan")])
+    (bag / "copy.mcap").write_bytes(mcap(bag).read_bytes())
+    source = BagSource(bag)
+    assert [frame.points[0, 0] for frame in source.frames()] == [0, 1, 2]
+    opened = open_bag(bag)
+    assert (opened.types["/scan"], opened.counts["/scan"]) == ("sensor_msgs/msg/LaserScan", 0)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from backports import zstd
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from dpm2_core.data.bag_file import open_bag
@@ -145,3 +147,41 @@ def test_a_database_that_computes_its_messages(bags: Any, tmp_path: Path, table:
         BagSource(folder)
     assert time.process_time() - began < 2
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_database_that_metadata_calls_otherwise_is_not_opened(bags: Any, tmp_path: Path, packed: bool) -> None:
+    """Nor unpacked: what looks like no database is not checked as one."""
+    folder = bags.write(tmp_path / "bag", rig(bags), plugin="SQLITE3")
+    database, metadata = folder / "bag.db3", folder / "metadata.yaml"
+    with closing(sqlite3.connect(database)) as sql:
+        sql.executescript(
+            "DROP TABLE topics; CREATE VIEW topics(id, name, type, serialization_format, offered_qos_profiles, "
+            "type_description_hash) AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) "
+            "SELECT x, x, x, x, x, x FROM n"
+        )
+    content = database.read_bytes()
+    (folder / "bag.data").write_bytes(zstd.compress(content) if packed else content)
+    database.unlink()
+    (folder / "sound.mcap").touch()
+    text = metadata.read_text().replace("bag.db3", "bag.data")
+    if packed:
+        text = re.sub("compression_format:.*", "compression_format: zstd", text)
+        text = re.sub("compression_mode:.*", "compression_mode: FILE", text)
+    metadata.write_text(text)
+    began = time.process_time()
+    with pytest.raises(UsageError, match=r"bag\.data: cannot be read as a bag"):
+        BagSource(folder)
+    assert time.process_time() - began < 2
+
+
+def test_a_message_that_is_a_bomb(bags: Any, tmp_path: Path) -> None:
+    """It costs its frame alone."""
+    bomb = zstd.compress(bytes(600 << 20))
+    source = BagSource(bags.write(tmp_path / "bag", [*rig(bags), (2, "/points", bomb)]))
+    tracemalloc.start()
+    try:
+        assert [len(frame.points) for frame in source.frames()] == [60, 0]
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
