@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plays a rosbag2 recording with its own timing, for machines without `ros2 bag`. Messages pass through undecoded."""
+"""Plays a rosbag2 recording with its own timing, for machines without `ros2 bag`. Messages pass through undecoded, all
+but those of /tf_static."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ import rclpy
 import typer
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
@@ -20,15 +22,19 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
 from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD
 from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
+from dpm2_ros.checks import MOST_TRANSFORMS
 from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
 from dpm2_ros.runtime import STOP, end_ros, ros_context
+from dpm2_ros.tf import TFMessage
 
 CLOCK = "/clock"
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
+_STATIC = topics.TF_STATIC, "tf2_msgs/msg/TFMessage"  # and its type
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
 DELIVERY = 5.0
@@ -130,9 +136,39 @@ class BagPlayer:
         return publishers
 
     def _publish_latched(self) -> None:
-        """Every latched message at once: calibration is wanted before the first cloud, from wherever one starts."""
+        """Every latched message at once: calibration is wanted before the first cloud, from wherever one starts.
+
+        Of /tf_static the last transform of each frame, all together: a recording may repeat them thousands of times,
+        and a subscriber takes only the last hundred messages or so.
+        """
+        placed = dict[str, Any]()
         for topic, _, data in self._bag.playable([topic for topic in self._latched if topic in self._publishers]):
-            self._publishers[topic].publish(bytes(data))
+            if (topic, self._bag.types[topic]) == _STATIC:
+                placed |= self._transforms(bytes(data))
+            else:
+                self._publishers[topic].publish(bytes(data))
+        transforms = list(placed.values())
+        for first in range(0, len(transforms), MOST_TRANSFORMS):
+            message = TFMessage(transforms=transforms[first : first + MOST_TRANSFORMS])
+            self._publishers[topics.TF_STATIC].publish(message)
+
+    def _transforms(self, data: bytes) -> dict[str, Any]:
+        """Those of a message, by the frame that each places; what cannot be used is left out, with a warning."""
+        out, log = dict[str, Any](), self._node.get_logger()
+        try:
+            message = deserialize_message(data, TFMessage)
+        except Exception as error:  # rclpy raises RMWError or RuntimeError
+            log.warning(f"{topics.TF_STATIC}: a message is left out: {printable(str(error))}", once=True)
+            return out
+        for stamped in message.transforms:
+            child = stamped.child_frame_id
+            try:
+                transform_matrix(stamped.transform)
+            except UsageError as error:
+                log.warning(f"{topics.TF_STATIC}: {printable(child)} is left out: {error}", once=True)
+            else:
+                out[child.lstrip("/")] = stamped
+        return out
 
     def _await_subscribers(self) -> None:
         """Until the clouds (or, without any, anything) have their subscribers; not for ever."""

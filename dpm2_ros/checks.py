@@ -15,7 +15,8 @@ from dpm2_ros.conversions import check_frame
 
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 2000
-_MOST_TRANSFORMS = 500  # in a message
+MOST_TRANSFORMS = 500
+"""In a message that is read."""
 
 
 def check_header(header: Any) -> None:
@@ -52,8 +53,8 @@ def checked_cloud(message: Any) -> tuple[Any, str]:
 
 def check_transforms(message: Any) -> None:
     """Raises RejectedError for a TFMessage of more transforms than any robot sends at once."""
-    if len(message.transforms) > _MOST_TRANSFORMS:
-        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {_MOST_TRANSFORMS} are read")
+    if len(message.transforms) > MOST_TRANSFORMS:
+        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {MOST_TRANSFORMS} are read")
 
 
 def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:

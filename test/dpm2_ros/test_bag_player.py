@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data import topics
+from dpm2_core.data.bag_messages import transforms
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.image_messages import decode_image
 from dpm2_core.data.messages import decode_points, stamp_ns
@@ -126,6 +128,28 @@ def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listene
     player.send_signal(signal.SIGINT)
     assert player.wait(60) == 0
     assert "again from the start" not in listener.output()
+
+
+def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(listener: Listener, tmp_path: Path) -> None:
+    """Of a robot whose camera repeats its own, also where a message is damaged and a transform is none."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    kind = "tf2_msgs/msg/TFMessage"
+    links = [("lidar", 1.5), *(("camera", 0.1 * n) for n in range(150)), ("lidar", math.nan)]
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection(topics.TF_STATIC, kind, typestore=types)
+        for time, (child, x) in enumerate(links):
+            T = np.eye(4)
+            T[0, 3] = x
+            writer.write(connection, time, types.serialize_cdr(transforms(time, {child: ("base_link", T)}), kind))
+        writer.write(connection, len(links), b"\0\1\0\0\xff")
+    player = listener.play(str(tmp_path / "bag"), "--wait", "90", "--loop")
+    placed = lambda: {t.child_frame_id: t.transform.translation.x for m in listener.static for t in m.transforms}  # noqa: E731
+    listener.harness.wait(lambda: len(placed()) == 2, "both frames")
+    assert placed() == {"lidar": 1.5, "camera": 0.1 * 149}
+    player.send_signal(signal.SIGINT)
+    assert player.wait(60) == 0
+    assert "/tf_static: lidar is left out: no rigid transform" in listener.output()
+    assert "/tf_static: a message is left out" in listener.output()
 
 
 def test_a_recorded_clock_is_the_only_one(listener: Listener, tmp_path: Path) -> None:
