@@ -8,8 +8,10 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error, printable
@@ -25,10 +27,11 @@ class GuardedNode(Node):
 
     Attributes:
         errors: unexpected exceptions: bugs, but the node goes on.
+        answering: requests of services that are still being worked on in another thread.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        self.errors = 0
+        self.errors = self.answering = 0
         self._rejections: dict[str, int] = {}
         self._said: dict[str, float] = {}
         self._last_rejection = -float("inf")
@@ -102,6 +105,38 @@ class GuardedNode(Node):
                 self.fail(where, error)
 
         return call
+
+
+def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]) -> None:
+    """A service whose callback awaits: in a group of its own, for the others of a group wait until it ends."""
+    node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
+
+
+async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
+    """Fill the response of a service with the result of work in another thread: success, or why not."""
+    node.answering += 1
+    await until(work.done)
+    node.answering -= 1
+    try:
+        response.success, response.message = True, work.result()
+    except Dpm2Error as error:
+        response.success, response.message = False, str(error)
+    except Exception as error:  # a bug; who asked is to have an answer nevertheless
+        response.success, response.message = False, f"{type(error).__name__}: {error}"
+        node.fail("service", error)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """In a callback: let the executor go on with others until the condition holds."""
+    while not condition():
+        await _OtherCallbacks()
+
+
+class _OtherCallbacks:
+    """Awaited in a callback: the executor goes on with others, and comes back."""
+
+    def __await__(self) -> Any:
+        yield
 
 
 def one_line(text: str, length: int = _LENGTH) -> str:

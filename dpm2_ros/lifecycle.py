@@ -11,15 +11,19 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from lifecycle_msgs.msg import Transition
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_ros.guard import GuardedNode
+from dpm2_ros.guard import GuardedNode, until
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.parameters import follow_changes, load_parameters
 from dpm2_ros.settings import NodeConfig
 
+_KEEP_SERVICES = (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE)
+"""Transitions that destroy no service."""
 _Snapshot = tuple[set[int], set[str]]
 """Which entities of ROS, by their id(), and which attributes a node has had."""
 
@@ -128,10 +132,13 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
             self._mapper.apply(config)
 
     def _serve(self) -> None:
-        LifecycleNodeMixin.__init__(self)
+        # In a group of its own: while a transition waits, the other callbacks of its group do, too.
+        LifecycleNodeMixin.__init__(self, callback_group=MutuallyExclusiveCallbackGroup())
         change = self._service_change_state.callback
 
-        def guarded(request: Any, response: Any) -> Any:
+        async def guarded(request: Any, response: Any) -> Any:
+            if request.transition.id not in _KEEP_SERVICES:  # a service that is destroyed cannot answer any more
+                await until(lambda: not self.answering)
             try:
                 return change(request, response)
             except Exception as error:  # rclpy raises for a transition that there is not, and would not answer

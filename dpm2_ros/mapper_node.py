@@ -14,9 +14,10 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.system import Slam
 from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, message_status, status
 from dpm2_ros.feed import ODOM, Feed
+from dpm2_ros.guard import respond, slow_service
 from dpm2_ros.keyframe_sender import weights_identity
 from dpm2_ros.lifecycle import ManagedNode
-from dpm2_ros.mapping import MapperThread, respond, slow_service
+from dpm2_ros.mapping import MapperThread
 from dpm2_ros.subscriptions import STEADY
 
 _MOST_ROBOTS = 64

@@ -12,8 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -29,7 +27,7 @@ from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
-from dpm2_ros.guard import GuardedNode
+from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.runtime import lower_priority
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
@@ -311,28 +309,3 @@ class MapperThread:
         if len(points) > most:
             points = points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
         return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
-
-
-def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]) -> None:
-    """A service whose callback awaits: in a group of its own, for the others of a group wait until it ends."""
-    node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
-
-
-async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
-    """Fill the response of a service with the result of work in another thread: success, or why not."""
-    while not work.done():
-        await _OtherCallbacks()
-    try:
-        response.success, response.message = True, work.result()
-    except Dpm2Error as error:
-        response.success, response.message = False, str(error)
-    except Exception as error:  # a bug; who asked is to have an answer nevertheless
-        response.success, response.message = False, f"{type(error).__name__}: {error}"
-        node.fail("service", error)
-
-
-class _OtherCallbacks:
-    """Awaited in a callback: the executor goes on with others, and comes back."""
-
-    def __await__(self) -> Any:
-        yield

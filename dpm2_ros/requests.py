@@ -15,8 +15,8 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_ros.base_frame import BaseFrame
-from dpm2_ros.guard import GuardedNode
-from dpm2_ros.mapping import MapperThread, respond, slow_service
+from dpm2_ros.guard import GuardedNode, respond, slow_service
+from dpm2_ros.mapping import MapperThread
 
 
 class Requests:

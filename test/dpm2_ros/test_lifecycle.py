@@ -8,8 +8,10 @@ import gc
 import os
 import signal
 import threading
+import time
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from lifecycle_msgs.msg import Transition
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray
+from std_srvs.srv import Trigger
 
 from dpm2_core.data.topics import POINTS
 from dpm2_core.estimates import Keyframe
@@ -27,6 +30,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
 from dpm2_ros.mapper_node import MapperNode
@@ -242,6 +246,35 @@ def test_what_cannot_be_activated_stays_inactive(ros: Callable[..., Any], tmp_pa
     assert (m.state, m.entities) == ("inactive", entities)
     assert m.change(CLEANUP)
     assert m.state == "unconfigured"
+
+
+@pytest.mark.parametrize("kind", [SlamNode, MapperNode])
+@pytest.mark.parametrize("service", ["save_map", "reset"])
+def test_who_has_asked_before_the_cleanup_is_answered(
+    ros: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: type[SlamNode] | type[MapperNode],
+    service: str,
+) -> None:
+    """`save_map` and `reset` may still be writing a large map when the node is cleaned up."""
+    begun, work = threading.Event(), {"save_map": "save", "reset": "keep"}[service]
+    answer = getattr(ActiveMap, work)
+
+    def slow(*arguments: Any) -> Any:
+        begun.set()
+        time.sleep(1.0)
+        return answer(*arguments)
+
+    monkeypatch.setattr(ActiveMap, work, slow)
+    m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), kind)
+    assert m.change(CONFIGURE)
+    with ThreadPoolExecutor(1) as thread:
+        asked = thread.submit(m.harness.call, Trigger, f"/{m.node.get_name()}/{service}")
+        assert begun.wait(90)
+        assert m.change(CLEANUP)
+        assert asked.result().message
+    assert (m.state, m.node.errors) == ("unconfigured", 0)
 
 
 @pytest.mark.slow

@@ -18,8 +18,7 @@ from std_srvs.srv import Trigger
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
 from dpm2_ros.display import path_to_msg
-from dpm2_ros.guard import GuardedNode
-from dpm2_ros.mapping import respond, slow_service
+from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.runtime import lower_priority
 
 
