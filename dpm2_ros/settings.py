@@ -48,8 +48,9 @@ class RosSettings(Settings):
     base -> odom -> map, or, with another odometry, the leaf base -> ODOM_FRAME_dpm2 beside map -> odom."""
 
     base_frame: str = ""
-    """Frame whose pose is published. Before /tf_static connects it with the LiDAR no pose is; up to 300 are kept. Empty
-    takes the root above the LiDAR in /tf_static, also one that comes late, else the LiDAR's own frame."""
+    """Frame whose pose is published. Before /tf_static connects it with the LiDAR no pose is; up to 300 are kept, with
+    one more all are discarded, and the drive begins again. Empty takes the root above the LiDAR in /tf_static, also one
+    that comes late, else the LiDAR's own frame."""
 
     tf_timeout: float = Field(default=0.5, ge=0, le=60)
     """How long the first cloud waits for all who publish /tf_static, s."""

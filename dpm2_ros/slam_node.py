@@ -40,7 +40,7 @@ from dpm2_ros.tf import TransformBroadcaster
 from dpm2_ros.warm_up import warm_up
 
 HELD = 300
-"""Poses kept while the base frame is not known."""
+"""Poses kept while the base frame is not known; with one more the drive begins again."""
 
 
 class SlamNode(ManagedNode):
@@ -202,7 +202,8 @@ class SlamNode(ManagedNode):
         self._health.add(tracked, time.monotonic() - bundle.arrival)
         self._projection.show(frame, [camera.topic for camera in self.calibration.cameras], bundle.beside)
         if (scale := self._slam.odometry.scale) != self._health.scale:
-            self.get_logger().info(f"slam.preset auto: {scale}, by what the scans show")
+            if scale:  # empty where the drive has just begun again
+                self.get_logger().info(f"slam.preset auto: {scale}, by what the scans show")
             self._health.scale = scale
 
     def _tracked(self, frame: Frame) -> OdometryResult:

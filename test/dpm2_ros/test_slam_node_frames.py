@@ -83,9 +83,12 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
 
 
 def test_poses_kept_for_a_base_are_bounded(
-    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Then the drive begins anew: what is published at last is a whole drive from its first pose on."""
+    """Then the drive begins anew: what is published at last is a whole drive from its first pose on.
+
+    The log says which preset each of the two takes, and names none before it is known.
+    """
     monkeypatch.setattr("dpm2_ros.slam_node.HELD", 3)
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0")
     for n in range(5):
@@ -96,6 +99,9 @@ def test_poses_kept_for_a_base_are_bounded(
     r.wait(lambda: len(r.odom) == 2, "the poses")
     assert r.stamps() == [drive.stamp(4), drive.stamp(5)]
     np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose), np.eye(4), atol=1e-9)
+    lines = [line for line in capfd.readouterr().err.splitlines() if "slam.preset auto" in line]
+    assert len(lines) == 2
+    assert all("slam.preset auto: outdoor," in line for line in lines)
 
 
 def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
