@@ -63,6 +63,7 @@ class OtherOdometry:
         self._comparison: Comparison | None = None
         self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
         self._ways = np.zeros(2)  # m, of late: its own, and those of the scans
+        self._subscription: MatchedSubscription | None = None
         if ros.odom_source == "topic":
             self._subscription = MatchedSubscription(node, Odometry, ros.odom_topic, self._on_odometry, ros)
             node.create_timer(0.5, self._subscription.refresh, clock=STEADY)
@@ -118,7 +119,7 @@ class OtherOdometry:
     def verdict(self) -> str:
         """How far it is to be believed, in words; empty where there is nothing to say against it."""
         if self.problem:
-            return self.problem
+            return (self._subscription.problem if self._subscription is not None else "") or self.problem
         said = []
         if self._struck is not None and (ago := time.monotonic() - self._struck[0]) < _RECENT:
             said.append(f"{self._struck[1]}, {ago:.0f} s ago")

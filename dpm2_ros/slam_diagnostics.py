@@ -71,7 +71,7 @@ class Diagnostics:
             out.append(self._beside("second camera", "image", known.second_camera.topic))
         if known.second_topic:
             out.append(self._beside("second lidar", "cloud", known.second_topic))
-        if self._inputs.imu_received:
+        if self._inputs.imu_received or self._inputs.problem(known.imu_topic):
             out.append(self._imu())
         if self._inputs.gnss is not None:
             out.append(self._gnss())
@@ -137,10 +137,12 @@ class Diagnostics:
     def _absence(self) -> tuple[bytes, str] | None:
         """Why no cloud comes, in words, and how bad that is; None where one has come lately."""
         topic, silence = self._inputs.calibration.points_topic, _silence(self._inputs.synchronizer.last_arrival)
-        if silence is not None:
-            return (STALE, f"no cloud on {topic} for {silence:.0f} s") if silence > SILENT else None
-        if problem := self._inputs.subscriptions[0].problem:
+        if silence is not None and silence <= SILENT:
+            return None
+        if problem := self._inputs.problem(topic):
             return ERROR, problem
+        if silence is not None:
+            return STALE, f"no cloud on {topic} for {silence:.0f} s"
         found = self._inputs.candidates()
         hint = f"; point clouds are published on {', '.join(found)}" if found else ""
         return STALE, f"no cloud on {topic} yet{hint}"
@@ -214,7 +216,7 @@ class Diagnostics:
 
     def _imu(self) -> DiagnosticStatus:
         inputs, last, topic = self._inputs, self._health.last, self._inputs.calibration.imu_topic
-        problem = self._frames.problems.get(topic, "")
+        problem = inputs.problem(topic) or self._frames.problems.get(topic, "")
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
@@ -232,6 +234,8 @@ class Diagnostics:
     def _fix_problem(self) -> str:
         """Why no fix comes, or none is of use, in words; else empty."""
         last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
+        if problem := self._inputs.problem(topic):
+            return problem
         if last is None:
             return f"no fix on {topic} yet"
         stamp, arrival = last
@@ -245,7 +249,9 @@ class Diagnostics:
         sensor = self._inputs.synchronizer.sensors[topic]
         figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
         silence = _silence(sensor.last_arrival)
-        if silence is None:
+        if unheard := self._inputs.problem(topic):
+            level, text = ERROR, unheard
+        elif silence is None:
             level, text = WARN, f"no {what} on {topic} yet"
         elif silence > SILENT:
             level, text = WARN, f"no {what} on {topic} for {silence:.0f} s"

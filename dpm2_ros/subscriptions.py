@@ -135,6 +135,10 @@ class Inputs:
             return False
         return known.angle_correction_deg is not None or not count(self._correction_topic)
 
+    def problem(self, topic: str) -> str:
+        """Why nothing comes on a topic of these although it has a publisher, in words; else empty."""
+        return next((one.problem for one in self.subscriptions if one.topic == topic), "")
+
     @property
     def times(self) -> tuple[int, int] | None:
         """ns: a late cloud's stamp, and what the node's clock said when it came; None before there are some.

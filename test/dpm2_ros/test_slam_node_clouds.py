@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import PointCloud2, PointField
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Image, Imu, NavSatFix, PointCloud2, PointField
 
 from dpm2_core.data.messages import cloud_fields, decode_points
 from dpm2_core.data.topics import POINTS
@@ -198,6 +199,28 @@ def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: 
         DiagnosticStatus.ERROR,
         "/points is best effort, ros.reliability asks for reliable",
     )
+
+
+def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: Callable[..., Any]) -> None:
+    """There was said to be no image and no fix yet, and nothing of an IMU."""
+    topics = ("input.image_topic:=/image", "input.imu_topic:=/imu", "input.gnss_topic:=/fix", "ros.odom_topic:=/wheels")
+    harness = ros(*topics, "ros.odom_source:=topic", "ros.reliability:=reliable")
+    sensors = {"camera": (Image, "/image"), "imu": (Imu, "/imu"), "gnss": (NavSatFix, "/fix")}
+    sensors["other odometry"] = (Odometry, "/wheels")
+    for kind, topic in sensors.values():
+        harness.publisher(kind, topic, reliable=False)
+    harness.add(SlamNode())
+    for part, (_, topic) in sensors.items():
+        says = f"{topic} is best effort, ros.reliability asks for reliable"
+        assert harness.status(f"slam_node: {part}", saying(says)).level != DiagnosticStatus.OK
+
+
+def test_a_lidar_that_comes_back_less_reliable_than_asked_for_is_reported(rig: Callable[..., Rig]) -> None:
+    r = rig("ros.reliability:=reliable")
+    r.send_and_wait(0)
+    r.harness.node.destroy_publisher(r.lidar)
+    r.harness.publisher(PointCloud2, POINTS, reliable=False)
+    assert r.status("odometry", saying(f"{POINTS} is best effort")).level == DiagnosticStatus.ERROR
 
 
 def test_a_wrong_topic_is_reported_with_the_right_one(ros: Callable[..., Any], drive: Any) -> None:
