@@ -178,14 +178,15 @@ class Diagnostics:
 
     def _clock_problem(self) -> str:
         """How the clouds' clock is not that of the node, in words; empty where it is."""
-        stamp, now = self._inputs.times or (0, 0)
+        clock = self._node.get_clock().now().nanoseconds
+        stamp, now = self._inputs.times or (clock, clock)  # clouds without a stamp get that of the clock
+        if not now:
+            return "use_sim_time is on, and /clock has no publisher"
         if abs(now - stamp) <= OTHER_CLOCK * 1e9:
             return ""
         if not self._node.get_parameter("use_sim_time").value:
             text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
             return f"{text}: a sensor's clock has to be set, a recording wants use_sim_time and /clock"
-        if not now:
-            return "use_sim_time is on, and /clock has no publisher"
         return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
     def _localization(self, mapper: MapperThread) -> DiagnosticStatus:

@@ -146,8 +146,12 @@ def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
     assert abs(float(values["clock (s)"]) - time.time()) < 60
 
 
-def test_sim_time_without_a_clock_is_reported(rig: Callable[..., Rig]) -> None:
+@pytest.mark.parametrize("stamp", [None, 0], ids=["with stamps", "without stamps"])
+def test_sim_time_without_a_clock_is_reported(rig: Callable[..., Rig], stamp: int | None) -> None:
+    """Clouds without a stamp get that of the clock, which stands: all but the first are rejected as repeated."""
     r = rig("use_sim_time:=true")
-    r.send_and_wait(0, 1, 2)
+    r.send_and_wait(0, stamp=stamp)
+    for n in range(1, 4):
+        r.send(n, stamp=stamp)
     status = r.status("odometry", lambda s: s.message.endswith("use_sim_time is on, and /clock has no publisher"), 0)
     assert status.level == DiagnosticStatus.WARN
