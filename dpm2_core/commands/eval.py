@@ -14,7 +14,7 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.trajectory import Trajectory, matched, matched_period, read_trajectory
+from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stamps_of
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import evaluate
@@ -51,8 +51,9 @@ def eval_(
     estimate = read_trajectory(est)
     if calib is not None:
         estimate = in_camera_frame(estimate, calib)
-    period = matched_period(truth.period, estimate.period)
-    metrics = evaluate(*matched(truth, estimate), chosen, period=period).model_copy(update={"truth": str(gt)})
+    true, est_poses, keys = matched(truth, estimate)
+    stamps = keys if "tum" in (truth.kind, estimate.kind) else stamps_of(keys)
+    metrics = evaluate(true, est_poses, chosen, stamps=stamps).model_copy(update={"truth": str(gt)})
     frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
     show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)

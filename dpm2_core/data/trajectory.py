@@ -135,8 +135,9 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)
 
 
-def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
-    """Ground truth (N, 4, 4) and the estimate (N, 4, 4) of the same frames, NaN where either has none.
+def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
+    """Ground truth and estimate (N, 4, 4) of the same frames, NaN where either has none, and the keys (N,) of these:
+    stamps, ns, where one of the two is TUM, else frame numbers.
 
     If both are TUM and their stamps are not the same, one is interpolated: the ground truth at the stamps of the
     estimate, or the estimate where the ground truth is clearly slower. Else by stamp, by frame number if one carries it
@@ -152,7 +153,7 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
             numbered = False
     if not stamped and not numbered:
         if len(gt) == len(est):
-            return gt.poses, est.poses
+            return gt.poses, est.poses, (est if est.kind == "tum" or gt.kind == "kitti" else gt).keys
         raise UsageError(
             f"ground truth has {len(gt)} poses ({gt.kind}), the estimate {len(est)} ({est.kind}), and neither frame"
             " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together;"
@@ -168,12 +169,7 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
         raise UsageError(f"no frame number of the estimate {numbers}")
     est_poses = np.full_like(gt.poses, np.nan)
     est_poses[rows[near]] = est.poses[near]
-    return gt.poses, est_poses
-
-
-def matched_period(gt: float, est: float) -> float:
-    """s from one frame of `matched` to the next, given the periods of both, s."""
-    return gt if est < _CLEARLY * gt else est
+    return gt.poses, est_poses, gt.keys
 
 
 def same_stamps(a: Keys, b: Keys) -> bool:
@@ -188,7 +184,7 @@ def _ordered(trajectory: Trajectory) -> Trajectory:
     return Trajectory(trajectory.poses[first], keys, trajectory.kind)
 
 
-def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
+def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
     """Both at the stamps of the estimate, or of the ground truth where that is clearly slower: a second of a bend, of
     which nothing is known in between, is no line."""
     at = gt.keys if est.period < _CLEARLY * gt.period else est.keys
@@ -198,7 +194,7 @@ def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array]:
             f"the estimate (time stamps from {est.keys[0]} to {est.keys[-1]} ns) has no pose during the ground truth"
             f" ({gt.keys[0]} to {gt.keys[-1]} ns): none at one of its stamps or between two up to 1 s apart"
         )
-    return true, estimated
+    return true, estimated, at
 
 
 def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
@@ -219,6 +215,11 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
     fraction = ((at - stamps[left])[between] / gap[between])[:, None]
     out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
     return out
+
+
+def stamps_of(numbers: Keys) -> Keys:
+    """Stamps (N,) ns of KITTI's frames of these numbers (N,)."""
+    return numbers * round(FRAME_PERIOD * 1e9)
 
 
 def frame_period(stamps: Keys | Sequence[int]) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.trajectory import FRAME_PERIOD
+from dpm2_core.data.trajectory import Keys, frame_period, stamps_of
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -29,7 +29,7 @@ class SegmentErrors:
         length: (S,) m.
         t_err: (S,) error of the relative translation over the length, a ratio.
         r_err: (S,) error of the relative rotation over the length, rad/m.
-        speed: (S,) mean speed, m/s.
+        speed: (S,) mean speed, m/s; NaN where the stamps go back.
     """
 
     length: Array
@@ -57,7 +57,7 @@ class SegmentErrors:
 
 
 def segment_errors(
-    gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, period: float = FRAME_PERIOD
+    gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, stamps: Keys | None = None
 ) -> SegmentErrors:
     """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
 
@@ -65,8 +65,9 @@ def segment_errors(
         gt: rows of NaN where the ground truth is unknown; these frames count for the speeds alone.
         est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
         lengths: m. With those of the benchmark a segment starts every 10 frames, as there, with others at each frame.
-        period: s from one frame to the next, for the speeds.
+        stamps: (N,) ns, for the speeds; by default KITTI's period apart.
     """
+    stamps = stamps_of(np.arange(len(gt))) if stamps is None else stamps
     at = np.flatnonzero(known(gt))  # position of each true pose among the frames
     gt, est = gt[at], est[at]
     step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
@@ -78,7 +79,11 @@ def segment_errors(
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
-    speed = length / (period * (at[last] - at[first] + 1))  # as the development kit counts the frames
+    # As the development kit counts: to the end of the first frame beyond the length, whether that one is there or not.
+    time, period = stamps - stamps[0], 1e9 * frame_period(stamps)
+    end = np.minimum(time[at[last]], np.interp(travelled[first] + length, travelled, time[at]) + period) + period
+    seconds = (end - time[at[first]]) / 1e9
+    speed = np.divide(length, seconds, out=np.full_like(length, np.nan), where=seconds > 0)
     return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length, speed)
 
 

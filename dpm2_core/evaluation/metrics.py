@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from dpm2_core.data.trajectory import FRAME_PERIOD
+from dpm2_core.data.trajectory import Keys, frame_period, stamps_of
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, SegmentErrors, known, relative, segment_errors
 from dpm2_core.frame import Array
@@ -91,7 +91,7 @@ def evaluate(
     est: Array,
     lengths: Sequence[float] = OFFICIAL_LENGTHS,
     *,
-    period: float = FRAME_PERIOD,
+    stamps: Keys | None = None,
     failed_frames: int | None = None,
 ) -> Metrics:
     """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames; what is not to be seen from these, as
@@ -101,7 +101,7 @@ def evaluate(
         gt: rows of NaN where the ground truth is unknown; these frames are left out.
         est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
         lengths: of the KITTI metric's segments, m.
-        period: s from one frame to the next, for the errors by speed.
+        stamps: (N,) ns, for the speeds and for which frames follow each other; by default KITTI's period apart.
         failed_frames: as the SLAM system counted them; by default the frames without an estimate.
 
     Raises:
@@ -115,9 +115,9 @@ def evaluate(
         raise UsageError(
             f"only {both.sum()} of {len(gt)} frames have both an estimate and ground truth; want 2 or more"
         )
-    segments = segment_errors(gt, est, lengths, period)
+    segments = segment_errors(gt, est, lengths, stamps)
     t_err, r_err = _percent(segments)
-    rpe_trans, rpe_rot = rpe(gt, est)
+    rpe_trans, rpe_rot = rpe(gt, est, stamps)
     position = _position_errors(gt[both], est[both])
     return Metrics(
         frames=len(est),
@@ -163,10 +163,15 @@ def _position_errors(gt: Array, est: Array) -> Array:
     return np.asarray(np.linalg.norm((T_gt_est @ est)[:, :3, 3] - gt[:, :3, 3], axis=1))
 
 
-def rpe(gt: Array, est: Array) -> tuple[float | None, float | None]:
-    """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbors."""
+def rpe(gt: Array, est: Array, stamps: Keys | None = None) -> tuple[float | None, float | None]:
+    """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbors.
+
+    A step across missing frames, more than 1.5 periods of the `stamps` (N,) ns, is none.
+    """
+    stamps = stamps_of(np.arange(len(gt))) if stamps is None else stamps
     both = known(gt) & known(est)
-    first = np.flatnonzero(both[:-1] & both[1:])
+    follows = np.diff(stamps) <= 1.5e9 * frame_period(stamps)
+    first = np.flatnonzero(both[:-1] & both[1:] & follows)
     if not len(first):
         return None, None
     error = se3.inverse(relative(gt, first, first + 1)) @ relative(est, first, first + 1)
@@ -193,7 +198,8 @@ def _of_length(segments: SegmentErrors, length: float) -> LengthErrors:
 
 def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
     out = []
-    for step in sorted({int(np.floor(speed / SPEED_STEP + 0.5)) for speed in segments.speed.tolist()}):
+    speeds = segments.speed[np.isfinite(segments.speed)]
+    for step in sorted({int(np.floor(speed / SPEED_STEP + 0.5)) for speed in speeds.tolist()}):
         center = step * SPEED_STEP
         chosen = segments.of_speed(center - SPEED_STEP / 2, center + SPEED_STEP / 2)
         t_err, r_err = _percent(chosen)

@@ -129,7 +129,7 @@ def aligned(run: RunFolder) -> Array:
     if run.truth is None:
         return np.eye(4)
     try:
-        true, est = matched(run.truth, run.trajectory)
+        true, est, _ = matched(run.truth, run.trajectory)
     except UsageError:
         return np.eye(4)
     both = known(true) & known(est)

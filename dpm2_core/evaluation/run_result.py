@@ -14,7 +14,7 @@ import numpy as np
 from dpm2_core.config import dump_settings
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.source import Source
-from dpm2_core.data.trajectory import Trajectory, frame_period, matched, matched_period, write_kitti, write_tum
+from dpm2_core.data.trajectory import Keys, Trajectory, matched, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import OdometryResult
 from dpm2_core.evaluation.figures import trajectory_png
@@ -163,7 +163,9 @@ class Result:
         Raises:
             UsageError: nothing of the ground truth belongs to this drive.
         """
-        truth, poses = self._compared() if len(self) else (None, np.empty((0, 4, 4)))
+        if not len(self):
+            return None
+        truth, poses, stamps = self._compared()
         if truth is None:
             return None
         if not isinstance(self.ground_truth, Trajectory):
@@ -171,10 +173,7 @@ class Result:
                 return None
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
-        period, failed = frame_period(self.recorder.stamps), self.methods["failed"]
-        if isinstance(self.ground_truth, Trajectory) and self.ground_truth.kind == "tum":
-            period = matched_period(self.ground_truth.period, period)
-        metrics = evaluate(truth, poses, period=period, failed_frames=failed)
+        metrics = evaluate(truth, poses, stamps=stamps, failed_frames=self.methods["failed"])
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 
@@ -219,7 +218,7 @@ class Result:
         """Write trajectory.png; returns why there is none."""
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
-        truth, poses = self._compared()
+        truth, poses, _ = self._compared()
         title = f"{self.source.name}: {len(self)} frames"
         try:
             trajectory_png(path, poses, truth, points, title)
@@ -227,18 +226,20 @@ class Result:
             return [f"no trajectory.png: {error}"]
         return []
 
-    def _compared(self) -> tuple[Array | None, Array]:
-        """Ground truth and estimate (M, 4, 4) of the same frames."""
-        truth = self.ground_truth
+    def _compared(self) -> tuple[Array | None, Array, Keys]:
+        """Ground truth and estimate (M, 4, 4) of the same frames, and the stamps (M,) of these, ns."""
+        truth, stamps = self.ground_truth, np.array(self.recorder.stamps)
         if not isinstance(truth, Trajectory):
-            return None if truth is None else truth[: len(self)], self.poses
-        own = Trajectory(self.poses, np.array(self.recorder.stamps), "tum")
-        if truth.kind == "kitti-indexed":
-            own = Trajectory(self.sensor_poses, np.array(self.recorder.index), "kitti-indexed")
-        true, est = matched(truth, own)
+            return None if truth is None else truth[: len(self)], self.poses, stamps
+        if truth.kind == "tum":
+            true, est, stamps = matched(truth, Trajectory(self.poses, stamps, "tum"))
+        else:
+            index = np.array(self.recorder.index)
+            true, est, numbers = matched(truth, Trajectory(self.sensor_poses, index, truth.kind))
+            stamps = np.interp(numbers, index, stamps).astype(np.int64)
         during = np.flatnonzero(known(est))  # all frames have a pose: the truth before and after is not of this drive
         drive = slice(during[0], during[-1] + 1)
-        return true[drive], est[drive]
+        return true[drive], est[drive], stamps[drive]
 
     @property
     def sensor(self) -> str:

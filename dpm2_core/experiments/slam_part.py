@@ -9,14 +9,13 @@ from time import perf_counter
 from typing import TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
-from dpm2_core.data.trajectory import Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
+from dpm2_core.data.trajectory import Keys, Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
@@ -64,7 +63,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
         truth = _truth(run.source, _span(drive))
         seconds = {stage: float(np.sum(times)) for stage, times in result.seconds.items()}
         accepted = sum(loop.ok for loop in result.mapper.loops)
-        figures = _measured(folder, run.source, (truth, result.poses), drive, result.fps)
+        figures = _measured(folder, run.source, (result.recorder.stamps, truth, result.poses), drive, result.fps)
         return {
             **figures,
             "failed_frames": result.methods["failed"],
@@ -104,7 +103,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     write_truth(folder / TRUTH, stamps, truth)
     fps = len(seconds) / sum(seconds)
     write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
-    return _measured(folder, source, (truth, poses), drive, fps)
+    return _measured(folder, source, (stamps, truth, poses), drive, fps)
 
 
 def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
@@ -127,12 +126,10 @@ def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
     write_tum(folder / TRAJECTORY, stamps[there].tolist(), poses[there])
     write_truth(folder / TRUTH, stamps.tolist(), truth)
     advance(len(truth), len(truth))
-    return _measured(folder, source, (truth, poses), drive, None)
+    return _measured(folder, source, (stamps, truth, poses), drive, None)
 
 
-def _poses_of(
-    file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, NDArray[np.int64]]
-) -> Array:
+def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, Keys]) -> Array:
     """Poses (N, 4, 4) of the LiDAR in the frames of a span, of the true poses `truth`, with those `keys`; NaN: none.
 
     Raises:
@@ -147,7 +144,7 @@ def _poses_of(
     if found.kind == "tum" and not same_stamps(own_keys, found.keys):
         found = Trajectory(interpolate(found.keys, found.poses, own_keys), own_keys, found.kind)
     try:
-        _, poses = matched(Trajectory(truth, own_keys, found.kind), found)
+        _, poses, _ = matched(Trajectory(truth, own_keys, found.kind), found)
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
@@ -168,12 +165,15 @@ def _span(drive: Drive) -> Span:
     return drive["frames"][0], drive["frames"][1]
 
 
-def _measured(folder: Path, source: Source, poses: tuple[Array, Array], drive: Drive, fps: float | None) -> Figures:
-    """Figures of true and estimated (N, 4, 4) poses of the LiDAR; of KITTI's left camera where its place is known."""
-    truth, est = poses
+def _measured(
+    folder: Path, source: Source, poses: tuple[Sequence[int] | Keys, Array, Array], drive: Drive, fps: float | None
+) -> Figures:
+    """Figures of stamps (N,) ns, true and estimated poses (N, 4, 4) of the LiDAR; of KITTI's left camera where its
+    place is known."""
+    stamps, truth, est = poses
     if source.T_cam_lidar is not None:
         truth, est = in_other_frame(truth, source.T_cam_lidar), in_other_frame(est, source.T_cam_lidar)
-    metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]))
+    metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), stamps=np.asarray(stamps, np.int64))
     metrics = metrics.model_copy(update={"truth": source.truth, "fps": fps})
     write_json(folder / METRICS, metrics.model_dump())
     return metrics.model_dump(exclude={"per_length", "per_speed"})

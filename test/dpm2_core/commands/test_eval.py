@@ -67,6 +67,21 @@ def test_speeds_are_those_of_the_stamps(tmp_path: Path, faster: int) -> None:
     assert [row["speed_mps"] for row in json.loads((tmp_path / "m.json").read_text())["per_speed"]] == [4.0]
 
 
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_gap_makes_no_drive_faster(tmp_path: Path, stamped: bool) -> None:
+    """10 m/s; where two seconds are missing the estimate seemed to be up to 30 m/s fast."""
+    poses, there = _drive(), np.r_[0:20, 40:60]
+    if stamped:
+        write_tum(tmp_path / "gt.txt", np.arange(60) * 100_000_000 + 3_000_000, poses)
+        write_tum(tmp_path / "est.txt", there * 100_000_000, poses[there])
+    else:
+        write_kitti(tmp_path / "gt.txt", poses[there], there.tolist())
+        write_kitti(tmp_path / "est.txt", poses[there])
+    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json", "10")
+    found = json.loads((tmp_path / "m.json").read_text())
+    assert [(row["speed_mps"], row["segments"]) for row in found["per_speed"]] == [(8.0, found["segments"])]
+
+
 def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: Path, kitti_excerpt: Path) -> None:
     """Compared without it, a drive that turns by 90 degrees seems decimetres off."""
     folder = kitti_excerpt / "00"

@@ -13,7 +13,6 @@ from dpm2_core.data.trajectory import (
     Trajectory,
     interpolate,
     matched,
-    matched_period,
     read_trajectory,
     same_stamps,
     write_kitti,
@@ -109,7 +108,7 @@ def _x(poses: np.ndarray) -> list[float | None]:
 
 
 def test_missing_frames_are_found_by_their_number() -> None:
-    gt, est = matched(_trajectory([0, 1, 2, 3, 4], "kitti"), _trajectory([3, 1], "kitti-indexed"))
+    gt, est, _ = matched(_trajectory([0, 1, 2, 3, 4], "kitti"), _trajectory([3, 1], "kitti-indexed"))
     assert (_x(gt), _x(est)) == ([0, 1, 2, 3, 4], [None, 1, None, 3, None])
 
 
@@ -142,7 +141,7 @@ def test_stamps_of_a_few_decimals_match_in_any_order() -> None:
     """Of the same frames, of which the estimate lacks one: it has failed there."""
     s = 10**9
     gt = _trajectory([2 * s, 1 * s, 4 * s, 3 * s], "tum")
-    _, est = matched(gt, _trajectory([3 * s - 99_999, s + 50_000, 2 * s], "tum"))
+    _, est, _ = matched(gt, _trajectory([3 * s - 99_999, s + 50_000, 2 * s], "tum"))
     assert _x(est) == [s + 50_000, 2 * s, 3 * s - 99_999, None]
 
 
@@ -157,8 +156,9 @@ def test_ground_truth_of_other_stamps_is_interpolated(gt_hz: float, est_hz: floa
     """At a steady speed an exact estimate has no error; taken at the nearest pose it was 0.15 m off at 15 m/s, frames
     further than 10 ms from one were left out, up to 71 %, or an error, and poses in between counted as failed."""
     est = _clock(est_hz, 41, begin=0.047)
-    true, found = matched(_clock(gt_hz, 5 * int(gt_hz)), est)
+    true, found, stamps = matched(_clock(gt_hz, 5 * int(gt_hz)), est)
     np.testing.assert_array_equal(found, est.poses)
+    np.testing.assert_array_equal(stamps, est.keys)
     np.testing.assert_allclose(true[:, 0, 3], found[:, 0, 3], atol=1e-3)  # ns, of which floats of 4e9 hold 5e-7
 
 
@@ -166,18 +166,18 @@ def test_ground_truth_of_other_stamps_is_interpolated(gt_hz: float, est_hz: floa
 def test_a_slow_ground_truth_counts_at_its_own_stamps(est_hz: int) -> None:
     """Of 1 Hz it knows nothing of a bend in between: there an exact estimate has 1 % of t_err on KITTI 00."""
     gt = _clock(1, 5)
-    true, found = matched(gt, _clock(est_hz, 7 * est_hz // 2, begin=0.047))
+    true, found, stamps = matched(gt, _clock(est_hz, 7 * est_hz // 2, begin=0.047))
     np.testing.assert_array_equal(true, gt.poses)
     assert _x(found)[::4] == [None, None]
     np.testing.assert_allclose(found[1:4, 0, 3], true[1:4, 0, 3], atol=1e-3)  # see above
-    assert (matched_period(1.0, 1 / est_hz), matched_period(0.1, 0.1), matched_period(0.02, 0.1)) == (1.0, 0.1, 0.1)
+    np.testing.assert_array_equal(stamps, gt.keys)
 
 
 def test_a_gap_of_the_ground_truth_is_not_bridged() -> None:
     """Beyond 1 s, as in bags."""
     gt, est = _clock(25, 250), _clock(10, 90, begin=0.047)
     hole = (gt.keys > 3e9) & (gt.keys < 5e9)
-    true, _ = matched(Trajectory(gt.poses[~hole], gt.keys[~hole], "tum"), est)
+    true, _, _ = matched(Trajectory(gt.poses[~hole], gt.keys[~hole], "tum"), est)
     assert [x is None for x in _x(true)] == [3e9 < key < 5e9 for key in est.keys]
 
 
@@ -198,8 +198,16 @@ def test_of_two_estimates_for_one_frame_the_first_counts() -> None:
 def test_ground_truth_of_a_faster_clock_gives_one_frame_for_each_estimate() -> None:
     fast = _trajectory([i * 10**7 for i in range(101)], "tum")
     slow = _trajectory([i * 10**8 for i in range(11)], "tum")
-    gt, est = matched(fast, slow)
+    gt, est, _ = matched(fast, slow)
     assert _x(gt) == _x(est) == [float(i * 10**8) for i in range(11)]
+
+
+def test_what_is_matched_line_by_line_has_the_keys_of_the_one_that_knows_them() -> None:
+    lines = _trajectory([0, 1, 2], "kitti")
+    numbers = _trajectory([0, 2, 5], "kitti-indexed")
+    stamps = _trajectory([7, 8, 9], "tum")
+    for knows, other in ((stamps, lines), (stamps, numbers), (numbers, lines)):
+        assert matched(knows, other)[2].tolist() == matched(other, knows)[2].tolist() == knows.keys.tolist()
 
 
 def test_lines_match_lines_only_if_there_are_as_many() -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.trajectory import Trajectory
 from dpm2_core.estimates import OdometryResult, Registration, State
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.slam.build import make_mapper
@@ -27,3 +29,22 @@ def test_frames_with_a_bad_image_or_bad_times_are_counted(recording: Path) -> No
     result.add(replace(good, camera="the same image"))
     result.add(replace(good, camera="the same image", times="wrong times"))
     assert result.timing["problems"] == {"the same image": 2, "wrong times": 1}
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+def test_speeds_are_those_of_the_drive_where_frames_are_missing(recording: Path, numbered: bool) -> None:
+    """20 m/s at 20 scans a second; four seconds without a scan made it 70 m/s."""
+    frames = np.r_[0:60, 140:300]
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, 0, 3] = frames
+    source = open_source(recording, InputSettings(images=False))
+    source.T_cam_lidar = None  # type: ignore[misc]
+    truth = Trajectory(poses, frames, "kitti-indexed") if numbered else poses
+    result = Result(source, Config(), make_mapper(SlamSettings()), truth, "")
+    registration = Registration(np.eye(4), np.eye(6))
+    for frame, pose in zip(frames.tolist(), poses, strict=True):
+        result.add(
+            OdometryResult(50_000_000 * frame, frame, pose, np.eye(6), np.zeros(6), State.TRACKING, registration)
+        )
+    assert result.metrics is not None
+    assert {row.speed_mps for row in result.metrics.per_speed} == {20.0}
