@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterator
-from decimal import Decimal
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from .helpers.documents import ROOT, equals, record, rows, text
+
 DOCS = (ROOT / "docs").glob("*.md")
 CARD, MEASURED = "dpm2_core/weights/small.md", "docs/measured.md"
 METHODS = {
@@ -23,32 +19,6 @@ METHODS = {
     "refined": "refined",
     "geometric": "geometric",
 }
-
-
-def record(name: str) -> Any:
-    return json.loads((ROOT / "benchmarks" / name).read_text(encoding="utf-8"))
-
-
-def text(path: str) -> str:
-    """A document in one line."""
-    return " ".join((ROOT / path).read_text(encoding="utf-8").split())
-
-
-def rows(path: str, heading: str) -> Iterator[list[str]]:
-    """Cells of the table in a Markdown file that begins with this heading."""
-    lines = iter((ROOT / path).read_text(encoding="utf-8").splitlines())
-    assert any(line == heading for line in lines), f"{path}: no table {heading}"
-    next(lines)
-    for line in lines:
-        if not line.startswith("|"):
-            return
-        yield [cell.strip() for cell in line.strip("|").split("|")]
-
-
-def equals(written: str, true: float) -> bool:
-    """Whether a figure in a text is the true one, rounded to as many digits."""
-    digits = -int(Decimal(written).as_tuple().exponent)
-    return abs(float(written) - true) <= 0.5001 * 10.0**-digits
 
 
 def test_the_figures_beside_kiss_icp_are_those_of_the_record() -> None:
