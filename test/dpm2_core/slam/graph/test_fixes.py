@@ -165,6 +165,23 @@ def test_the_heading_must_be_observable_first() -> None:
         assert graph.fixes[0] == 0
 
 
+@pytest.mark.parametrize(
+    ("way", "lap", "known"), [(50, False, False), (60, False, True), (75, True, False), (90, True, True)]
+)
+def test_what_counts_is_how_far_the_fixes_lie_from_their_middle(way: int, lap: bool, known: bool) -> None:
+    """Fixes each 5 m of a way, m, straight on or once around, by a receiver of 2 m: as docs/how_to.md says."""
+    graph, curvature, before = PoseGraph(RobustSettings()), 2 * np.pi / way if lap else 1e-6, np.eye(4)
+    for node, turn in enumerate(curvature * np.arange(0, way + 1, 5)):
+        place = np.array([np.sin(turn), 1 - np.cos(turn), 0]) / curvature
+        T = se3.make(se3.rotation(np.array([0, 0, turn])), place)
+        edge = Edge("odometry", node - 1, node, Registration(se3.inverse(before) @ T, STEP))
+        graph.add_node(T, edge if node else None)
+        before = T
+        if graph.add_fix(node, fix_at(node, T, np.zeros(3))):
+            graph.optimize()
+    assert (graph.georeference is not None) == known
+
+
 def test_without_fixes_nothing_changes() -> None:
     """To the bit: the graph that is written and solved is the same."""
     with_fixes, odometry = driven(4)  # too few to tell where the map is
