@@ -3,7 +3,9 @@
 
 The model here is small: it is to undo a distortion of the clouds (each is scaled and shifted along x). Its own loss is
 the distance to the clean cloud; the SLAM loss asks that the trajectory through its output be that through clean clouds.
-Prints both before and after.
+Prints both before and after. In 20 steps the first falls to about a sixtieth, the second to a twentieth or less,
+also on KITTI. Few POINTS do not determine a registration: with 400 of them the SLAM loss on KITTI 04 was 14 times as
+large after 20 steps, although the clouds were nearly right.
 """
 
 import sys
@@ -15,7 +17,7 @@ from torch import Tensor, nn
 from dpm2_core import open_source
 from dpm2_core.diffslam import SlamLoss
 
-WINDOW, POINTS, GAMMA = 3, 400, 0.1
+WINDOW, POINTS, GAMMA = 3, 1000, 0.1
 
 
 class Undistort(nn.Module):

@@ -140,6 +140,16 @@ def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
     assert after[1] < before[1]
 
 
+@pytest.mark.slow
+def test_the_slam_loss_falls_on_real_scans_too(kitti_root: Path) -> None:
+    """As far as the example says."""
+    done = example("slam_loss", kitti_root / "sequences" / "04", 20)
+    assert done.returncode == 0, done.stderr
+    before, after = ([float(line.split()[3]), float(line.split()[5])] for line in done.stdout.splitlines())
+    assert after[0] < before[0] / 50
+    assert after[1] < before[1] / 20
+
+
 @pytest.mark.long
 @pytest.mark.weights
 def test_the_notebook(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
