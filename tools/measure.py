@@ -19,7 +19,7 @@ RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
     "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": (),
     "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": ("--pairs", "200"),
-    "roads": (), "indoor": (), "finetune": (),
+    "roads": (), "indoor": (), "motion": (), "beside": (), "imu": ("--threads", "1"), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, the quick ones first."""
 TARGETS = {"livox": "bench-livox"}
