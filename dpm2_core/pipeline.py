@@ -70,7 +70,9 @@ class OfflineRun:
             self._start, self._stop = span_of(self.source, frames)
             if map_mode == "resume":
                 self._start = resume_at(self.slam.mapper, self.source, self._start)
-                _check_span(self.source, self._start, self._stop, frames)
+                if self._start >= self._stop:
+                    ends = self.slam.mapper.keyframes[-1].index
+                    raise UsageError(f"--frames {frames[0]}:{frames[1]}: the map goes on to frame {ends} already")
             if map_mode != "localize":  # the frame of the map is its own
                 self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
         except BaseException as error:

@@ -16,6 +16,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stamps_of
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.ground_truth import in_other_frame
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.report import metrics_table
@@ -23,12 +24,16 @@ from dpm2_core.geometry import se3
 
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
 FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
+FRAME_OF_DRIVE = "{}, as in the files of this kind that dpm2 run writes"
 
 
 def eval_(
     gt: Annotated[
         Path,
-        typer.Option(help="Ground truth: a KITTI, KITTI-360 or TUM file, or a drive whose poses are known."),
+        typer.Option(
+            help="Ground truth: a KITTI, KITTI-360 or TUM file, or a drive whose poses are known: for a TUM estimate "
+            "those of its LiDAR, else those of its left camera."
+        ),
     ],
     est: Annotated[Path, typer.Option(help="The estimate, in either format.")],
     json_file: JsonFile = None,
@@ -47,31 +52,41 @@ def eval_(
     if settings and not gt.is_dir():
         raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is a file")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
-    truth = _of_drive(gt, settings or []) if gt.is_dir() else read_trajectory(gt)
-    estimate = read_trajectory(est)
+    estimate, frame = read_trajectory(est), FRAME_AS_GIVEN
+    if gt.is_dir():
+        stamped = estimate.kind == "tum"
+        truth, sensor = _of_drive(gt, settings or [], stamped, lidar=stamped and calib is None)
+        frame = FRAME_OF_DRIVE.format(sensor)
+    else:
+        truth = read_trajectory(gt)
     if calib is not None:
-        estimate = in_camera_frame(estimate, calib)
+        estimate, frame = in_camera_frame(estimate, calib), FRAME_CAMERA
     true, est_poses, keys = matched(truth, estimate)
     stamps = keys if "tum" in (truth.kind, estimate.kind) else stamps_of(keys)
     metrics = evaluate(true, est_poses, chosen, stamps=stamps).model_copy(update={"truth": str(gt)})
-    frame = FRAME_CAMERA if calib else FRAME_AS_GIVEN
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
     show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)
 
 
-def _of_drive(path: Path, settings: list[str]) -> Trajectory:
-    """True poses of all frames of a drive, NaN where there is none, by frame number; of the left camera where its place
-    is known, as `dpm2 run` writes them."""
+def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
+    """True poses of all frames of a drive, NaN where there is none, as `dpm2 run` writes its own: by stamp, or by frame
+    number; of the LiDAR, or of the left camera where its place is known. And which of these, in words."""
     source = open_source(path, load_settings(InputSettings, None, [*settings, "images=false"]))
     if source.poses is None:
         raise UsageError(f"{path}: the drive has no ground truth")
-    T = np.eye(4) if source.T_cam_lidar is None else source.T_cam_lidar
-    numbers = getattr(source, "numbers", None)  # those in the file names
-    numbers = np.arange(len(source)) if numbers is None else numbers
     if not known(source.poses).any():
         raise UsageError(f"{path}: no frame has a pose; {'; '.join(source.notes)}")
+    camera = None if lidar else source.T_cam_lidar
+    poses = source.poses if camera is None else in_other_frame(source.poses, camera)
+    sensor = "LiDAR" if camera is None else "left camera"
+    if stamped:
+        stamps = getattr(source, "stamps", None)  # some sources have them with their frames alone
+        stamps = [frame.stamp for frame in source.frames()] if stamps is None else stamps
+        return Trajectory(poses, np.array(stamps, np.int64), "tum"), sensor
+    numbers = getattr(source, "numbers", None)  # those in the file names
+    numbers = np.arange(len(source)) if numbers is None else numbers
     # Frames without a pose stay: a file with a line for each frame is matched line by line.
-    return Trajectory(T @ source.poses @ se3.inverse(T), numbers, "kitti-indexed")
+    return Trajectory(poses, numbers, "kitti-indexed"), sensor
 
 
 def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:

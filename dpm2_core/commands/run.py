@@ -18,7 +18,7 @@ from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.evaluation.run_folder import TRAJECTORY
+from dpm2_core.evaluation.run_folder import TRAJECTORY, set_aside
 from dpm2_core.evaluation.run_result import Result, save_config
 from dpm2_core.files import make_folder
 from dpm2_core.interrupt import interrupt_deferred
@@ -97,6 +97,12 @@ def run(
     with ExitStack() as open_things:
         drive = open_things.enter_context(OfflineRun(source, chosen, span, gt, map_file, mode))
         make_folder(out)  # the recording may go there
+        if resume and (out / TRAJECTORY).exists():
+            first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
+            set_aside(out, out / f"before_{first}")
+            typer.echo(
+                f"{out / f'before_{first}'}: the results so far; those of this run begin at frame {first}", err=True
+            )
         live = None
         if view or record is not None:
             live = open_things.enter_context(LiveView(drive.source.name, view, record))

@@ -18,7 +18,7 @@ import numpy as np
 from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge
-from dpm2_core.files import atomic_write
+from dpm2_core.files import atomic_write, make_folder
 from dpm2_core.frame import Array
 
 TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
@@ -110,6 +110,21 @@ def remove_results(folder: Path, *names: str) -> None:
             (folder / name).unlink(missing_ok=True)
         except OSError as error:
             raise Dpm2Error(f"{folder / name}: not removed: {error.strerror or error}") from error
+
+
+def set_aside(folder: Path, into: Path) -> None:
+    """Move the results of a run to another folder, so that the next one replaces none of them.
+
+    Raises:
+        Dpm2Error: one could not be moved.
+    """
+    make_folder(into)
+    for name in (TRAJECTORY, *MAPPING):
+        try:
+            if (folder / name).exists():
+                (folder / name).replace(into / name)
+        except OSError as error:
+            raise Dpm2Error(f"{folder / name}: not moved to {into}: {error.strerror or error}") from error
 
 
 def read_run(path: Path) -> RunFolder:

@@ -190,6 +190,7 @@ class Result:
                 be made there.
         """
         make_folder(out)
+        remove_results(out, METRICS, TRUTH, PICTURE, LOCALIZATION)  # also where the truth turns out not to fit
         save_config(self.config, out)
         write_kitti(out / POSES, self.sensor_poses)
         write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
@@ -203,16 +204,12 @@ class Result:
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
         write_json(out / TIMING, self.timing)
-        if self.metrics is None:
-            remove_results(out, METRICS, TRUTH)
-        else:
+        if self.metrics is not None:
             write_json(out / METRICS, self.metrics.model_dump())
             assert self.ground_truth is not None
             write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
                                                      self.source.T_cam_lidar))  # fmt: skip
-        missing = self._draw(out / PICTURE, points)
-        remove_results(out, LOCALIZATION, *([PICTURE] if missing else []))
-        return missing
+        return self._draw(out / PICTURE, points)
 
     def _draw(self, path: Path, points: Points | None) -> list[str]:
         """Write trajectory.png; returns why there is none."""

@@ -99,6 +99,21 @@ def test_an_interrupted_run_keeps_what_there_is(recording: Path, tmp_path: Path)
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 4
 
 
+def test_a_truth_that_does_not_fit_leaves_no_figures_of_the_run_before(
+    recording: Path, result: Result, tmp_path: Path
+) -> None:
+    """They lay beside the new trajectory and were taken for its own."""
+    out = tmp_path / "out"
+    result.save(out)
+    assert (out / "metrics.json").exists()
+    write_tum(tmp_path / "late.tum", [10**15, 10**15 + 10**8], np.tile(np.eye(4), (2, 1, 1)))
+    other = OfflineRun(recording, CONFIG, (0, 4), tmp_path / "late.tum").run()
+    with pytest.raises(UsageError):
+        other.save(out)
+    assert len(read_trajectory(out / "trajectory.tum")) == 4
+    assert not any((out / name).exists() for name in ("metrics.json", "ground_truth.tum", "trajectory.png"))
+
+
 @pytest.mark.slow
 def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = open_source(recording)

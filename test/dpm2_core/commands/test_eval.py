@@ -135,6 +135,29 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
     assert "no ground truth" in str(run.exception)
 
 
+def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> None:
+    """`dpm2 run` writes trajectory.tum so, and --localise nothing else; they were held against poses of the camera."""
+    folder = tmp_path / "sequences" / "07"
+    (folder / "velodyne").mkdir(parents=True)
+    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
+    for n in range(6):
+        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
+    (folder / "times.txt").write_text("".join(f"{0.1 * n}\n" for n in range(6)))
+    write_kitti(folder / "poses.txt", poses)
+    T_cam_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])
+    stamps = [100_000_000 * n for n in range(1, 6)]
+    of_lidar = se3.inverse(T_cam_lidar) @ poses @ T_cam_lidar
+    write_tum(tmp_path / "est.tum", stamps, of_lidar[1:])
+    arguments = ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.tum"), "--json", str(tmp_path / "m.json")]
+    for extra, frame in (([], "LiDAR, as"), (["--calib", str(folder / "calib.txt")], "left camera; the estimate")):
+        run = CliRunner().invoke(app, [*arguments, *extra])
+        assert run.exit_code == 0, run.output
+        figures = json.loads((tmp_path / "m.json").read_text())
+        assert figures["ape_rmse_m"] < 1e-6
+        assert figures["frame"].startswith(frame)
+
+
 def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
     """Scans 3 and 4 are missing, and the poses end at frame 6: the estimate's ten lines were taken for frames 0 to 9,
     as there are more of them than known poses; an exact one had a t_err of 28 %."""

@@ -332,7 +332,12 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     rejected = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN)
     assert rejected.returncode == 2
     assert "--resume goes on with it" in rejected.stderr
-    assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN).returncode == 0
+    done = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN)
+    assert done.returncode == 0
+    first = loaded(parts).keyframes[before - 1].index
+    assert f"before_{first}: the results so far; those of this run begin at frame {first}" in done.stderr
+    assert len(read_trajectory(tmp_path / "b" / f"before_{first}" / "trajectory.tum")) == 35
+    assert (tmp_path / "b" / f"before_{first}" / "metrics.json").exists()
     one, two = loaded(whole), loaded(parts)
     assert set(two.session) == {1, 2}
     assert two.keyframes[before].index == two.keyframes[before - 1].index  # it begins where the first part ended
@@ -346,6 +351,8 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     assert max(np.linalg.norm(a[i][:3, 3] - b[i][:3, 3]) for i in common) < 0.05
     # Only the new frames are in the trajectory of the second run, the map has all.
     assert len(read_trajectory(tmp_path / "b" / "trajectory.tum")) == 60 - two.keyframes[before].index
+    ended = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", "--frames", "0:20", *RUN)
+    assert f"--frames 0:20: the map goes on to frame {loaded(parts).keyframes[-1].index} already" in ended.stderr
 
 
 @pytest.mark.slow
