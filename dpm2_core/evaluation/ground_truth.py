@@ -22,12 +22,13 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
         path: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
 
     Raises:
-        UsageError: no such file, or one of another drive.
+        UsageError: no such file, or one of another drive or of other frames.
     """
     if path is None:
         return None if source.poses is None else source.poses[start:stop]
     truth = read_trajectory(path)
-    if truth.kind == "tum" or truth.kind == "kitti-indexed":
+    if truth.kind != "kitti":
+        _check_overlap(truth, path, source, start, stop)
         return truth
     numbers = getattr(source, "numbers", None)  # those in the file names; a bag has none
     if len(truth) < len(source) or (len(truth) > len(source) and numbers is None):
@@ -40,6 +41,29 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
     else:
         poses = truth.poses[start:stop]
     return poses if source.T_cam_lidar is None else in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+
+
+def _check_overlap(truth: Trajectory, path: Path, source: Source, start: int, stop: int) -> None:
+    """Before the run: at its end the error would cost all its time.
+
+    Raises:
+        UsageError: all true poses are from before or after those frames.
+    """
+    stamped, begin, end = truth.kind == "tum", int(truth.keys.min()), int(truth.keys.max())
+
+    def key_at(position: int) -> int:
+        frame = next(iter(source.frames(position, position + 1)))
+        return frame.stamp if stamped else frame.index
+
+    if begin <= (first := key_at(start)) <= end:  # the last frame of a bag is found only by reading all of it
+        return
+    first, last = sorted((first, key_at(stop - 1)))
+    if end < first or begin > last:
+        of_truth, of_frames = (
+            f"from {a / 1e9:.3f} to {b / 1e9:.3f} s" if stamped else f"{a} to {b}"
+            for a, b in ((begin, end), (first, last))
+        )
+        raise UsageError(f"{path}: poses {of_truth}, but the frames of {source.name} are {of_frames}")
 
 
 def truth_by_stamp(

@@ -186,8 +186,8 @@ class Result:
             cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
-            Dpm2Error: a file could not be written; the old one survives. UsageError: see `metrics`, or no folder can
-                be made there.
+            Dpm2Error: a file could not be written; the old one survives. UsageError: no folder can be made there, or,
+                when all other files are written, see `metrics`.
         """
         make_folder(out)
         remove_results(out, METRICS, TRUTH, PICTURE, LOCALIZATION)  # also where the truth turns out not to fit
@@ -204,18 +204,22 @@ class Result:
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
         write_json(out / TIMING, self.timing)
+        missing = self._draw(out / PICTURE, points)
         if self.metrics is not None:
             write_json(out / METRICS, self.metrics.model_dump())
             assert self.ground_truth is not None
             write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
                                                      self.source.T_cam_lidar))  # fmt: skip
-        return self._draw(out / PICTURE, points)
+        return missing
 
     def _draw(self, path: Path, points: Points | None) -> list[str]:
         """Write trajectory.png; returns why there is none."""
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
-        truth, poses, _ = self._compared()
+        try:
+            truth, poses, _ = self._compared()
+        except UsageError:  # the truth is of another drive
+            truth, poses = None, self.poses
         title = f"{self.source.name}: {len(self)} frames"
         try:
             trajectory_png(path, poses, truth, points, title)

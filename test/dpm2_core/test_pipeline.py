@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
-from dpm2_core.data.trajectory import interpolate, read_trajectory, write_kitti, write_tum
+from dpm2_core.data.trajectory import Trajectory, interpolate, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Frame
@@ -99,21 +100,6 @@ def test_an_interrupted_run_keeps_what_there_is(recording: Path, tmp_path: Path)
     assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 4
 
 
-def test_a_truth_that_does_not_fit_leaves_no_figures_of_the_run_before(
-    recording: Path, result: Result, tmp_path: Path
-) -> None:
-    """They lay beside the new trajectory and were taken for its own."""
-    out = tmp_path / "out"
-    result.save(out)
-    assert (out / "metrics.json").exists()
-    write_tum(tmp_path / "late.tum", [10**15, 10**15 + 10**8], np.tile(np.eye(4), (2, 1, 1)))
-    other = OfflineRun(recording, CONFIG, (0, 4), tmp_path / "late.tum").run()
-    with pytest.raises(UsageError):
-        other.save(out)
-    assert len(read_trajectory(out / "trajectory.tum")) == 4
-    assert not any((out / name).exists() for name in ("metrics.json", "ground_truth.tum", "trajectory.png"))
-
-
 @pytest.mark.slow
 def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = open_source(recording)
@@ -149,6 +135,18 @@ def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path
     assert stamped.metrics.ape_rmse_m == pytest.approx(given.metrics.ape_rmse_m, abs=5e-3)
     stamped.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_truth_that_turns_out_not_to_fit_costs_nothing_else(recording: Path, result: Result, tmp_path: Path) -> None:
+    """The results are whole, and those of a run before are not taken for its own."""
+    stamps = result.recorder.stamps
+    apart = Trajectory(np.tile(np.eye(4), (2, 1, 1)), np.array([stamps[0] - 10**9, stamps[-1] + 10**9]), "tum")
+    result.save(tmp_path, cloud=False)
+    (tmp_path / "timing.json").unlink()
+    (tmp_path / "trajectory.png").unlink()
+    with pytest.raises(UsageError, match="no pose during the ground truth"):
+        replace(result, ground_truth=apart).save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"metrics.json", "ground_truth.tum"}
 
 
 def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
@@ -252,3 +250,12 @@ def test_errors_of_use_come_before_anything_runs(recording: Path, tmp_path: Path
     write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(UsageError, match=f"3 poses for {FRAMES} frames of 00"):
         OfflineRun(recording, CONFIG, ground_truth=tmp_path / "short.txt")
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    write_kitti(tmp_path / "other.txt", poses, [20, 21, 22])
+    with pytest.raises(UsageError, match=f"other.txt: poses 20 to 22, but the frames of 00 are 2 to {FRAMES - 1}"):
+        OfflineRun(recording, CONFIG, (2, None), tmp_path / "other.txt")
+    write_tum(tmp_path / "late.tum", [10**15, 2 * 10**15, 3 * 10**15], poses)
+    with pytest.raises(
+        UsageError, match=r"late.tum: poses from 1000000.000 to 3000000.000 s, but the frames of 00 are"
+    ):
+        OfflineRun(recording, CONFIG, ground_truth=tmp_path / "late.tum")

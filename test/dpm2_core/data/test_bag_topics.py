@@ -159,7 +159,7 @@ def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("damaged", "why"), [(False, "no rigid transform"), (True, "is damaged")])
-def test_a_true_pose_that_is_none_costs_itself(bags: Any, tmp_path: Path, damaged: bool, why: str) -> None:
+def test_an_invalid_true_pose_costs_itself(bags: Any, tmp_path: Path, damaged: bool, why: str) -> None:
     """A cloud there gets the pose between those of its neighbors."""
     truth = [bags.odometry(1 + 0.5 * i, x) for i, x in enumerate((0.0, 99.0, 10.0))]
     if damaged:

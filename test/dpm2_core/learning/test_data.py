@@ -146,7 +146,7 @@ def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("setting", [{"emphasis": {"citty": 100}}, {"radii": {"tunel": 1}}])
-def test_a_place_that_is_none_is_rejected(setting: dict) -> None:
+def test_an_unknown_place_is_rejected(setting: dict) -> None:
     """It was taken, and changed nothing."""
     with pytest.raises(ValidationError, match="there are city, suburb, rural"):
         DataSettings(**setting)
