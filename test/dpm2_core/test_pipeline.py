@@ -22,6 +22,8 @@ from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import Config
+from dpm2_core.slam.store.map_data import load_map, trajectory
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamResult
 
 from ..helpers.drives import first_scans
@@ -197,6 +199,18 @@ def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:
         result.save(tmp_path / "out")
     with pytest.raises(UsageError, match="there is a file already"):
         OfflineRun(recording, CONFIG, map_file=path)
+
+
+def test_the_frame_where_a_drive_goes_on_is_in_the_trajectory_of_its_map_once(recording: Path, tmp_path: Path) -> None:
+    path = tmp_path / "drive.dpm2map"
+    for stop in (4, None):
+        with OfflineRun(recording, CONFIG, (0, stop), map_file=path, map_mode="resume") as drive:
+            drive.run()
+    with MapStore.open(path) as store:
+        data = load_map(store)
+    stamps, poses = trajectory(data)
+    assert stamps == sorted({keyframe.stamp for keyframe in data.keyframes})
+    assert len(poses) == len(stamps) == len(data.keyframes) - 1
 
 
 def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> None:

@@ -280,9 +280,17 @@ def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:
 
 
 def trajectory(data: MapData) -> tuple[list[int], Array]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other, the earliest first."""
-    found = sorted(ways(data).values(), key=lambda way: way[0][0])
-    return [stamp for stamps, _ in found for stamp in stamps], np.concatenate([data.poses[:0], *(T for _, T in found)])
+    """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other, the earliest first.
+
+    The frame with which a drive was cut off and went on, a keyframe of both sessions, is there once.
+    """
+    stamps, poses, ends = list[int](), [data.poses[:0]], set[tuple[str, int]]()
+    for (robot, _), (at, T_map_kf) in sorted(ways(data).items(), key=lambda way: way[1][0][0]):
+        again = int((robot, at[0]) in ends)
+        ends.add((robot, at[-1]))
+        stamps += at[again:]
+        poses.append(T_map_kf[again:])
+    return stamps, np.concatenate(poses)
 
 
 def odometry_by_node(edges: Iterable[Edge]) -> dict[int, Edge]:
