@@ -115,15 +115,20 @@ def test_a_calibration_without_tr_or_that_is_not_there_is_rejected(tmp_path: Pat
             eval_(tmp_path / "gt.txt", tmp_path / "gt.txt", calib=tmp_path / name)
 
 
-def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
-    """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
-    folder = tmp_path / "sequences" / "07"
+def drive_with_truth(root: Path) -> tuple[Path, np.ndarray]:
+    """A KITTI sequence of six scans, and the poses (6, 4, 4) of its left camera."""
+    folder, poses = root / "sequences" / "07", np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
     (folder / "velodyne").mkdir(parents=True)
-    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
     for n in range(6):
         np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
     write_kitti(folder / "poses.txt", poses)
+    return folder, poses
+
+
+def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
+    """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
+    folder, poses = drive_with_truth(tmp_path)
     write_kitti(tmp_path / "est.txt", poses[1:], range(1, 6))
     run = CliRunner().invoke(
         app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt"), "--json", str(tmp_path / "m.json")]
@@ -137,14 +142,8 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
 
 def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> None:
     """`dpm2 run` writes trajectory.tum so, and --localise nothing else; they were held against poses of the camera."""
-    folder = tmp_path / "sequences" / "07"
-    (folder / "velodyne").mkdir(parents=True)
-    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
-    for n in range(6):
-        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
-    (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
+    folder, poses = drive_with_truth(tmp_path)
     (folder / "times.txt").write_text("".join(f"{0.1 * n}\n" for n in range(6)))
-    write_kitti(folder / "poses.txt", poses)
     T_cam_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])
     stamps = [100_000_000 * n for n in range(1, 6)]
     of_lidar = se3.inverse(T_cam_lidar) @ poses @ T_cam_lidar
