@@ -99,10 +99,9 @@ def run(
         make_folder(out)  # the recording may go there
         if resume and (out / TRAJECTORY).exists():
             first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
-            set_aside(out, out / f"before_{first}")
-            typer.echo(
-                f"{out / f'before_{first}'}: the results so far; those of this run begin at frame {first}", err=True
-            )
+            before = out / f"before_{first}"
+            set_aside(out, before)
+            typer.echo(f"{before}: the results so far; those of this run begin at frame {first}", err=True)
         live = None
         if view or record is not None:
             live = open_things.enter_context(LiveView(drive.source.name, view, record))

@@ -47,6 +47,11 @@ class Source(Protocol):
         ...
 
 
+def frame_at(source: Source, position: int) -> Frame:
+    """The frame at a position of a drive; of a bag that reads all before it."""
+    return next(iter(source.frames(position, position + 1)))
+
+
 def parse_range(text: str) -> Span:
     """`a:b`, `a:`, `:b` or `:` to (a, b or None).
 

@@ -45,7 +45,7 @@ class SlamLossSettings(Settings):
     that the iterations do not converge from there. What has not converged has a gradient that says little."""
     truncate: int = Field(default=0, ge=0)
     """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass.
-    Only with spans of 1: in a pose graph there is no way along which they pass."""
+    Only with spans of 1: a pose graph has no chain to cut."""
 
     placebo: bool = False
     """For experiments: a window is compared with the trajectory of the window before; the first, with its own, which

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, frame_at
 from dpm2_core.data.trajectory import Trajectory, read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -52,7 +52,7 @@ def _check_overlap(truth: Trajectory, path: Path, source: Source, start: int, st
     stamped, begin, end = truth.kind == "tum", int(truth.keys.min()), int(truth.keys.max())
 
     def key_at(position: int) -> int:
-        frame = next(iter(source.frames(position, position + 1)))
+        frame = frame_at(source, position)
         return frame.stamp if stamped else frame.index
 
     if begin <= (first := key_at(start)) <= end:  # the last frame of a bag is found only by reading all of it

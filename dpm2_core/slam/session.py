@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from dpm2_core.config import dump_settings
 from dpm2_core.data.messages import returned
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, frame_at
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import weights_id
@@ -119,12 +119,12 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     last = mapper.keyframes[-1]
 
     def index_at(position: int) -> int:
-        return next(iter(source.frames(position, position + 1))).index
+        return frame_at(source, position).index
 
     position = min(len(source) - 1, last.index - index_at(0))
     if position > 0 and index_at(position) != last.index:  # some scans are missing
         position = bisect_left(range(position), last.index, key=index_at)
-    result = None if position < 0 else next(iter(source.frames(position, position + 1)))
+    result = None if position < 0 else frame_at(source, position)
     if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
     if not _shows(result, mapper.clouds[-1]):

@@ -197,7 +197,7 @@ def changed(**sections: object) -> Callable[[DeepPointMap2], dict[str, str]]:
 
 
 WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
-    "a hub's name": (changed(image={"backbone": "timm:hf-hub:somebody/something"}), "do not choose what is downloaded"),
+    "a hub's name": (changed(image={"backbone": "timm:hf-hub:owner/model"}), "do not choose what is downloaded"),
     "an address": (changed(image={"backbone": "timm:local-dir:/etc"}), "do not choose what is downloaded"),
     "1e12 channels": (changed(channels=10**12), "network.channels is 1000000000000; at most 65536"),
     "65,536 channels": (changed(decoder={"width": 65536}), "does not fit the network that it describes"),

@@ -20,7 +20,7 @@ import sys, time
 from dpm2_ros.runtime import ros_context
 ros_context([])
 import rclpy
-node = rclpy.create_node("somebody")
+node = rclpy.create_node("listener")
 print("up", flush=True)
 sys.stdin.read()
 """

@@ -116,7 +116,7 @@ class MotionState:
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
         speed, swing = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
-        turn = swing if self.turn is None else 0.0  # what swings goes on as little as it did before
+        turn = swing if self.turn is None else 0.0  # a turn that has changed may change again
         return covariance(speed, self.seconds + dt, self.settings.steadiness, self.of_velocity, turn)
 
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:

@@ -43,12 +43,12 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     programs = [name for name in ("kiss-icp", "small_gicp") if find_spec(name.replace("-", "_"))]  # of the extra bench
     peers = [word for name in programs for word in ("--peer", name)]
     call = ("experiment", "kitti", kitti, "--out", out, "--lengths", "2,3", *QUICK, *peers,
-            "--peer", f"somebody={tmp_path}/given_{{sequence}}.txt")  # fmt: skip
+            "--peer", f"other-slam={tmp_path}/given_{{sequence}}.txt")  # fmt: skip
     done = dpm2(*call)
     assert done.returncode == 0, done.stderr
     found = rows(out / "kitti.json")
-    assert list(found) == ["dpm2 geometric", *programs, "somebody", "DeepPointMap2"]
-    assert found["somebody"]["06"]["t_err_percent"] == pytest.approx(0, abs=1e-4)
+    assert list(found) == ["dpm2 geometric", *programs, "other-slam", "DeepPointMap2"]
+    assert found["other-slam"]["06"]["t_err_percent"] == pytest.approx(0, abs=1e-4)
     assert 0 < found["dpm2 geometric"]["mean"]["t_err_percent"] < 5
     assert found["DeepPointMap2"]["06"] == {"t_err_percent": 0.47, "r_err_deg_per_100m": 0.20}
     assert "07, 08, 09" in done.stderr
@@ -56,14 +56,14 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     record = json.loads((out / "kitti.json").read_text())
     speeds = {row["name"]: row["cells"]["10"] for row in record["tables"][1]["rows"]}
     assert speeds["dpm2 geometric"]["fps"] > 0
-    assert speeds["somebody"] == {"ape_rmse_m": pytest.approx(0, abs=1e-4), "fps": None}  # a file tells no time
+    assert speeds["other-slam"] == {"ape_rmse_m": pytest.approx(0, abs=1e-4), "fps": None}  # a file tells no time
     assert record["request"]["lengths"] == [2.0, 3.0]
     assert record["parts"]["dpm2_geometric/06"]["truth"] == "poses/06.txt"
     assert (out / "trajectories_10.png").stat().st_size > 5000
     assert "DeepPointMap2" in (out / "kitti.html").read_text()
     page = tmp_path / "report.html"
     assert dpm2("report", out, "--out", page).returncode == 0
-    assert "somebody/10" in page.read_text()
+    assert "other-slam/10" in page.read_text()
     assert "KITTI odometry: t_err" in page.read_text()  # the experiment's table
     before = {path: path.stat().st_mtime_ns for path in out.rglob("part.json")}
     assert len(before) == 2 * (2 + len(programs))

@@ -141,7 +141,7 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
 def test_a_merge_that_is_stopped_at_its_end_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
-    """The map had its name, and no record of what it was: it counted as somebody else's file from then on."""
+    """The map had its name, and no record of what it was: it counted as a file of another program from then on."""
     _, maps, joins = fleet_maps(3)
     for name, data in maps.items():
         (tmp_path / name).mkdir()
