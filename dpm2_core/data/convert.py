@@ -29,7 +29,7 @@ EPOCH_NS = 1_316_995_200_000_000_000
 """Added to stamps that are no times since 1970, as KITTI's: 26 September 2011, its first day. ROS takes a stamp near 0
 for none."""
 _EARLIEST = 10**17  # ns, in 1973
-_PERIOD = 100_000_000  # ns, between two clouds where the clock went back
+_PERIOD = 100_000_000  # ns, between two clouds where the clock was set
 
 # The odometry set has no such calibration: kitti2bag's base_link, the middle of the wheelbase at ground level.
 _T_BASE_LIDAR = se3.make(np.eye(3), [-0.59, 0.0, 1.73])
@@ -131,7 +131,7 @@ class _Bag:
             self._put(f"{self._names.truth}/path", self._first, path, latched=True)
 
     def _begin(self, frame: Frame) -> int:
-        """The stamp to write, ns. Readers go by the time of recording, which goes on where the clock went back."""
+        """The stamp to write, ns. Readers go by the time of recording, which goes on evenly where the clock was set."""
         self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0  # of each, since a clock may be set during a drive
         stamp = frame.stamp + self._later
         if self._first is None:
@@ -140,8 +140,11 @@ class _Bag:
                 correction = bag_messages.number(self._correction_deg)
                 self._put(topics.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
         last = self._recorded.get(self._names.points, stamp)
-        if stamp + self._shift < last:
+        if frame.stepped or stamp + self._shift < last:
             self._shift = last + _PERIOD - stamp
+            if frame.imu and topics.IMU in self._recorded:  # the sweep may take longer than that
+                first = int(frame.imu.stamps[0]) + self._later
+                self._shift = max(self._shift, self._recorded[topics.IMU] + 1 - first)
         return stamp
 
     def _is_new(self, topic: str, stamp: int) -> bool:

@@ -349,42 +349,6 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
     assert set(open_bag(tmp_path / "bag").types) == {"/points"}
 
 
-class OddClock:
-    """Clouds whose numbers are their first coordinates, with a sample of an IMU before each and an image every 2nd."""
-
-    name, truth, T_cam_lidar, poses = "clock", "", None, None
-
-    def __init__(self, stamps: list[int]) -> None:
-        self.stamps, self.notes = stamps, list[str]()
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """All of them."""
-        for index, stamp in enumerate(self.stamps):
-            imu = Inertial(np.array([stamp - 10**7]), np.ones((1, 3)), np.ones((1, 3)))
-            yield Frame(stamp, np.full((3, 4), index, np.float32), index=index, imu=imu)
-
-
-@pytest.mark.parametrize(
-    "stamps",
-    [
-        [STAMP, STAMP + 10**8, STAMP - 10**9, STAMP - 9 * 10**8],  # set back while driving
-        [5 * 10**9, 5 * 10**9 + 10**8, STAMP, STAMP + 10**8],  # set once it hears of the time
-    ],
-)
-def test_the_order_is_kept_where_the_clock_is_set(tmp_path: Path, stamps: list[int]) -> None:
-    """Players and readers go by the time of recording, and nothing is lost."""
-    convert(OddClock(stamps), tmp_path / "bag")
-    bag = open_bag(tmp_path / "bag")
-    clouds = [bag.decode(topic, data) for topic, _, data in bag.messages(["/points"])]
-    assert [float(np.frombuffer(cloud.data, "<f4")[0]) for cloud in clouds] == [0, 1, 2, 3]
-    said = [cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec for cloud in clouds]
-    assert said == [stamp if stamp > 10**17 else stamp + EPOCH_NS for stamp in stamps]
-    assert bag.counts["/imu"] == 4
-
-
 def test_the_first_camera_is_that_although_its_images_come_late(tmp_path: Path) -> None:
     """By what the source knows. And an image that two clouds have is written once."""
     drive = OtherDrive()
