@@ -130,7 +130,7 @@ class FrameBuilder:
         try:
             second = self._decode(topic, second)
             others, other_offset = self._points(second)
-            T = self._calibration.transforms.lookup(lidar_frame, second.header.frame_id)
+            T = self._calibration.transforms.between(lidar_frame, second.header.frame_id)
         except (MessageError, UsageError) as error:
             self.problems[topic] = self._tell(topic, error, "; going on without the second LiDAR")
             return points, offset
@@ -195,10 +195,8 @@ class FrameBuilder:
         R = self._settings.imu_rotation()
         if R is not None:
             return R
-        if lidar_frame and lidar_frame.lstrip("/") == imu_frame.lstrip("/"):
-            return np.eye(3)
         try:
-            return self._calibration.transforms.lookup(lidar_frame, imu_frame)[:3, :3]
+            return self._calibration.transforms.between(lidar_frame, imu_frame)[:3, :3]
         except UsageError as error:
             raise UsageError(f"{error}; set input.q_lidar_imu, or publish it on /tf_static") from None
 

@@ -85,6 +85,18 @@ class TransformTree:
             raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
         return se3.inverse(up_target[common]) @ up_source[common]
 
+    def between(self, target_frame: str, source_frame: str) -> Array:
+        """T_target_source (4, 4) as by `lookup`; of one frame that has a name the identity, also where it is not known.
+
+        Not for cameras: their axes are not those of a LiDAR whose frame they name.
+
+        Raises:
+            UsageError: the two are not connected.
+        """
+        if _name(target_frame) and _name(target_frame) == _name(source_frame):
+            return np.eye(4)
+        return self.lookup(target_frame, source_frame)
+
     def root(self, frame: str, below: Collection[str] = ()) -> str:
         """The topmost frame above `frame`, `below` none of those named; itself where nothing is."""
         first, *above = self._ancestors(_name(frame))

@@ -65,6 +65,13 @@ def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
     assert said == ["4 of 4 frames have no cloud of /second (within 0.05 s)"] * bool(missing)
 
 
+def test_a_second_lidar_in_the_frame_of_the_first_needs_no_transform(bags: Any, tmp_path: Path) -> None:
+    second = (1, "/second", bags.cloud(1, x=7, frame="/velo_link"))
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), second])
+    (frame,) = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second")).frames()
+    np.testing.assert_array_equal(frame.points[60:, 0], [7] * 60)
+
+
 def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -> None:
     second = [(1.01, "/second", bags.cloud(1.01, frame="left"))]
     bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), *second])
