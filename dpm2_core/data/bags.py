@@ -118,10 +118,20 @@ class BagSource:
 
     @cached_property
     def poses(self) -> Array | None:
-        """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without."""
+        """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without.
+
+        Raises:
+            UsageError: a topic was asked for whose frame is not connected with the LiDAR; other topics are noted.
+        """
         if not self.truth:
             return None
-        stamps, T = self._truth(self.truth)
+        try:
+            stamps, T = self._truth(self.truth)
+        except UsageError as error:
+            if self._settings.ground_truth_topic:
+                raise UsageError(f"{self.path}: {self.truth}: {error}") from None
+            self._note_once(f"{self.truth} is not used as ground truth", str(error))
+            return None
         poses = interpolate(stamps, T, self.stamps)
         if missing := int(np.isnan(poses[:, 0, 0]).sum()):
             times = f"poses from {_span(stamps)}, clouds from {_span(self.stamps)}"
@@ -211,7 +221,11 @@ class BagSource:
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts.
-        What cannot be decoded, or is no rigid transform, is left out, with a note."""
+        What cannot be decoded, or is no rigid transform, is left out, with a note.
+
+        Raises:
+            UsageError: they are of a frame that is not connected with the LiDAR.
+        """
         decoded, stamps, T, problems = list[tuple[int, Any]](), list[int](), list[Array](), list[str]()
         for _, time, data in self._bag.messages([topic]):
             try:
@@ -233,8 +247,8 @@ class BagSource:
             self._note_once(what, f"the first: {printable(problems[0])}")
         T_world_lidar = np.array(T).reshape(-1, 4, 4)
         child = "" if is_path or not decoded else decoded[0][1].child_frame_id
-        if child and child != self.lidar_frame:
-            T_world_lidar = T_world_lidar @ self.transforms.lookup(child, self.lidar_frame)
+        if child:
+            T_world_lidar = T_world_lidar @ self.transforms.between(child, self.lidar_frame)
         return np.array(stamps, np.int64), T_world_lidar
 
     def _note_once(self, what: str, detail: str) -> None:

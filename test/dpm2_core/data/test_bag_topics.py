@@ -143,6 +143,28 @@ def test_odometry_is_interpolated_at_the_clouds(bags: Any, tmp_path: Path, child
     assert np.isnan(poses[3]).all()
 
 
+@pytest.mark.parametrize(("child", "lidar"), [("/velo_link", "velo_link"), ("velo_link", "/velo_link")])
+def test_a_truth_of_the_lidar_with_a_leading_slash(bags: Any, tmp_path: Path, child: str, lidar: str) -> None:
+    truth = [(t, "/ground_truth/odom", bags.odometry(t, t, child)) for t in (1, 2)]
+    messages = [*((t, "/points", bags.cloud(t, frame=lidar)) for t in (1, 2)), *truth]
+    poses = BagSource(bags.write(tmp_path / "b", messages)).poses
+    assert poses is not None
+    assert poses[:, 0, 3].tolist() == [1, 2]
+
+
+def test_a_truth_whose_frame_is_not_connected_is_left_out_or_named(bags: Any, tmp_path: Path) -> None:
+    """A note where the topic was found, an error that names it where it was asked for."""
+    topic = "/ground_truth/odom"
+    bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), (1, topic, bags.odometry(1, 0, "body"))])
+    source = BagSource(bag)
+    assert source.poses is None
+    assert source.notes == [
+        f"{topic} is not used as ground truth (no transform from 'velo_link' to 'body'; frames known: none)"
+    ]
+    with pytest.raises(UsageError, match=f"{bag}: {topic}: no transform from 'velo_link' to 'body'"):
+        _ = BagSource(bag, InputSettings(ground_truth_topic=topic)).poses
+
+
 def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
     """As by a clock that counts leap seconds; a stamp of zero is that of the recording."""
     messages = [*clouds(bags, [1, 1.5]), *((t, "/truth", bags.odometry(t + 37, 0)) for t in (1, 1.5))]
