@@ -39,3 +39,8 @@ def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
 def printable(text: str) -> str:
     """Text from a file or a message as one line for a terminal: what would steer it is shown, not sent."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def one_line(error: Exception) -> str:
+    """What an error of a library says, or its type where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__

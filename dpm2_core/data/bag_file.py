@@ -9,33 +9,33 @@ has them (CDR), so that all that follows is the same.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from heapq import merge
 from itertools import chain
-from pathlib import Path, PurePath
-from shlex import quote
+from pathlib import Path
 from typing import Any
 
-import yaml
 from backports.zstd import ZstdDecompressor, ZstdError, get_frame_info
 from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dpm2_core.data.livox import LIVOX, cloud_of_custom, custom_of_ros1
-from dpm2_core.data.mcap_salvage import whole_messages
+from dpm2_core.data.mcap_scan import McapMessage, by_log_time, scanned_messages
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import RawMessage
+from dpm2_core.data.rosbag2_folder import STORAGES, check_unpacked, recorded
 from dpm2_core.database import check_plain
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, one_line
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_STORAGES, _PACKED = (".mcap", ".db3"), ".zstd"
+_NO_SCHEMA = "__schemaless__"  # rosbags' name of a type that a file's summary does not have
 _LARGEST = 1 << 29  # bytes of a message: an image of 67 million pixels may have 6 bytes each
 _LATEST = 2**63 - 1  # ns; MCAP allows twice that
 
@@ -74,7 +74,7 @@ class Bag:
                 yield topic, min(time, _LATEST), _unpacked(data)
         except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
             self.notes.append(
-                f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({_reason(error)})"
+                f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({one_line(error)})"
             )
 
     def playable(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -98,7 +98,7 @@ class Bag:
                 return cloud_of_custom(data)
             return _jazzy().deserialize_cdr(data, self.types[topic])
         except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
-            raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({_reason(error)})") from None
+            raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({one_line(error)})") from None
 
     def decoded(self, topic: str) -> Iterator[Any]:
         """The messages of a topic that can be decoded."""
@@ -122,55 +122,22 @@ def open_bag(path: Path) -> Bag:
     Raises:
         UsageError: there is nothing that can be read, and why.
     """
-    if path.suffix == ".bag" and path.is_file():
-        return _open_ros1(path)
     if not path.is_dir():
-        _check_unpacked([path])
+        check_unpacked([path])
         return _open_file(path)
-    files = sorted(file for file in path.iterdir() if file.suffix in _STORAGES and file.is_file())
-    _check_unpacked(path.iterdir())
+    files = sorted(file for file in path.iterdir() if file.suffix in STORAGES and file.is_file())
+    check_unpacked(path.iterdir())
     if not files:
         raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
     types, missing = dict[str, str](), ""
     try:
-        files, types = _recorded(path)
+        files, types = recorded(path)
     except UsageError as error:
         missing = str(error)
     bag = _open_files(path, files, types)
     if missing and not bag.notes:  # a file that is damaged was not closed, and there are no metadata then
         bag.notes.append(f"{missing}; read {', '.join(file.name for file in files)}")
     return bag
-
-
-def _recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
-    """The files that metadata.yaml names, and topic to message type, also of topics without a message.
-
-    Raises:
-        UsageError: it does not say, or they are not there.
-    """
-    try:
-        text = (folder / "metadata.yaml").read_text(encoding="utf-8")
-        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
-        files = [folder / PurePath(name.removesuffix(_PACKED)).name for name in about["relative_file_paths"]]
-        topics = [topic["topic_metadata"] for topic in about["topics_with_message_count"]]
-        types = {str(topic["name"]): str(topic["type"]) for topic in topics}
-    except FileNotFoundError:
-        raise UsageError(f"{folder}: no metadata.yaml") from None
-    except Exception as error:  # anything from YAMLError to TypeError by the kind of damage
-        raise UsageError(f"{folder}: metadata.yaml is unusable ({_reason(error)})") from None
-    missing = [file.name for file in files if not file.is_file()]
-    if missing or not files:
-        raise UsageError(f"{folder}: metadata.yaml is unusable (no file {', '.join(missing)})")
-    return files, types
-
-
-def _check_unpacked(files: Iterable[Path]) -> None:
-    """They are not unpacked here: a megabyte may be a terabyte, and whether there is room is for the user to say."""
-    endings = tuple(f"{storage}{_PACKED}" for storage in _STORAGES)
-    for file in files:
-        if file.name.endswith(endings) and not file.with_suffix("").is_file():
-            command = f"zstd -d {quote(str(file.parent))}/*{_PACKED}"
-            raise UsageError(f"{file}: compressed as a whole (--compression-mode file); unpack it: {command}")
 
 
 def _open_files(path: Path, files: list[Path], types: dict[str, str]) -> Bag:
@@ -203,14 +170,12 @@ def _read_parts(parts: list[Bag], topics: Collection[str]) -> Iterator[RawMessag
 
 
 def _open_file(file: Path) -> Bag:
+    if file.suffix == ".bag" and file.is_file():
+        return _open_ros1(file)
     try:
         return _open_indexed(file)
     except Exception as error:  # rosbags raises ReaderError, TypeError, apsw.Error... by the kind of damage
-        return _salvage(file, _reason(error))
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+        return _open_scanned(file, one_line(error))
 
 
 @cache
@@ -228,12 +193,27 @@ def _opened(file: Path) -> Iterator[Reader]:
 
 def _open_indexed(file: Path) -> Bag:
     with _opened(file) as reader:
+        _check_index(reader)
         connections, start = list(reader.connections), reader.start_time
     types = {connection.topic: connection.msgtype for connection in connections}
     counts = Counter(dict.fromkeys(types, 0))
     for connection in connections:
         counts[connection.topic] += connection.msgcount
     return Bag(file, types, counts, partial(_read_indexed, file), start=start)
+
+
+def _check_index(reader: Reader) -> None:
+    """Without an index rosbags ends at a message that was written late; what an index lacks it leaves out.
+
+    Raises:
+        ReaderError: the index of an MCAP file does not lead to every message, or not to the types of all.
+    """
+    if not isinstance(reader.storage, McapReader):
+        return
+    chunks, known = reader.storage.chunks, {c.id for c in reader.connections if c.msgtype != _NO_SCHEMA}
+    indexed = sum(count for chunk in chunks for key, count in chunk.channel_count.items() if key in known)
+    if indexed < reader.message_count or (chunks and not indexed):
+        raise ReaderError("its index does not lead to every message")
 
 
 def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -246,14 +226,14 @@ def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
 def _open_ros1(path: Path) -> Bag:
     try:
         with Ros1Reader(path) as reader:
-            connections = list(reader.connections)  # closing forgets them
+            connections, start = list(reader.connections), reader.start_time  # closing forgets them
     except Exception as error:  # damaged files raise anything from ReaderError to struct.error
-        raise UsageError(f"{path}: cannot be read as a ROS 1 bag: {_reason(error)}") from None
+        raise UsageError(f"{path}: cannot be read as a ROS 1 bag: {one_line(error)}") from None
     counts: Counter[str] = Counter()
     for connection in connections:
         counts[connection.topic] += connection.msgcount
     types = {connection.topic: connection.msgtype for connection in connections}
-    return Bag(path, types, dict(counts), partial(_read_ros1, path))
+    return Bag(path, types, dict(counts), partial(_read_ros1, path), start=start)
 
 
 def _read_ros1(path: Path, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -282,8 +262,8 @@ def _unpacked(data: bytes) -> bytes:
     return b""
 
 
-def _salvage(file: Path, reason: str) -> Bag:
-    """What can be read of an MCAP file from its start, without the index at its end, in the order of the file."""
+def _open_scanned(file: Path, reason: str) -> Bag:
+    """An MCAP file whose index cannot be used, and why: what can be read from its start on."""
     with file.open("rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     if not head:
@@ -291,16 +271,26 @@ def _salvage(file: Path, reason: str) -> Bag:
     if head != _MCAP_MAGIC:
         kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
         raise UsageError(f"{file}: {kind}: {reason}")
-    types, counts, start = dict[str, str](), Counter[str](), _LATEST
-    for topic, kind, time, _ in whole_messages(file):
-        types[topic] = kind
-        counts[topic] += 1
-        start = min(start, time)
-    if not types:
-        raise UsageError(f"{file}: truncated before its first message ({reason})")
-    note = f"{file}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved"
-    return Bag(file, types, counts, partial(_read_whole, file), [note], start)
+    types, counts, start, notes = dict[str, str](), Counter[str](), _LATEST, list[str]()
+    try:
+        for message in scanned_messages(file):
+            types[message.topic] = message.kind
+            counts[message.topic] += 1
+            start = min(start, message.time)
+    except Exception:  # see scanned_messages
+        if not types:
+            raise UsageError(f"{file}: truncated before its first message ({reason})") from None
+        notes = [f"{file}: truncated or never closed ({reason}); {counts.total()} messages of it could be saved"]
+    return Bag(file, types, counts, partial(_read_scanned, file), notes, start)
 
 
-def _read_whole(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-    return ((topic, time, data) for topic, _, time, data in whole_messages(file) if topic in topics)
+def _read_scanned(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+    for message in by_log_time(_up_to_cut(file, topics)):
+        data = _as_ros2(message.data, message.kind) if message.ros1 else message.data
+        yield message.topic, message.time, data
+
+
+def _up_to_cut(file: Path, topics: Collection[str]) -> Iterator[McapMessage]:
+    """Where the file is cut was said when it was opened."""
+    with suppress(Exception):
+        yield from (message for message in scanned_messages(file) if message.topic in topics)

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which files of a rosbag2 folder are its recording, by its metadata.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path, PurePath
+from shlex import quote
+
+import yaml
+
+from dpm2_core.errors import UsageError, one_line
+
+STORAGES = (".mcap", ".db3")
+_PACKED = ".zstd"
+
+
+def recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
+    """The files that metadata.yaml names, and topic to message type, also of topics without a message.
+
+    Raises:
+        UsageError: it does not say, or they are not there.
+    """
+    try:
+        text = (folder / "metadata.yaml").read_text(encoding="utf-8")
+        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        files = [folder / PurePath(name.removesuffix(_PACKED)).name for name in about["relative_file_paths"]]
+        topics = [topic["topic_metadata"] for topic in about["topics_with_message_count"]]
+        types = {str(topic["name"]): str(topic["type"]) for topic in topics}
+    except FileNotFoundError:
+        raise UsageError(f"{folder}: no metadata.yaml") from None
+    except Exception as error:  # anything from YAMLError to TypeError by the kind of damage
+        raise UsageError(f"{folder}: metadata.yaml is unusable ({one_line(error)})") from None
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        raise UsageError(f"{folder}: metadata.yaml is unusable (no file {', '.join(missing)})")
+    return files, types
+
+
+def check_unpacked(files: Iterable[Path]) -> None:
+    """They are not unpacked here: a megabyte may be a terabyte, and whether there is room is for the user to say.
+
+    Raises:
+        UsageError: one is compressed as a whole; with the command that unpacks it.
+    """
+    endings = tuple(f"{storage}{_PACKED}" for storage in STORAGES)
+    for file in files:
+        if file.name.endswith(endings) and not file.with_suffix("").is_file():
+            command = f"zstd -d {quote(str(file.parent))}/*{_PACKED}"
+            raise UsageError(f"{file}: compressed as a whole (--compression-mode file); unpack it: {command}")
