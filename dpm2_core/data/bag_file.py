@@ -116,8 +116,8 @@ class Bag:
 
 
 def open_bag(path: Path) -> Bag:
-    """Open a rosbag2 folder, or a .mcap, .db3 or ROS 1 .bag file. A truncated MCAP file gives what is whole; a file of
-    a folder that cannot be read is left out, with a note.
+    """Open a folder of rosbag2 or of split ROS 1 bags, or a .mcap, .db3 or .bag file. A truncated MCAP file gives what
+    is whole; a file of a folder that cannot be read is left out, with a note.
 
     Raises:
         UsageError: there is nothing that can be read, and why.
@@ -127,13 +127,16 @@ def open_bag(path: Path) -> Bag:
         return _open_file(path)
     files = sorted(file for file in path.iterdir() if file.suffix in STORAGES and file.is_file())
     check_unpacked(path.iterdir())
-    if not files:
-        raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
     types, missing = dict[str, str](), ""
     try:
-        files, types = recorded(path)
+        if files:
+            files, types = recorded(path)
+        else:  # of rosbag record --split
+            files, missing = sorted(path.glob("*.bag")), f"{path}: bags of ROS 1 in one folder are one recording"
     except UsageError as error:
         missing = str(error)
+    if not files:
+        raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
     bag = _open_files(path, files, types)
     if missing and not bag.notes:  # a file that is damaged was not closed, and there are no metadata then
         bag.notes.append(f"{missing}; read {', '.join(file.name for file in files)}")

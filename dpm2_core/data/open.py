@@ -86,6 +86,10 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.cloud_folder import CloudFolder
 
         return CloudFolder(path, settings)
+    if not is_kitti and any(path.glob("*.bag")) and not any(path.glob("*/velodyne")):
+        from dpm2_core.data.bags import BagSource
+
+        return BagSource(path, settings)
     from dpm2_core.data.kitti import KittiSource
 
     return KittiSource(path, settings)

@@ -150,3 +150,26 @@ def test_types_that_are_not_known_are_only_named(ros1: Path) -> None:
     bag.types["/points"] = "my_msgs/msg/Cloud"
     with pytest.raises(MessageError, match="/points"):
         bag.decode("/points", b"12345678")
+
+
+def test_a_folder_of_split_bags_is_one_recording(bags: Any, tmp_path: Path) -> None:
+    """In order of time, not of names; one that is cut is left out, and named."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for part in range(12):
+        with Writer(folder / f"drive_{part}.bag") as writer:
+            kind = "sensor_msgs/msg/PointCloud2"
+            points = writer.add_connection("/points", kind, typestore=get_typestore(Stores.ROS1_NOETIC))
+            writer.write(points, 10**9 + part * 10**8, as_ros1(bags.cloud(1 + 0.1 * part, part)))
+    source = open_source(folder)
+    assert len(source) == 12
+    assert [frame.points[0, 0] for frame in source.frames()] == list(range(12))
+    assert source.notes[0].startswith(f"{folder}: bags of ROS 1 in one folder are one recording; read drive_0.bag, ")
+    last = folder / "drive_11.bag"
+    last.write_bytes(last.read_bytes()[:100])
+    source = open_source(folder)
+    assert [frame.points[0, 0] for frame in source.frames()] == list(range(11))
+    assert source.notes[0].startswith(f"{last}: cannot be read as a ROS 1 bag")
