@@ -32,7 +32,7 @@ from dpm2_core.frame import Array, Camera, Frame
 
 Stamps = NDArray[np.int64]
 
-_SWEEP = 100_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
+_SWEEP = 250_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
 
 
 class BagSource:

@@ -68,20 +68,23 @@ def test_each_cloud_has_the_samples_since_the_one_before(bags: Any, tmp_path: Pa
     assert [len(frame.imu) for frame in again if frame.imu is not None] == [41, 10]  # what was skipped, too
 
 
-def test_a_cloud_that_was_recorded_at_its_stamp_has_the_samples_of_its_sweep(bags: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("sweep", [10**8, 18 * 10**7])
+def test_a_cloud_that_was_recorded_at_its_stamp_has_the_samples_of_its_sweep(
+    bags: Any, tmp_path: Path, sweep: int
+) -> None:
     """The samples up to its last point were recorded after it."""
     messages = [quarter(bags), *drive(bags, until=2.2)]
     noise = np.random.default_rng(0)
     for i, (t, topic, message) in enumerate(messages):
         if topic == POINTS:
             columns = {k: noise.uniform(1, 9, 60).astype(np.float32) for k in "xyz"}
-            columns["t"] = np.linspace(0, 10**8, 60).astype(np.uint32)
+            columns["t"] = np.linspace(0, sweep, 60).astype(np.uint32)
             kind = bags.store.types["sensor_msgs/msg/PointField"]
             swept = bags.new("sensor_msgs/PointCloud2", header=message.header, **cloud_fields(columns, kind))
             messages[i] = (t, topic, swept)
     for frame in BagSource(bags.write(tmp_path / "b", messages)).frames():
         assert frame.imu is not None
-        assert frame.imu.stamps[-1] == frame.stamp + 10**8
+        assert frame.imu.stamps[-1] == frame.stamp + sweep
 
 
 def test_without_its_place_it_is_left_out_and_said(bags: Any, tmp_path: Path) -> None:
