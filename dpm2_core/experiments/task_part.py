@@ -81,7 +81,8 @@ def train(
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)
     advance(1, 1)
-    return {"scans": len(scans), "epochs": until or settings.epochs, **_logged(folder, settings)}
+    epochs = until or settings.epochs
+    return {"scans": len(scans), "epochs": epochs, **_logged(folder, epochs, settings.slam.gamma)}
 
 
 def measure_on(folder: Path, advance: Advance, task: str, weights: str, drive: tuple[str, Sequence[str]]) -> Figures:
@@ -120,14 +121,14 @@ def folder_name(sequence: str) -> str:
     return sequence.replace("/", "_")
 
 
-def _logged(folder: Path, settings: SlamTaskTraining) -> Figures:
-    """The losses of the last epoch, and what the SLAM loss was beside the task's when it first counted."""
+def _logged(folder: Path, epochs: int, gamma: float) -> Figures:
+    """The losses of the last epoch of so many, and what the SLAM loss was beside the task's when it first counted."""
     lines = (folder / LOG).read_text(encoding="utf-8").splitlines()
     # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
     rows = list({row["step"]: row for row in map(json.loads, lines) if "norm" in row}.values())
-    epoch = max(1, len(rows) // settings.epochs)
+    epoch = max(1, len(rows) // epochs)  # steps of one
     first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch]
-    share = [settings.slam.gamma * row["slam_loss"] / row["task_loss"] for row in first]
+    share = [gamma * row["slam_loss"] / row["task_loss"] for row in first]
     last = [row["task_loss"] for row in rows[-epoch:] if row["task_loss"] is not None]  # None: it was not finite
     return {
         "last_task_loss": median(last) if last else None,
