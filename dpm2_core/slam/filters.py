@@ -18,6 +18,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
+from dpm2_core.files import expanded
 from dpm2_core.frame import Points
 from dpm2_core.network.pretrained import DYNAMIC, PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
@@ -84,7 +85,8 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """
     if settings.kind == "none":
         return None
-    path = settings.weights or PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
+    shipped = PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
+    path = Path(expanded(str(settings.weights or shipped)))
     if not path.is_file():
         why = "no such file" if settings.weights else "none come with this dpm2"
         raise UsageError(

@@ -81,6 +81,14 @@ def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray
     np.testing.assert_allclose(scan.seen, scan.source, atol=1e-5)  # at rest
 
 
+def test_weights_in_the_home_folder_are_found_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of the descriptors are: no shell looks at settings."""
+    task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
+    save_task(task, tmp_path / "mine.safetensors", {})
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert make_filter(FilterSettings(kind="movers", weights=Path("~/mine.safetensors")), 1) is not None
+
+
 @pytest.mark.slow
 def test_a_slam_with_a_filter_runs_and_tells_what_is_missing(tmp_path: Path, points: np.ndarray) -> None:
     task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
