@@ -58,6 +58,7 @@ class OfflineRun:
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
+        self._ran = False
         self._begun = None if map_file is None or map_file.exists() else map_file  # a map file without a frame yet
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:
@@ -107,8 +108,11 @@ class OfflineRun:
             progress: called after each frame. watch: the same, with the frame and the map as they are then.
 
         Raises:
-            Dpm2Error: none of the scans could be read.
+            Dpm2Error: none of the scans could be read. UsageError: it has run before.
         """
+        if self._ran:
+            raise UsageError(f"{self.source.name}: it was run already; a second run needs another OfflineRun")
+        self._ran = True
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began, problems = perf_counter(), list[str]()
         with interrupt_deferred() as interrupted:

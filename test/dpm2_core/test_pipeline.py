@@ -213,6 +213,16 @@ def test_the_frame_where_a_drive_goes_on_is_in_the_trajectory_of_its_map_once(re
     assert len(poses) == len(stamps) == len(data.keyframes) - 1
 
 
+def test_a_run_is_over_once(recording: Path) -> None:
+    """A second one put the drive into the same map again; then the result of the first could not be saved either."""
+    drive = OfflineRun(recording, CONFIG, (0, 3))
+    result = drive.run()
+    with pytest.raises(UsageError, match="00: it was run already; a second run needs another OfflineRun"):
+        drive.run()
+    assert result.metrics is not None
+    assert (len(result), result.metrics.frames) == (3, 3)
+
+
 def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> None:
     """Every second scan: the frame where the map ends is found by its number, not by its position."""
     drive, path = tmp_path / "drive", tmp_path / "drive.dpm2map"
