@@ -12,7 +12,7 @@ import typer
 from dpm2_core.commands.options import JsonFile, parse_lengths, show
 from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
-from dpm2_core.data.open import open_source
+from dpm2_core.data.open import is_drive, open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stamps_of
 from dpm2_core.errors import UsageError
@@ -49,11 +49,11 @@ def eval_(
     ] = None,
 ) -> None:
     """Evaluate a trajectory: KITTI metric, APE, RPE and final drift."""
-    if settings and not gt.is_dir():
-        raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is a file")
+    if settings and not is_drive(gt):
+        raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is none")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
     estimate, frame = read_trajectory(est), FRAME_AS_GIVEN
-    if gt.is_dir():
+    if is_drive(gt):
         stamped = estimate.kind == "tum"
         truth, sensor = _of_drive(gt, settings or [], stamped, lidar=stamped and calib is None)
         frame = FRAME_OF_DRIVE.format(sensor)

@@ -9,6 +9,8 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 
+_OUSTER = (".pcap", ".osf")
+
 
 def sequences_below(path: Path | str) -> list[str]:
     """What `input.sequence` may be in a folder of KITTI odometry, raw, -360 or -CARLA with several drives.
@@ -30,6 +32,11 @@ def sequences_below(path: Path | str) -> list[str]:
             f"{path}: no drives below it (sequences/NN, DATE_drive_NNNN_sync, data_3d_raw/DRIVE or TOWN/generated)"
         )
     return sorted(found)
+
+
+def is_drive(path: Path) -> bool:
+    """A folder, or a file of a name that drives have: a bag, or what an Ouster LiDAR has sent."""
+    return path.is_dir() or (path.is_file() and (path.suffix in (".bag", *_OUSTER) or is_rosbag2(path)))
 
 
 def is_rosbag2(path: Path) -> bool:
@@ -60,7 +67,7 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kiss_datasets import KissSource
 
         return KissSource(path, settings)
-    if path.suffix in (".pcap", ".osf"):
+    if path.suffix in _OUSTER:
         from dpm2_core.data.ouster import OusterSource
 
         return OusterSource(path, settings)

@@ -157,6 +157,17 @@ def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> N
         assert figures["frame"].startswith(frame)
 
 
+def test_a_drive_that_is_one_file_is_its_own_ground_truth(tmp_path: Path) -> None:
+    folder, poses = drive_with_truth(tmp_path)
+    made = CliRunner().invoke(app, ["convert", "kitti", str(folder), str(tmp_path / "bag")])
+    assert made.exit_code == 0, made.output
+    write_kitti(tmp_path / "est.txt", poses)
+    (bag,) = (tmp_path / "bag").glob("*.mcap")
+    for drive in (bag.parent, bag):
+        eval_(drive, tmp_path / "est.txt", tmp_path / "m.json")
+        assert json.loads((tmp_path / "m.json").read_text())["frames"] == 6
+
+
 def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
     """Scans 3 and 4 are missing, and the poses end at frame 6: the estimate's ten lines were taken for frames 0 to 9,
     as there are more of them than known poses; an exact one had a t_err of 28 %."""
