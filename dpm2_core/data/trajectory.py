@@ -71,8 +71,11 @@ def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> N
             file.write(f"{sign}{ns // 10**9}.{ns % 10**9:09d} " + " ".join(f"{x:.12g}" for x in row) + "\n")
 
 
-def read_trajectory(path: Path | str) -> Trajectory:
+def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
     """Read KITTI (12 numbers a line, or 13 with the frame number first), KITTI-360 (also 17) or TUM (8).
+
+    Args:
+        allow_empty: a file without a pose is a TUM trajectory of none.
 
     Raises:
         UsageError: no such file, or a line that is no pose; it names file and line.
@@ -84,6 +87,8 @@ def read_trajectory(path: Path | str) -> Trajectory:
         raise UsageError(f"{path}: {reason}") from None
     lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
     lines = [(number, fields) for number, fields in lines if fields and not fields[0].startswith("#")]
+    if not lines and allow_empty:
+        return Trajectory(np.zeros((0, 4, 4)), np.zeros(0, np.int64), "tum")
     if not lines:
         raise UsageError(f"{path}: holds no pose")
     columns = len(lines[0][1])

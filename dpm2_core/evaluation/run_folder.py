@@ -46,7 +46,7 @@ class RunFolder:
     """A folder that `dpm2 run` or an experiment wrote.
 
     Attributes:
-        trajectory: T_map_lidar, by stamp. truth: the same in a world frame of its own, or None.
+        trajectory: T_map_lidar, by stamp; may be empty. truth: the same in a world frame of its own, or None.
         states: of each frame. stages_ms: wall time of each frame by stage, (N,) each; {} of other programs.
         loops: that were tried. metrics, timing: content of these files; {} without.
     """
@@ -135,7 +135,7 @@ def read_run(path: Path) -> RunFolder:
     """
     if not (path / TRAJECTORY).is_file():
         raise UsageError(f"{path}: no run; want a folder with {TRAJECTORY}, as `dpm2 run` and `dpm2 experiment` write")
-    trajectory = read_trajectory(path / TRAJECTORY)
+    trajectory = read_trajectory(path / TRAJECTORY, allow_empty=True)  # of a localization that found nothing
     if trajectory.kind != "tum":
         raise UsageError(f"{path / TRAJECTORY}: want 8 numbers a line, the stamp first")
     try:

@@ -126,7 +126,7 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
 
 def aligned(run: RunFolder) -> Array:
     """T_truth_map (4, 4) of a run; the identity where too few poses belong together."""
-    if run.truth is None:
+    if run.truth is None or not len(run.trajectory):
         return np.eye(4)
     try:
         true, est, _ = matched(run.truth, run.trajectory)

@@ -77,6 +77,20 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "").replace("http://example.org", "")
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_a_run_without_a_pose_is_on_the_page(tmp_path: Path, known: bool) -> None:
+    """As a localization leaves it that found nothing; it cost the page of all others."""
+    write_run(tmp_path / "found", 5)
+    (tmp_path / "none").mkdir()
+    write_tum(tmp_path / "none" / "trajectory.tum", [], np.zeros((0, 4, 4)))
+    if known:
+        shutil.copy(tmp_path / "found" / "ground_truth.tum", tmp_path / "none")
+    text = runs_page("A report", find_runs([tmp_path]))
+    assert "<td>none</td><td>0</td>" in text
+    ways = {run["name"]: len(run["way"]) for group in data_of(text) for run in group["runs"]}
+    assert ways == {"found": 10, "none": 0}
+
+
 @pytest.mark.slow
 def test_a_whole_kitti_sequence_of_four_methods_is_below_five_megabytes(tmp_path: Path) -> None:
     runs = [(str(i), write_run(tmp_path / str(i), 4541, 1 + i / 100)) for i in range(4)]
