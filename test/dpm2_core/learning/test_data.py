@@ -13,7 +13,7 @@ import torch
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from dpm2_core.data.packed import QUANTUM, PackedDrive, Sample, open_packed, write_packed
+from dpm2_core.data.packed import QUANTUM, PackedDrive, Sample, open_packed, packed_digest, write_packed
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
@@ -67,6 +67,24 @@ def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tm
     settings = DataSettings(packed={str(tmp_path): 1.0}, images=True)
     with pytest.raises(UsageError, match=r"data\.images: no packed drive"):
         GroupDataset(settings, tiny(), settings.draw, 0)
+
+
+@pytest.mark.parametrize("frame", [0, -1])
+def test_drives_that_differ_in_their_images_alone_are_told_apart(
+    samples: list[Sample], tmp_path: Path, frame: int
+) -> None:
+    """The same points and poses, as a world at another hour has them; or the same pixels of another camera."""
+    image = samples[frame].images[0]
+    turned = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ se3.exp([0, 0, 0.1, 0, 0, 0]))
+    others = [image, replace(image, pixels=255 - image.pixels), replace(image, camera=turned)]
+    for number, other in enumerate(others):
+        changed = list(samples)
+        changed[frame] = samples[frame]._replace(images=(other,))
+        write_packed(tmp_path / str(number) / "world", changed, {})
+    write_packed(tmp_path / "again" / "world", samples, {})
+    digests = [packed_digest(open_packed(tmp_path / name)) for name in ("0", "1", "2", "again")]
+    assert len(set(digests)) == 3
+    assert digests[0] == digests[3]
 
 
 def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
