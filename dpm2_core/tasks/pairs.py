@@ -5,7 +5,8 @@ A pair is s3.npy and d3.npy in one folder (a prefix, as in tests3.npy and testd3
 number in two: s/ and d/, static/ and dynamic/, or static_out_npy/ and dynamic_out_npy/. An array is (N, 2, rows,
 columns) of d and z in units of 120 m, filled; or, before that, (N, rows, columns, 3 or 4) of x, y, z in m with zeros
 where there is no point; of these the authors leave out points whose x, y or z is among the least or the greatest
-hundredth of the array.
+hundredth of the array. x is ahead and y to the left; the columns of x, y, z may begin in any direction and run either
+way. Those of d and z, which do not show it, begin straight ahead and run to the left.
 
 True poses, where they are known, are in poses3.txt beside the pair of that number: a line of 12 numbers for each scan,
 T_world_lidar row by row.
@@ -20,19 +21,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
-from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings, fill, to_points
+from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings, azimuths, fill, to_points
 from dpm2_core.tasks.scan import TaskScan
 
 SCALE = 120.0
 """What a value of one stands for in the preprocessed arrays, m."""
 _FOLDERS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
 _LOOKED_AT = 64
-"""Scans of an array whose percentiles are taken: those of all would read gigabytes."""
+"""Scans of an array whose percentiles and azimuths are taken: those of all would read gigabytes."""
+_EVEN = 0.99
+"""Length of the mean of unit vectors that point to where columns are off: 8 degrees, root mean square."""
 _NAMED = re.compile(r"(.*?)([sd])(\d+)")
 
 
@@ -60,7 +64,8 @@ def open_pairs(path: Path) -> list[ArrayPair]:
     """A sequence for each pair of arrays in a folder, by number; none if it holds no arrays of these names.
 
     Raises:
-        UsageError: an array without its twin, of another shape than it, or no array of numbers.
+        UsageError: an array without its twin, of another shape than it, no array of numbers, or columns of x, y, z that
+            do not go around in even steps.
     """
     return [ArrayPair.open(static, dynamic, number, path) for number, static, dynamic in _pairs(path)]
 
@@ -93,7 +98,7 @@ class ArrayPair:
 
     Attributes:
         number: of the pair. limits: (2, 3) least and greatest x, y, z of points that count, m; None for filled arrays.
-        root: folder of the pairs.
+        root: folder of the pairs. columns: (columns,) of the arrays by azimuth; None: as they are.
     """
 
     static: np.ndarray
@@ -103,6 +108,7 @@ class ArrayPair:
     root: Path
     limits: Array | None = None
     static_limits: Array | None = None
+    columns: NDArray[np.intp] | None = None
 
     @staticmethod
     def open(static: Path, dynamic: Path, number: int, root: Path) -> ArrayPair:
@@ -115,7 +121,8 @@ class ArrayPair:
         if arrays[0].shape != arrays[1].shape:
             raise UsageError(f"{dynamic}: shape {arrays[1].shape}, its static twin {static.name} has {arrays[0].shape}")
         static_limits, limits = (_limits(array) for array in arrays)
-        return ArrayPair(arrays[0], arrays[1], dynamic, number, root, limits, static_limits)
+        columns = None if limits is None else _columns(np.concatenate([*map(_some, arrays)]), dynamic)
+        return ArrayPair(arrays[0], arrays[1], dynamic, number, root, limits, static_limits, columns)
 
     @property
     def name(self) -> str:
@@ -153,6 +160,8 @@ class ArrayPair:
             raise UsageError(f"{self.path}: scan {index} of the pair has values that are not finite")
         if limits is None:
             return values, values[0] > 0
+        if self.columns is not None:
+            values = values[:, self.columns]
         d = torch.hypot(values[..., 0], values[..., 1])
         low, high = torch.from_numpy(limits).to(values)
         usual = ((values[..., :3] >= low) & (values[..., :3] <= high)).all(-1)
@@ -169,8 +178,29 @@ def _limits(array: np.ndarray) -> Array | None:
     """(2, 3) between which 98 % of all x, of all y and of all z lie, empty slots included, as the authors have it."""
     if _preprocessed(array):
         return None
-    some = np.asarray(array[:: max(1, len(array) // _LOOKED_AT), ..., :3], np.float64).reshape(-1, 3)
-    return np.asarray(np.nanpercentile(some, [1, 99], axis=0))
+    return np.asarray(np.nanpercentile(_some(array).reshape(-1, 3), [1, 99], axis=0))
+
+
+def _some(array: np.ndarray) -> Array:
+    """(n, rows, columns, 3) x, y, z of some of its scans."""
+    return np.asarray(array[:: max(1, len(array) // _LOOKED_AT), ..., :3], np.float64)
+
+
+def _columns(xyz: Array, path: Path) -> NDArray[np.intp] | None:
+    """(columns,) which of the columns of x, y, z lies at each of `azimuths`; None if no slot has a point."""
+    x, y = xyz[..., 0], xyz[..., 1]
+    there = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0)
+    if not there.any():
+        return None
+    count = there.shape[-1]
+    angle, middle = np.arctan2(y, x)[there], np.broadcast_to(azimuths(count).numpy(), there.shape)[there]
+    left, right = (np.exp(1j * (angle - way * middle)).mean() for way in (1, -1))
+    off = left if abs(left) >= abs(right) else right
+    if abs(off) < _EVEN:
+        raise UsageError(f"{path}: its columns, or its twin's, are not in even steps of azimuth around the sensor")
+    start = round(float(np.angle(off)) / (2 * np.pi) * count)
+    column = np.arange(count)
+    return (column - start if off is left else start - 1 - column) % count
 
 
 def _mapped(path: Path) -> np.ndarray:

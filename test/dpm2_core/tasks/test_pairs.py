@@ -78,6 +78,49 @@ def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.numpy(), xyz[1][near][:, :3], atol=1e-3)
 
 
+def in_slots(scans: int = 2, columns: int = 512) -> np.ndarray:
+    """(scans, 16, columns, 3) x, y, z, m, from straight ahead to the left; a sector is empty."""
+    d, z = np.moveaxis(SCALE * images(scans, rows=16, columns=columns).astype(np.float64), 1, 0)
+    angle = (np.arange(columns) + 0.5) * (2 * np.pi / columns)
+    xyz = np.stack([d * np.cos(angle), d * np.sin(angle), z], -1)
+    xyz[:, :, 100:150] = 0
+    return xyz
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("start", [0, 7, 256])
+def test_points_in_slots_stay_where_they_are_in_whatever_order_the_columns_come(
+    tmp_path: Path, start: int, mirrored: bool
+) -> None:
+    """Of arrays that begin elsewhere, or turn to the right, the points were turned or mirrored."""
+    plain = in_slots()
+    other = np.roll(plain[:, :, ::-1] if mirrored else plain, start, axis=2)
+    for name, xyz in (("plain", plain), ("other", other)):
+        (tmp_path / name).mkdir()
+        for twin in ("s0.npy", "d0.npy"):
+            np.save(tmp_path / name / twin, xyz)
+    expected, found = (open_scans(tmp_path / name)[1] for name in ("plain", "other"))
+    assert isinstance(expected, ImageScan)
+    assert isinstance(found, ImageScan)
+    for name in ("points", "static", "image", "mask", "static_image", "static_mask"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+    np.testing.assert_allclose(found.points[:, :3], plain[1][found.mask.numpy()], atol=1e-3)
+
+
+def test_columns_that_do_not_go_around_evenly_are_named(tmp_path: Path) -> None:
+    """Shuffled, or of a sector: no shift puts the points where they are. Without any point there is nothing to say."""
+    plain = in_slots()
+    shuffled = plain[:, :, np.random.default_rng(0).permutation(512)]
+    for xyz in (shuffled, plain[:, :, :100]):
+        for twin in ("s0.npy", "d0.npy"):
+            np.save(tmp_path / twin, xyz)
+        with pytest.raises(UsageError, match=r"d0\.npy: its columns, or its twin's, are not in even steps of azimuth"):
+            open_scans(tmp_path)
+    for twin in ("s0.npy", "d0.npy"):
+        np.save(tmp_path / twin, 0 * plain)
+    assert not len(open_scans(tmp_path)[0].points)
+
+
 def test_pairs_by_number_and_their_poses(tmp_path: Path) -> None:
     """Those that are named, whatever the zeros before them; poses beside them, one a scan or an error."""
     carla64(tmp_path)
