@@ -24,8 +24,10 @@ FindLoops = Callable[[MapData, MapData], list[Edge]]
 
 
 def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ()) -> MapData:
-    """One map in the frame of `a`, its place on Earth that of `a`, else that of `b`. Nodes and sessions of `b` count on
-    after those of `a`.
+    """One map in the frame of `a`. Nodes and sessions of `b` count on after those of `a`.
+
+    Its place on Earth is that of `a`; else that of `b`, if `loops` tie the first keyframes of both: a georeference is
+    that of the first keyframe's part.
 
     Args:
         T_a_b: (4, 4). loops: as `FindLoops` gives them.
@@ -35,7 +37,7 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
     moving = [*(a.clouds.moving(i) for i in range(n)), *(b.clouds.moving(i) for i in range(len(b)))]
     loans = {i: loan for i in range(n) if (loan := a.clouds.loan(i))}
     loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}
-    return MapData(
+    both = MapData(
         [*a.keyframes, *b.keyframes],
         [*a.session, *(number + sessions for number in b.session)],
         np.concatenate([a.poses, T_a_b @ b.poses]),
@@ -45,8 +47,13 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
         lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
         lambda i: a.describe(i) if i < n else b.describe(i - n),
-        a.georeference or _seen_from(T_a_b, b.georeference),
+        a.georeference,
     )
+    if a.georeference is None and b.georeference is not None:
+        parts = parts_of(both)
+        if (parts[n : n + 1] == parts[:1]).any():
+            return replace(both, georeference=_seen_from(T_a_b, b.georeference))
+    return both
 
 
 def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
@@ -60,9 +67,9 @@ def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
     return [Edge("loop", 0, 0, Registration(T, _GIVEN_COVARIANCE, method="transform"))]
 
 
-def _seen_from(T_a_b: Array, known: Georeference | None) -> Georeference | None:
+def _seen_from(T_a_b: Array, known: Georeference) -> Georeference:
     """The georeference of b as one of a."""
-    return None if known is None else replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
+    return replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
 
 
 def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
