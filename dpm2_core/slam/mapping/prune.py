@@ -8,11 +8,13 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Fix
 from dpm2_core.geometry import se3
+from dpm2_core.slam.graph.graph_data import Index
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
@@ -22,7 +24,7 @@ _LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
-    """Keyframes without a payload of their own, and those near an older one that stays; never the last.
+    """Keyframes without a payload of their own, and those near an older one that stays; never the last of a part.
 
     Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known.
 
@@ -31,11 +33,12 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     """
     if not len(data):
         return []
-    positions, last = data.poses[:, :3, 3], data.clouds.loan(len(data) - 1)
-    parts, session, tree = parts_of(data), np.array(data.session), KDTree(positions)
+    positions, parts, session = data.poses[:, :3, 3], parts_of(data), np.array(data.session)
+    tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
+    needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
     stays = np.ones(len(data), np.bool_)
     for node in range(len(data)):
-        if node == len(data) - 1 or (last is not None and node == last.lender):
+        if node in needed:
             continue
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
         near = near[(near < node) & stays[near] & (parts[near] == parts[node])]
@@ -51,14 +54,15 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
     A fix of one that goes is handed to the keyframe beside it, where that has none.
 
     Raises:
-        ValueError: a node that stays borrows the cloud of one that goes.
+        ValueError: a node that stays borrows the cloud of one that goes, or nothing of a part stays.
     """
     gone = set(nodes)
     kept = [node for node in range(len(data)) if node not in gone]
     for node in kept:
         if (loan := data.clouds.loan(node)) is not None and loan.lender in gone:
             raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}")
-    anchors = {node: _anchor(data, node, kept) for node in gone}
+    parts, at = parts_of(data), np.array(kept, np.intp)
+    anchors = {node: _anchor(data, node, at[parts[at] == parts[node]]) for node in gone}
     trail = [
         RemovedKeyframe(
             keyframe.id,
@@ -75,21 +79,21 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
         anchor = anchors.get(old.node, old.node)
         T_anchor_old = se3.inverse(data.poses[anchor]) @ data.poses[old.node]
         trail.append(replace(old, node=anchor, T_node_kf=T_anchor_old @ old.T_node_kf))
-    keyframes = _with_fixes(data, sorted(gone), kept)
+    keyframes = _with_fixes(data, parts, sorted(gone), at)
     return subset(replace(data, keyframes=keyframes), kept, eliminate(data.edges, sorted(gone)), trail)
 
 
-def _with_fixes(data: MapData, gone: Sequence[int], kept: Sequence[int]) -> list[Keyframe]:
+def _with_fixes(data: MapData, parts: NDArray[np.int32], gone: Sequence[int], kept: Index) -> list[Keyframe]:
     """The keyframes of all nodes, where those that stay have taken over fixes of those that go.
 
     A fix goes to the nearest keyframe of its part that stays, which need not be the one that has its place on the
     trail: where a whole drive goes, that is the end of the drive. Of several the surest is taken, then the nearest.
     """
-    keyframes, parts, at = list(data.keyframes), parts_of(data), np.array(kept, np.intp)
+    keyframes = list(data.keyframes)
     offered: list[tuple[float, float, int, Fix]] = []
     for node in gone:
-        fix, near = data.keyframes[node].fix, at[parts[at] == parts[node]]
-        if fix is None or not len(near):
+        fix, near = data.keyframes[node].fix, kept[parts[kept] == parts[node]]
+        if fix is None:
             continue
         heir = int(near[np.argmin(np.linalg.norm(data.poses[near, :3, 3] - data.poses[node, :3, 3], axis=1))])
         antenna = se3.transform(se3.inverse(data.poses[heir]) @ data.poses[node], fix.antenna[None])[0]
@@ -101,13 +105,15 @@ def _with_fixes(data: MapData, gone: Sequence[int], kept: Sequence[int]) -> list
     return keyframes
 
 
-def _anchor(data: MapData, node: int, kept: Sequence[int]) -> int:
-    """The node that stays to which a pruned one is tied: its lender, or else the nearest along the drive."""
+def _anchor(data: MapData, node: int, near: Index) -> int:
+    """That one of `near`, the nodes of its part that stay, to which a pruned one is tied: its lender, or else the
+    nearest along the drive. With another part it would go where that one is, which is not known."""
+    if not len(near):
+        raise ValueError(f"nothing that is tied to keyframe {node} stays")
     loan = data.clouds.loan(node)
-    at = np.array(kept)
-    if loan is not None and at[np.searchsorted(at, loan.lender) % len(at)] == loan.lender:
+    if loan is not None and loan.lender in near:
         return loan.lender
-    return int(at[np.argmin(np.abs(at - node))])
+    return int(near[np.argmin(np.abs(near - node))])
 
 
 def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:

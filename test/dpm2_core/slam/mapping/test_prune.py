@@ -15,6 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.merge import align, merge_maps, optimized
+from dpm2_core.slam.mapping.parts import first_part, parts_of
 from dpm2_core.slam.mapping.prune import composed, eliminate, inverted, prune, redundant_nodes
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
@@ -101,6 +102,27 @@ def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revis
     refused = [edge.rejected("no") for edge in data.edges if edge not in within]
     apart = replace(data, edges=[*within, *refused])
     assert redundant_nodes(apart, 2.0, 20.0) == []
+
+
+def test_pruned_keyframes_stay_with_the_part_that_they_are_tied_to() -> None:
+    """Though keyframes of a drive that nothing ties are between them and the rest, or lend them their clouds."""
+    one = laps(1)
+    again = [Edge("loop", node, node, Registration(np.eye(4), SIGMA)) for node in range(40)]
+    revisit = merge_maps(merge_maps(one, one, np.eye(4)), one, np.eye(4), again)  # the second one is elsewhere
+    borrowing = merge_maps(one, one, np.eye(4))
+    for node in range(40):
+        borrowing.clouds.borrow(40 + node, Loan(node, np.eye(4)))  # by loops that were rejected since then
+    for data, stay in ((revisit, [*range(80), 119]), (borrowing, [*range(40), 79])):
+        gone = redundant_nodes(data, 2.0, 20.0)
+        assert sorted({*range(len(data))} - {*gone}) == stay
+        less = prune(data, gone)
+        np.testing.assert_array_equal(parts_of(less), parts_of(data)[stay])
+        known = first_part(data)
+        stamps, poses = trajectory(first_part(less))
+        assert stamps == trajectory(known)[0]
+        np.testing.assert_allclose(poses, trajectory(known)[1], atol=1e-9)
+    with pytest.raises(ValueError, match="nothing that is tied to keyframe 40 stays"):
+        prune(borrowing, range(40, 80))
 
 
 def test_the_fixes_of_a_pruned_drive_stay_in_the_map() -> None:
