@@ -159,8 +159,13 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
             names = ", ".join(str(path) for path, _ in waiting)
             raise Dpm2Error(f"{names}: nothing of the other maps was found there; --transform says where they are")
         (path, other), (T, loops) = waiting.pop(number), found
-        first = optimized(merge_maps(first, other, T, loops), PoseGraph(settings.pose_graph))
+        merged = merge_maps(first, other, T, loops)
+        first = optimized(merged, PoseGraph(settings.pose_graph))
         _note(f"{path}: {len(loops)} loops to what came before")
+        checked = zip(merged.edges, first.edges, strict=True)
+        if rejected := [f"{now.from_node} and {now.to_node}" for was, now in checked if was.ok and not now.ok]:
+            said = "loops that contradict the rest are rejected, those of the new map's keyframes"
+            _note(f"{path}: {said} {', '.join(rejected)}")
     return first
 
 

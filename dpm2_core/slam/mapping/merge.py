@@ -14,7 +14,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.parts import frame_of, parts_of
-from dpm2_core.slam.mapping.restore import restore
+from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
 
@@ -113,7 +113,10 @@ def loops_by(closer: LoopCloser) -> FindLoops:
 
 
 def optimized(data: MapData, graph: PoseGraph) -> MapData:
-    """The map with the poses that its constraints ask for; `graph` is empty."""
+    """The map with the poses that its constraints ask for, and without the constraints that these poses contradict.
+
+    `graph` is empty.
+    """
     restore(graph, data)
     graph.optimize()
-    return replace(data, poses=graph.poses, georeference=graph.georeference)
+    return replace(data, poses=graph.poses, edges=judged(graph, data), georeference=graph.georeference)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dpm2_core.estimates import Edge
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.store.map_data import MapData, odometry_by_node
 
@@ -20,6 +21,12 @@ def restore(graph: PoseGraph, data: MapData) -> None:
             graph.add_fix(first + node, keyframe.fix)
     if data.georeference is not None and not first:
         graph.set_georeference(data.georeference)
+
+
+def judged(graph: PoseGraph, data: MapData) -> list[Edge]:
+    """The edges of a map by the last optimization of a graph that holds this map alone, as `restore` made it."""
+    chain, loops = odometry_by_node(data.constraints), iter(graph.loops)
+    return [next(loops) if edge.ok and chain.get(edge.to_node) is not edge else edge for edge in data.edges]
 
 
 def restore_solved(graph: PoseGraph, data: MapData) -> None:
