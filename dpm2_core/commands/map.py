@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.map_info import MapFile, graph_of, info, too_few, with_fix
+from dpm2_core.commands.map_info import MapFile, graph_of, info, unplaced
 from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -268,15 +268,14 @@ def _export_geojson(data: MapData, out: Path) -> None:
     from dpm2_core.geometry import geodesy
     from dpm2_core.slam.mapping.parts import placed_on_earth
 
-    if data.georeference is None:
-        why = too_few(count) if (count := with_fix(data)) else "see input.gnss_topic"
-        raise UsageError(f"{out}: the map has no georeference; {why}")
     placed, features = placed_on_earth(data), []
+    if np.isnan(placed.poses).all():
+        raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
     for (robot, session), (_, poses) in ways(placed).items():
         way = poses[:, :3, 3]
         known = np.isfinite(way).all(axis=1)
         if not known.all():
-            reason = "no loop ties them to the first keyframe, and their own fixes are too few to tell where they are"
+            reason = "neither their own fixes nor those of what loops tie them to tell where they are"
             _say_without(out, (robot, session), int((~known).sum()), len(way), reason)
         if not known.any():
             continue

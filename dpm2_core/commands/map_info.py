@@ -41,7 +41,7 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
         ("length", f"{f['length_m']:.1f} m"),
         ("extent", f"{extent} m, of the keyframes that are tied to the first" if extent else "-"),
         ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
-        ("georeference", _georeference(f["georeference"], f["with_fix"])),
+        ("georeference", _georeference(f["georeference"], unplaced(data))),
         ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
     )
     for row in rows:
@@ -64,7 +64,7 @@ def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]
         "keyframes": len(data),
         "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
         "with_descriptors": with_descriptors,
-        "with_fix": with_fix(data),
+        "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),
         "robots": sorted({robot for robot, _ in drives}),
         "length_m": _length(drives.values()),
@@ -109,19 +109,20 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
     }
 
 
-def with_fix(data: MapData) -> int:
-    """How many keyframes have a fix."""
-    return sum(keyframe.fix is not None for keyframe in data.keyframes)
+def unplaced(data: MapData) -> str:
+    """Why a map without a georeference has none, in words; empty where it has no fixes."""
+    parts, fixes = parts_of(data), np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
+    tied = int(fixes[parts == parts[:1]].sum())
+    elsewhere = int(fixes.sum()) - tied
+    reasons = [f"{tied} fixes do not tell it: the way is too short or too straight"] if tied else []
+    if elsewhere:
+        reasons.append(f"{elsewhere} fixes are of keyframes that no loop ties to the first")
+    return "; ".join(reasons)
 
 
-def too_few(fixes: int) -> str:
-    """Why a map with that many fixes has no georeference."""
-    return f"{fixes} fixes do not tell it: the way is too short or too straight"
-
-
-def _georeference(figures: dict[str, Any] | None, fixes: int) -> str:
+def _georeference(figures: dict[str, Any] | None, unplaced: str) -> str:
     if figures is None:
-        return f"- ({too_few(fixes)})" if fixes else "-"
+        return f"- ({unplaced})" if unplaced else "-"
     latitude, longitude, altitude = figures["origin"]
     heading = f"{figures['heading_deg']:.2f} deg from east to north"
     where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"

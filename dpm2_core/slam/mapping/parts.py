@@ -51,14 +51,9 @@ def frame_of(known: Georeference) -> Array:
 def placed_on_earth(data: MapData) -> MapData:
     """The map with poses (N, 4, 4) T_ecef_kf.
 
-    The georeference is that of the first keyframe's part. Another part is placed by its own fixes; where these do not
-    tell, its poses are NaN.
-
-    Raises:
-        ValueError: the map has no georeference.
+    The georeference is that of the first keyframe's part; another part is placed by its own fixes. The poses of a part
+    whose place is not known are NaN.
     """
-    if data.georeference is None:
-        raise ValueError("the map has no georeference")
     parts, poses = parts_of(data), np.full_like(data.poses, np.nan)
     for part in np.unique(parts):
         own = parts == part

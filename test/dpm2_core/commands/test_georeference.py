@@ -207,10 +207,30 @@ def test_info_says_what_is_not_tied_and_measures_the_rest(tmp_path: Path) -> Non
 
 
 def test_fixes_that_do_not_tell_it_are_counted(tmp_path: Path) -> None:
-    data = replace(two_drives(), georeference=None)
+    data = replace(two_drives(tied=True), georeference=None)
     save_as(data, tmp_path / "map")
     assert "(80 fixes do not tell it" in " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
     assert "80 fixes do not tell it" in dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson").stderr
+
+
+def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(tmp_path: Path) -> None:
+    data = two_drives()
+    first = [replace(keyframe, fix=None) for keyframe in data.keyframes[:40]]
+    save_as(replace(data, keyframes=[*first, *data.keyframes[40:]], georeference=None), tmp_path / "map")
+    shown = " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
+    assert "georeference - (40 fixes are of keyframes that no loop ties to the first)" in shown
+    done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
+    assert "without 40 of the 40 keyframes of session 1: neither their own fixes" in done.stderr
+    lines = lines_of(tmp_path / "a.geojson")
+    assert set(lines) == {2}
+    np.testing.assert_allclose(lines[2], data.poses[40:, :3, 3] + FAR, atol=0.01)  # the file has mm
+    # Two of the first drive, and five of the second within 20 m that are 5 m off: neither tell where it is.
+    few = [replace(k, fix=k.fix if node in (0, 1, *range(40, 45)) else None) for node, k in enumerate(data.keyframes)]
+    few = [replace(k, fix=k.fix and replace(k.fix, covariance=np.eye(3) * 25.0)) for k in few]
+    save_as(replace(data, keyframes=few, georeference=None), tmp_path / "few")
+    done = dpm2("map", "export", tmp_path / "few", tmp_path / "few.geojson")
+    assert done.returncode == 2
+    assert "2 fixes do not tell it: the way is too short or too straight; 5 fixes are of keyframes that" in done.stderr
 
 
 def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
