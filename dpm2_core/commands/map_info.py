@@ -114,7 +114,8 @@ def unplaced(data: MapData) -> str:
     parts, fixes = parts_of(data), np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
     tied = int(fixes[parts == parts[:1]].sum())
     elsewhere = int(fixes.sum()) - tied
-    reasons = [f"{tied} fixes do not tell it: the way is too short or too straight"] if tied else []
+    why = "the way is too short or too straight, or half of them or more are off it, as by another clock"
+    reasons = [f"{tied} fixes do not tell it: {why}"] if tied else []
     if elsewhere:
         reasons.append(f"{elsewhere} fixes are of keyframes that no loop ties to the first")
     return "; ".join(reasons)
