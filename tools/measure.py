@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The records that stand on the weights and need this machine alone, measured again: python -m tools.measure [NAME...] (`make measure`).
+"""Records that stand on the weights, measured again: python -m tools.measure [NAME...] (`make measure`).
 
 What was stopped goes on: a record is whole if the code has not changed since the commit that it names.
 """
