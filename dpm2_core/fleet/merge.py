@@ -64,11 +64,12 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         cluster: not entered yet. largest: keyframes of a region of the pose graph.
 
     Raises:
-        UsageError: a map is there that is no merge of this folder, or no drive. Dpm2Error: nothing can be joined.
+        UsageError: a file is there that is no merge of drives or holds more than these, or there is no drive.
+        Dpm2Error: nothing can be joined, or the map that is there is damaged.
         KeyboardInterrupt: it was stopped before all drives were looked at; the map stays as it is.
     """
     folder, left_out = folder.resolve(), dict[str, str]()
-    before = _record(out)
+    before = _record(out, folder)
     with cluster:
         search = Search(folder, settings, cluster, view or View())
         parts = search.drives(left_out)
@@ -95,7 +96,7 @@ def _beside(out: Path) -> Path:
     return out.with_name(f"{out.name}.json")
 
 
-def _record(out: Path) -> Merged | None:
+def _record(out: Path, folder: Path) -> Merged | None:
     """What is known of the map that is there. A map that this wrote may be changed, any other file not."""
     try:
         merged = TypeAdapter(Merged).validate_json(_beside(out).read_bytes())
@@ -103,6 +104,12 @@ def _record(out: Path) -> Merged | None:
         merged = None
     if out.exists() and merged is None:
         raise UsageError(f"{out}: there is a file already, which is no merge of drives")
+    if out.exists() and merged is not None:
+        drives = merged.drives.keys() | {path.parent.name for path in folder.glob(f"*/{MAP}")}
+        with MapStore.open(out) as store:
+            others = sum(str(robot).partition("/")[0] not in drives for (robot,) in store.rows("keyframes", "robot"))
+        if others:  # by `dpm2 run --extend`, or the file of another program beside an old record
+            raise UsageError(f"{out}: {others} of its keyframes are of no drive of {folder}; give another --out")
     return merged
 
 

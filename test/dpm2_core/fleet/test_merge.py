@@ -28,7 +28,7 @@ from dpm2_core.fleet.search import Search
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_data import MapData, append_map, load_map, save_as
 from dpm2_core.slam.store.map_file import move_map
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.fleets import fleet_maps
@@ -142,13 +142,7 @@ def test_a_merge_that_is_stopped_at_its_end_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
     """The map had its name, and no record of what it was: it counted as a file of another program from then on."""
-    _, maps, joins = fleet_maps(3)
-    for name, data in maps.items():
-        (tmp_path / name).mkdir()
-        save_as(data, tmp_path / name / MAP)
-    monkeypatch.setattr("dpm2_core.fleet.merge.Search", lambda *arguments: Found(tmp_path, maps, joins))
-    out = tmp_path / "out" / "town"
-    out.parent.mkdir()
+    out = _fleet(tmp_path, monkeypatch)
 
     def stopped(source: Path, target: Path) -> None:
         move_map(source, target)
@@ -168,9 +162,37 @@ def test_a_merge_that_is_stopped_at_its_end_goes_on(
     assert check_map(out).keyframes == 180
 
 
+def _fleet(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Three drives of 60 keyframes each that hang together; returns where their map is to be."""
+    _, maps, joins = fleet_maps(3)
+    for name, data in maps.items():
+        (folder / name).mkdir()
+        save_as(data, folder / name / MAP)
+    monkeypatch.setattr("dpm2_core.fleet.merge.Search", lambda *arguments: Found(folder, maps, joins))
+    (folder / "out").mkdir()
+    return folder / "out" / "town"
+
+
 def _interrupt() -> None:
     """As Ctrl-C while Ray ends."""
     raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_drive_that_was_added_to_a_merge_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replaced: bool
+) -> None:
+    """As by `dpm2 run --extend`, or `replaced`: another map altogether, beside the record of the merge before it."""
+    out = _fleet(tmp_path, monkeypatch)
+    merge(tmp_path, out, SlamSettings(), nullcontext())
+    if replaced:
+        out.unlink()
+    with MapStore.create(out) if replaced else MapStore.open(out, read_only=False) as store:
+        append_map(store, ring(5))
+    before = out.read_bytes()
+    with pytest.raises(UsageError, match=f"town: 5 of its keyframes are of no drive of {tmp_path}; give another --out"):
+        merge(tmp_path, out, SlamSettings(), nullcontext())
+    assert out.read_bytes() == before
 
 
 @pytest.mark.parametrize("drives", ['["a"]', '{"a": "x"}', "{"])
