@@ -23,6 +23,7 @@ from dpm2_core.slam.store.map_data import NO_POINTS, MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
+_HIDDEN = 30_000  # rows in succession that one damaged page of a tree can hide
 _BRIDGE_COVARIANCE = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
 
 
@@ -32,7 +33,8 @@ class Findings:
 
     Attributes:
         problems: one line each; empty: the map is sound.
-        keyframes: that can be used. lost: keyframes that cannot. lost_clouds: usable, but without their payload.
+        keyframes: that can be used. lost: keyframes that cannot; where the end of the map cannot be read, at least so
+            many. lost_clouds: usable, but without their payload.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -47,6 +49,7 @@ class Salvage:
     def __init__(self, sql: sqlite3.Connection, size: int, findings: Findings) -> None:
         """`size`: of the file, bytes."""
         self._sql, self._most, self._findings = sql, size // _SMALLEST, findings
+        self._last = {table: self._last_row(table) for table in schema.CONTENT}
 
     def run(self) -> MapData:
         """All that is good, without gaps."""
@@ -93,7 +96,7 @@ class Salvage:
                 continue
             if loan is not None:
                 loans[node] = loan
-        end = self._end()
+        end = max(self._last[table] for table in ("keyframes", "payloads", "poses")) + 1
         if missing := sorted(set(range(end)) - keyframes.keys()):
             self._problem(f"keyframes lost: {_listed(missing)}")
             self._findings.lost = len(missing)
@@ -182,7 +185,7 @@ class Salvage:
 
     def _trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
         trail = []
-        for row in self._rows("trail", "rowid"):
+        for row in self._rows("trail"):
             with suppress(ValueError):
                 if (pruned := rows.removed_of(row)).node in keyframes:
                     trail.append(pruned)
@@ -209,21 +212,19 @@ class Salvage:
             self._problem(f"sessions: {error}")
             return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
 
-    def _rows(self, table: str, key: str = "") -> Iterator[tuple[Any, ...]]:
-        """The good rows of a table, each fetched by its key so that a damaged page costs only what is on it."""
-        key = key or schema.CONTENT[table][0]
-        for number in range(self._last(table, key) + 1):
+    def _rows(self, table: str) -> Iterator[tuple[Any, ...]]:
+        """The good rows of a table, each fetched by its number so that a damaged page costs only what is on it."""
+        for number in range(self._last[table] + 1):
             try:
-                row = self._row(table, number, key)
+                row = self._row(table, number)
             except ValueError as error:
                 self._problem(f"{table} {number}: {error}")
                 continue
             if row is not None:
                 yield row
 
-    def _row(self, table: str, number: int, key: str = "") -> tuple[Any, ...] | None:
-        names = schema.CONTENT[table]
-        query = f"SELECT {', '.join(names)}, crc FROM {table} WHERE {key or names[0]} = ?"
+    def _row(self, table: str, number: int) -> tuple[Any, ...] | None:
+        query = f"SELECT {', '.join(schema.CONTENT[table])}, crc FROM {table} WHERE rowid = ?"
         try:
             row = self._sql.execute(query, (number,)).fetchone()
         except (sqlite3.DatabaseError, OverflowError, UnicodeDecodeError) as error:
@@ -238,25 +239,31 @@ class Salvage:
             raise ValueError("its checksum is wrong")
         return tuple(row[:-1])
 
-    def _last(self, table: str, key: str) -> int:
+    def _last_row(self, table: str) -> int:
+        """Number of the last row of a table, -1 without any; where its end is damaged, of the first lost row."""
+        with suppress(sqlite3.DatabaseError):
+            first = self._sql.execute(f"SELECT coalesce(min(rowid), 0) FROM {table}").fetchone()[0]
+            if first < 0:
+                self._problem(f"{table}: rows before 0, from {first}")
         try:
-            query = f"SELECT coalesce(max({key}), -1), coalesce(min({key}), 0) FROM {table}"
-            last, first = map(int, self._sql.execute(query).fetchone())
-        except (sqlite3.DatabaseError, TypeError, ValueError):
-            return min(self._end() * 10, self._most)  # of edges there are several a keyframe
-        if first < 0:
-            self._problem(f"{table}: rows before 0, from {first}")
+            last = int(self._sql.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()[0])
+        except sqlite3.DatabaseError:
+            lost = self._last_readable(table) + 1
+            self._problem(f"{table}: rows from {lost} on cannot be read, and how many there are is not known")
+            return lost
         if last > self._most:
             self._problem(f"{table}: a row {last} in a file of at most {self._most}")
         return min(last, self._most)
 
-    def _end(self) -> int:
-        """One more than the last node that any table has."""
-        last = -1
-        for table in ("keyframes", "payloads", "poses"):
-            with suppress(sqlite3.DatabaseError, TypeError, ValueError):
-                last = max(last, int(self._sql.execute(f"SELECT coalesce(max(node), -1) FROM {table}").fetchone()[0]))
-        return min(last, self._most) + 1
+    def _last_readable(self, table: str) -> int:
+        """Found from the first row upward: the way down to the last one leads over the damage."""
+        last, number = -1, 0
+        while number <= min(last + _HIDDEN, self._most):
+            with suppress(sqlite3.DatabaseError):
+                if self._sql.execute(f"SELECT 1 FROM {table} WHERE rowid = ?", (number,)).fetchone():
+                    last = number
+            number += 1
+        return last
 
     def _problem(self, text: str) -> None:
         self._findings.problems.append(text)

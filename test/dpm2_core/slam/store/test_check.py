@@ -145,6 +145,26 @@ def test_a_map_that_was_cut_off(map_file: Path) -> None:
     assert len(recovered(map_file)) >= 1
 
 
+def test_a_map_without_its_last_pages_keeps_all_before_them(tmp_path: Path) -> None:
+    """Where a map ends is read from the last page of a table; without it a single keyframe was recovered, 0 lost."""
+    path = tmp_path / "map"
+    save_as(ring(60, 30), path)
+    content, cut = bytearray(path.read_bytes()), {}
+    with closing(sqlite3.connect(path)) as sql:
+        roots = dict(sql.execute("SELECT name, rootpage FROM sqlite_master"))
+    for table in ("keyframes", "payloads", "poses", "edges"):
+        root = (roots[table] - 1) * 4096
+        last = (int.from_bytes(content[root + 8 : root + 12], "big") - 1) * 4096  # see the SQLite file format
+        cut[table] = int.from_bytes(content[last + 3 : last + 5], "big")
+        content[last : last + 4096] = bytes(4096)
+    path.write_bytes(content)
+    result = check_map(path)
+    left = 60 - cut["keyframes"]
+    assert result.keyframes == len(recovered(path)) == left > 20
+    assert 1 <= result.lost <= cut["keyframes"]
+    assert f"keyframes: rows from {left} on cannot be read, and how many there are is not known" in result.problems
+
+
 def test_nothing_left_to_recover(tmp_path: Path) -> None:
     path = tmp_path / "a.dpm2map"
     path.write_bytes(bytes(40960))
