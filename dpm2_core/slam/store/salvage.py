@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData, subset
+from dpm2_core.slam.store.map_data import NO_POINTS, MapData, odometry_by_node, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
@@ -66,7 +65,7 @@ class Salvage:
             except (ValueError, TypeError) as error:
                 self._problem(f"keyframe {node}: which points move is lost: {error}")
         self._fixes(keyframes)
-        edges = self._bridged(self._edges(keyframes), keyframes, session)
+        edges = self._edges(keyframes, session)
         trail = self._trail(keyframes)
         # A map in the old numbers with holes, of which the good nodes are then taken.
         nothing = pack_cloud(NO_POINTS)
@@ -171,17 +170,38 @@ class Salvage:
                 self._problem(f"georeference: {error}")
         return None
 
-    def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
-        edges = []
+    def _edges(self, keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
+        """Those between keyframes that are there, and what bridges the others."""
+        edges, known = [], []
         for row in self._rows("edges"):
             try:
                 edge = rows.edge_of(row)
+                known.append(edge)
                 rows.check_ends(edge, keyframes)
+                edges.append(edge)
             except ValueError as error:
                 self._problem(f"edge {row[0]}: {error}")
-            else:
-                edges.append(edge)
-        return edges
+        return [*edges, *self._bridges(known, keyframes, session)]
+
+    def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> Iterator[Edge]:
+        """Odometry edges over the holes that lost keyframes and edges have left.
+
+        `known`: edges, also from and to lost keyframes. A node to which no odometry leads begins a drive; where edges
+        are lost, too, only if its frames are counted anew.
+        """
+        chain, some_lost = odometry_by_node(known), len(known) <= self._last["edges"]
+        tied = {edge.to_node for edge in known if edge.kind == "odometry" and edge.from_node in keyframes}
+        newest: dict[tuple[str, int], int] = {}
+        for node, b in sorted(keyframes.items()):
+            drive = b.robot, session[node]
+            before, origin = newest.get(drive), _before(node, chain, keyframes)
+            newest[drive] = node
+            if before is None or node in tied:
+                continue
+            a = keyframes[before]
+            if origin == before or (origin is None and some_lost and a.index < b.index):
+                T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
+                yield Edge("odometry", before, node, Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge"))
 
     def _trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
         trail = []
@@ -192,18 +212,6 @@ class Salvage:
                     continue
             self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
         return trail
-
-    def _bridged(self, edges: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
-        """With odometry edges over the holes that lost keyframes and edges have left."""
-        tied = {edge.to_node for edge in edges if edge.kind == "odometry"}
-        out = list(edges)
-        for before, node in pairwise(sorted(keyframes)):
-            a, b = keyframes[before], keyframes[node]
-            if node not in tied and (session[node], b.robot) == (session[before], a.robot) and b.id > 0:
-                T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
-                bridge = Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge")
-                out.append(Edge("odometry", before, node, bridge))
-        return out
 
     def _sessions(self, session: dict[int, int]) -> list[Session]:
         try:
@@ -271,3 +279,12 @@ class Salvage:
 
 def _listed(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+
+
+def _before(node: int, chain: Mapping[int, Edge], there: Container[int]) -> int | None:
+    """The node that is there from which odometry leads to another one, over lost ones; None: it begins among these."""
+    while node in chain:
+        node = chain[node].from_node
+        if node in there:
+            return node
+    return None

@@ -11,7 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +165,38 @@ def test_a_map_without_its_last_pages_keeps_all_before_them(tmp_path: Path) -> N
     assert result.keyframes == len(recovered(path)) == left > 20
     assert 1 <= result.lost <= cut["keyframes"]
     assert f"keyframes: rows from {left} on cannot be read, and how many there are is not known" in result.problems
+
+
+def save_drives(path: Path, robots: Sequence[str], begins: int = 0) -> None:
+    """A map of one session, with the robot of each keyframe; at the node `begins` one begins another drive."""
+    data, newest, edges = ring(len(robots), 30), dict[str, int](), []
+    keyframes = [replace(k, robot=robot) for k, robot in zip(data.keyframes, robots, strict=True)]
+    for node, robot in enumerate(robots):
+        if robot in newest and node != begins:
+            edges.append(data.edges[0].between(newest[robot], node))
+        newest[robot] = node
+    keyframes[begins:] = [replace(k, index=k.index - keyframes[begins].index) for k in keyframes[begins:]]
+    save_as(replace(data, keyframes=keyframes, edges=edges), path)
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "UPDATE edges SET rmse = 9 WHERE id = 2", "DELETE FROM keyframes WHERE node IN (3, 6)"]
+)
+def test_two_drives_of_a_robot_in_one_session_stay_apart(tmp_path: Path, damage: str) -> None:
+    """Where the second is relative to the first is not known; holes within the two are bridged."""
+    save_drives(tmp_path / "map", ["red"] * 12, begins=6)
+    execute(tmp_path / "map", (damage, ()))
+    data = recovered(tmp_path / "map")
+    second = [keyframe.id >= 6 for keyframe in data.keyframes].index(True)
+    steps = set(range(1, len(data))) - {second}
+    assert sorted((edge.from_node, edge.to_node) for edge in data.edges) == [(node - 1, node) for node in sorted(steps)]
+
+
+def test_a_lost_keyframe_among_those_of_two_robots_is_bridged(tmp_path: Path) -> None:
+    save_drives(tmp_path / "map", ["red", "blue"] * 4)
+    execute(tmp_path / "map", ("DELETE FROM keyframes WHERE node = 4", ()))
+    ties = {(edge.from_node, edge.to_node) for edge in recovered(tmp_path / "map").edges}
+    assert ties == {(0, 2), (2, 5), (1, 3), (3, 4), (4, 6)}
 
 
 def test_nothing_left_to_recover(tmp_path: Path) -> None:
