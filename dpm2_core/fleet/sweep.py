@@ -31,8 +31,9 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
         raise UsageError(f"--set {min(twice)}: given twice; all its values belong to one, with commas")
     out = {}
     for values in product(*(_values(setting) for setting in settings)):
-        name = " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in zip(keys, values, strict=True))
-        out[name.replace("/", "_")] = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+        chosen = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+        # No two have one name: each with its whole key, and % for what a folder's name cannot have.
+        out[" ".join(chosen).replace("%", "%25").replace("/", "%2F")] = chosen
     return out
 
 

@@ -173,8 +173,23 @@ def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) 
 
 def test_values_of_a_sweep_may_be_lists() -> None:
     found = variants(["input.T=[1,2],[3,4]", "slam.neural.weights=a/b,c"])
-    assert list(found) == [f"T={T} weights={w}" for T in ("[1,2]", "[3,4]") for w in ("a_b", "c")]
-    assert found["T=[3,4] weights=a_b"] == ["input.T=[3,4]", "slam.neural.weights=a/b"]
+    assert list(found) == [f"input.T={T} slam.neural.weights={w}" for T in ("[1,2]", "[3,4]") for w in ("a%2Fb", "c")]
+    assert found["input.T=[3,4] slam.neural.weights=a%2Fb"] == ["input.T=[3,4]", "slam.neural.weights=a/b"]
+
+
+@pytest.mark.parametrize(("one", "other"), [
+    ("slam.keyframes.distance=4", "slam.map.redundancy.distance=4"),
+    ("slam.neural.weights=w/a_b.npz", "slam.neural.weights=w_a/b.npz"),
+    ("slam.neural.weights=a/b", "slam.neural.weights=a%2Fb"),
+])  # fmt: skip
+def test_other_settings_have_another_folder(one: str, other: str) -> None:
+    """Else the second of two sweeps replaced the runs of the first, and of two such values one was left out."""
+    assert not variants([one]).keys() & variants([other]).keys()
+
+
+def test_the_folder_of_a_setting_is_one_name() -> None:
+    (name,) = variants(["slam.neural.weights=/w/a.npz"])
+    assert Path(name).name == name
 
 
 @pytest.mark.slow
