@@ -37,6 +37,7 @@ _TURNING = 0.1  # rad/s: slower turns prove nothing
 
 _GRAVITY = 9.81
 _POSSIBLE = 1.5  # m/s2 that a mean force without the changes of velocity may differ from it
+_NO_GRAVITY = 0.5  # m/s2: forces that differ by less from the changes of velocity have none in them
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
 _SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
 _FEWEST = 5  # samples that show it
@@ -231,12 +232,14 @@ class _Vertical:
         self._axis: Array | None = None
         self._seconds = 0.0  # that `_up` is the mean of
         self._velocity: Array | None = None
+        self._without = False  # gravity, as a start at rest has shown
         self.pause()
 
     def start(self, force: Array, axis: Array) -> bool:
         """At rest at the start; `axis` (3,) is to be up. False: the force is not gravity, and shows no vertical."""
         up = _metric(force)
-        if not _is_gravity(up):
+        self._without = not _is_gravity(up)
+        if self._without:
             return False
         self._up, self._axis, self._seconds = up, axis, _WEIGHT
         return True
@@ -250,13 +253,15 @@ class _Vertical:
         if self._velocity is None:
             self._velocity = velocity
             return
-        self._sum, self._time = self._sum + _metric(force) * seconds, self._time + seconds
+        self._sum, self._time = self._sum + force * seconds, self._time + seconds
         if self._time < _SPAN:
             return
-        up, time = (self._sum - (velocity - self._velocity)) / self._time, self._time
+        mean, change, time = self._sum / self._time, (velocity - self._velocity) / self._time, self._time
         self.pause()
         self._velocity = velocity
-        if not _is_gravity(up):
+        up = _metric(mean) - change
+        # An acceleration of 1 m/s2 without gravity looks as gravity in g: then the forces are the change of velocity.
+        if self._without or not _is_gravity(up) or np.linalg.norm(mean - change) < _NO_GRAVITY:
             return
         self._seconds = min(self._seconds + time, _MINUTE)
         self._up = self._up + time / self._seconds * (up - self._up)
@@ -274,9 +279,9 @@ def _angle(R: Array) -> float:
 
 
 def _metric(forces: Array) -> Array:
-    """Forces (N, 3), or a mean one (3,), in m/s2; some drivers count in g."""
+    """Forces (N, 3), or a mean one (3,), in m/s2; some drivers count in g, in which their mean is 1 then."""
     mean = np.atleast_2d(forces).mean(0)
-    return forces * _GRAVITY if np.linalg.norm(mean) < _GRAVITY / 3 else forces
+    return forces * _GRAVITY if _is_gravity(_GRAVITY * mean) else forces
 
 
 def _is_gravity(up: Array) -> bool:

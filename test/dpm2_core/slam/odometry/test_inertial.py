@@ -303,6 +303,23 @@ def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
     np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
 
 
+@pytest.mark.parametrize("rest", [2.0, 0.0], ids=["start at rest", "start in motion"])
+def test_accelerations_without_gravity_are_not_taken_for_gravity_in_g(rest: float) -> None:
+    """One of 1.1 m/s2 looked as 1.1 g: odom was turned by up to 0.02 degrees for each meter."""
+    motion, before, rng = InertialMotion(), np.eye(4), np.random.default_rng(1)
+    for i in range(400):
+        stamp, time = 10**9 + i * 10**8, 0.1 * i
+        ahead = np.where((time - rest) % 24 < 12, 1.1, -1.1) if time > rest else 0.0
+        speed = 1.1 * (12 - abs((time - rest) % 24 - 12)) if time > rest else 0.0
+        forces = rng.normal([ahead, 0, 0], 0.03, (10, 3))
+        samples = Inertial(np.arange(stamp - 9 * 10**7, stamp + 1, 10**7), rng.normal(0, 0.002, (10, 3)), forces)
+        T = before @ se3.exp([0, 0, 0, 0.1 * speed, 0, 0])
+        motion.look(Frame(stamp, np.zeros((0, 4), np.float32), imu=samples))
+        motion.registered(before, T, stamp, np.array([0, 0, 0, speed, 0, 0]) if i else None)
+        before = T
+    np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["as they are", "reversed"])
 def test_a_start_upside_down_is_said(sign: float) -> None:
     """A reversed sign and a LiDAR that hangs, of which nothing is known, look alike."""
@@ -335,10 +352,14 @@ def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
     assert tilt[-1] == tilt[10]  # 1.3 degrees more, were its forces still believed
 
 
-def test_the_level_follows_a_drifting_odometry_without_a_jump() -> None:
+@pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
+def test_the_level_follows_a_drifting_odometry_without_a_jump(unit: float) -> None:
     """The odometry tips over by 0.01 deg in each frame of 0.5 m, and the robot stays level."""
     motion, drift = InertialMotion(), np.radians(0.01)
-    frames = standing(np.eye(4), 500, ImuConfig(acceleration_bias=0.0, misaligned=0.0))
+    frames = with_imu(
+        standing(np.eye(4), 500, ImuConfig(acceleration_bias=0.0, misaligned=0.0)),
+        lambda rates, forces: (rates, unit * forces),
+    )
     before, outs = np.eye(4), []
     step = se3.exp([0, drift, 0, 0.5, 0, 0])
     for i, frame in enumerate(frames):
