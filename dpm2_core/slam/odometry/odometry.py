@@ -170,7 +170,7 @@ class Odometry:
             twist = motion.turned(twist, seconds)
         frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])))
         if frame.guess is not None and motion.other is None:
-            motion.other = OtherMotion()
+            motion.other = OtherMotion(self._settings.steadiness)
         if motion.other is not None:
             known = None if motion.twist is None else twist
             motion.other.look(frame.guess, known, seconds, motion.of_prediction(seconds))

@@ -2,9 +2,9 @@
 """Another odometry, such as that of wheels, beside ours: what it says of the way, and how far it is believed.
 
 Only its steps count, from the last registered frame to this one, so that its drift does no harm. A step that the motion
-before makes impossible (a jump, a restart) is not used, nor is one that the scan contradicts; those that are far off
-again and again make all that follow doubtful, until they are right for a while. Where the scene leaves a direction
-open, as in a tunnel, nothing contradicts it: it decides.
+before makes impossible (a jump, a restart) is not used, nor are those after it until a frame is registered; nor is one
+that the scan contradicts. Those that are far off again and again make all that follow doubtful, until they are right
+for a while. Where the scene leaves a direction open, as in a tunnel, nothing contradicts it: it decides.
 """
 
 from __future__ import annotations
@@ -69,14 +69,18 @@ class OtherMotion:
         comparison: of this frame, if there was a step and the frame was registered.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, steadiness: float = 10.0) -> None:
+        """`steadiness`: standard deviation of the acceleration, m/s2 and rad/s2."""
+        self._steadiness = steadiness
         self.step: Step | None = None
         self.comparison: Comparison | None = None
         self._raw: Array | None = None  # the step, possible or not
         self._unsure = False  # by its own covariance, and by nothing else
-        self._hangs = False  # it repeats a pose that no vehicle can have stopped at
+        self._jumped = False  # since the last registered frame; or it repeats a pose that it cannot have stopped at
         self._now: Guess | None = None
         self._last: Guess | None = None  # that of the last registered frame
+        self._before: Guess | None = None  # the last one, and how long that is after `_last`, s, and its motion (6,)
+        self._seconds, self._twist = 0.0, np.zeros(6)
         self._way: _Way | None = None  # since it was last judged
         self._doubt = 1.0  # squared sigmas by which it has been off of late
 
@@ -93,17 +97,29 @@ class OtherMotion:
         T = self._raw = se3.orthonormalized(se3.inverse(self._last.T_other_lidar) @ guess.T_other_lidar)
         grown = _grown(self._last, guess)
         covariance = _spread(T) + grown
+        lost, unsteady = self._before is not self._last, self._is_unsteady(guess, seconds)
         if twist is not None:
             off = se3.log(se3.inverse(predicted(np.eye(4), twist, seconds)) @ T)
             impossible = bool(off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE)
             same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
-            self._hangs = same and (self._hangs or impossible)
-            if impossible or self._hangs or self._doubt > _CREDIBLE:
+            self._jumped = impossible or (lost and unsteady) or (self._jumped and (lost or same))
+            if self._jumped or self._doubt > _CREDIBLE:
                 return
             self._unsure = bool(np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
             if self._unsure:
                 return
         self.step = Step(T, covariance)
+
+    def _is_unsteady(self, guess: Guess, seconds: float) -> bool:
+        """Whether a guess, `seconds` after the last registered frame, follows the last guess as no vehicle moves."""
+        assert self._before is not None
+        before, period = self._before, seconds - self._seconds
+        T, T_steady = se3.inverse(before.T_other_lidar) @ guess.T_other_lidar, predicted(np.eye(4), self._twist, period)
+        self._before, self._seconds, self._twist = guess, seconds, se3.log(T) / period
+        covariance = _spread(T) + _spread(T_steady) + _grown(before, guess)
+        covariance += (self._steadiness * period**2) ** 2 * np.eye(6)
+        off = se3.log(se3.inverse(T_steady) @ T)
+        return bool(off @ np.linalg.solve(covariance, off) > _POSSIBLE)
 
     def agrees(self, T_before: Array, result: Registration) -> bool:
         """Whether a scan that was registered from the step's end (the last one at T_before (4, 4)) confirms it."""
@@ -127,7 +143,8 @@ class OtherMotion:
 
     def keep(self) -> None:
         """This frame was registered: the next step begins here."""
-        self._last = self._now
+        self._last = self._before = self._now
+        self._seconds = 0.0
 
 
 def _spread(T: Array) -> Array:

@@ -124,6 +124,19 @@ def test_scans_that_fail_are_bridged_by_it(suburb_drive: Drive) -> None:
     assert sigmas[-1] > 0.05
 
 
+@pytest.mark.parametrize(("since", "jump"), [(8, 50.0), (10, 3.0), (10, 50.0)])
+def test_one_that_jumps_while_no_scan_can_be_read_is_not_followed(suburb_drive: Drive, since: int, jump: float) -> None:
+    """Ever less is known of the motion before, and a jump was soon possible: 10 m off at a stated 0.3 m."""
+    frames, truth = suburb_drive
+    back = se3.exp([0, 0, 0, -jump, 0, 0])
+    guesses = [Guess(T if i < since else T @ back) for i, T in enumerate(truth)]
+    blind = [f if f.index < 8 else replace(f, points=f.points[:0], problem="unreadable") for f in frames]
+    led = run([replace(f, guess=guess) for f, guess in zip(blind, guesses, strict=True)])
+    for result, T in list(zip(led, truth, strict=True))[8:]:
+        error = se3.log(se3.inverse(T) @ result.T_odom_lidar)
+        assert error @ np.linalg.solve(result.covariance, error) < 20  # of 6 degrees of freedom
+
+
 def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> None:
     """It states a covariance that grows by 9 m2 a frame: the motion before knows more."""
     frames = beside(suburb_drive)[:8]
