@@ -156,7 +156,13 @@ class Odometry:
         self._clock.correct(dt)
         if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
             frame = replace(frame, imu=None)
-        return frame, self._unbent(frame, match, twist, dt), dt
+        match, motion = self._unbent(frame, match, twist, dt), self._motion
+        known = motion.twist is not None and match.result.method not in ("none", "first")
+        if known and motion.turn is not None and not match.result.ok:
+            again = self._matcher.again_without_imu(frame, dt, self._sweep.span / 2)
+            if again.result.ok:
+                frame, match = replace(frame, imu=None), again
+        return frame, match, dt
 
     def _look(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
         """What an IMU and another odometry say of a frame, `seconds` after the last registered one: the frame with what

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -102,6 +103,15 @@ class ScanMatcher:
             result = motion.gated(result, T_predicted, dt)
             match = match._replace(scan=scan, result=result) if result.ok else match
         return match._replace(swept=swept.placed(match.result)) if match.result.ok else match
+
+    def again_without_imu(self, frame: Frame, dt: float, half: float) -> Match:
+        """A frame that fits nowhere with its IMU, matched and straightened as if there were none: after a wrong turn
+        the points of the sweep do not show how a turn begins."""
+        motion = copy(self.motion)
+        motion.inertial, motion.T = None, predicted(motion.T_registered, motion.ahead, motion.seconds)
+        frame, twist, matcher = replace(frame, imu=None), motion.ahead, replace(self, motion=motion)
+        match = matcher._alone(frame, self.registration.prepare(frame, twist), motion.predicted(twist, dt), dt)
+        return matcher.straightened(frame, match, twist, dt, half)
 
     def _steadied(self, frame: Frame, match: Match, twist: Array, seconds: float, half: float) -> Match:
         """As `straightened`, by the average motion of the `seconds` since the last scan, where the points of the sweep
