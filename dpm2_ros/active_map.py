@@ -150,6 +150,7 @@ class ActiveMap:
         """A robot's odometry has started again: a loop or a search has to find where it is."""
         placed = self._T_map_odom or {}
         self._T_map_odom = {other: T for other, T in placed.items() if other != robot}
+        self.mapper.forget_start()
         if self.localizer is not None:
             self.localizer.restart()
 

@@ -168,6 +168,10 @@ class Mapper:
         """
         self._start = SessionStart(T_map_odom, covariance, node)
 
+    def forget_start(self) -> None:
+        """The odometry that `start_session` has placed begins anew before its first keyframe: only a loop tells."""
+        self._start = None
+
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, if loops are searched with them and its registration made none."""
         return self._closer.described(keyframe)
