@@ -13,7 +13,7 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Edge, Keyframe
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -184,14 +184,14 @@ class Mapper:
                 after that the keyframe is in, with what was found until then.
         """
         check_keyframe(keyframe, self._closer.channels)
-        node, cloud, thumbnail = len(self.keyframes), keyframe.cloud, keyframe.thumbnail
+        node, cloud, thumbnail, way = len(self.keyframes), keyframe.cloud, keyframe.thumbnail, keyframe.edge
         robot = self._robot(keyframe.robot)
-        follows = robot.last is not None and keyframe.edge is not None
+        follows = robot.last is not None and way is not None
         offset = robot.offset if follows else robot.ids
         keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
         keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None)
         packed = pack_cloud(cloud)
-        to_before = self._add_node(keyframe, robot.last if follows else None)
+        to_before = self._add_node(keyframe, way, robot.last if follows else None)
         self._clouds.append(packed)
         self.keyframes.append(keyframe)
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
@@ -273,16 +273,17 @@ class Mapper:
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving)))
 
-    def _add_node(self, keyframe: Keyframe, last: int | None) -> list[Edge]:
-        """A node with an edge to its robot's `last` one, also when some between them never arrived."""
-        node, result = len(self.keyframes), keyframe.edge
+    def _add_node(self, keyframe: Keyframe, way: Registration | None, last: int | None) -> list[Edge]:
+        """A node with an edge to its robot's `last` one, also when some between them never arrived; `way`: its edge as
+        it came."""
+        node, result = len(self.keyframes), way
         if result is not None and last is not None:
             before = self.keyframes[last]
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
             covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             result = replace(result, T_target_source=T_before_this, covariance=covariance)
         elif node == self.session_start and self._start is not None:
-            return [self._begin_session(self._start, node, keyframe)]
+            return [self._begin_session(self._start.after(way), node, keyframe)]
         else:
             self._graph.add_node(keyframe.T_odom_kf)
             return []

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,11 @@ class SessionStart:
     T_map_odom: Array | None
     covariance: Array
     node: int | None
+
+    def after(self, way: Registration | None) -> SessionStart:
+        """With the uncertainty of the way to the first keyframe, where it has one from a keyframe before the session:
+        a break of the odometry may be in it."""
+        return self if way is None else replace(self, covariance=self.covariance + way.covariance)
 
     def T_map_kf(self, T_odom_kf: Array, poses: Array) -> Array:
         """(4, 4) of the first keyframe; poses: (N, 4, 4) of the map."""

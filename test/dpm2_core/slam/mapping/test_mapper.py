@@ -279,6 +279,18 @@ def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) 
             assert (mapper.T_map_odom_of("") is not None) == (mapper.T_map_odom is not None) == expected
 
 
+def test_a_session_whose_odometry_breaks_before_its_first_keyframe_is_tied_loosely(tmp_path: Path) -> None:
+    """As loosely as the break says. It was tied as firmly as the robot had been found before it."""
+    _, maps, _ = fleet_maps(1)
+    save_as(maps["d0"], tmp_path / "map")
+    broken = Registration(np.eye(4), np.diag([1.0] * 3 + [30.0] * 3) ** 2, 0.9, 0.05, "test")
+    with MapStore.open(tmp_path / "map") as store:
+        mapper = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}), store)
+        mapper.start_session(np.eye(4), SIGMA)
+        mapper.add(replace(drifting(circle(1), np.zeros(6), np.zeros((0, 4), np.float32))[0], edge=broken))
+        np.testing.assert_allclose(mapper.edges[-1].covariance, SIGMA + broken.covariance)
+
+
 def test_a_map_of_several_drives_is_loaded_with_the_poses_of_its_file(tmp_path: Path) -> None:
     """However far its loops are from them: they have been weighed against each other."""
     _, maps, joins = fleet_maps(3)
