@@ -64,7 +64,8 @@ class RosSettings(Settings):
     """slam_node publishes odom -> base on /tf, unless `odom_source` is another."""
 
     publish_tf_map: bool = True
-    """The mapper publishes map -> odom on /tf."""
+    """The mapper publishes map -> odom on /tf; with a mapper apart beside another odometry (`odom_source`) it publishes
+    map -> ODOM_FRAME_dpm2, and slam_node ODOM_FRAME_dpm2 -> odom."""
 
     embed_mapper: bool = True
     """slam_node hosts the mapper; false where a mapper_node runs apart."""

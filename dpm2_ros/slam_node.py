@@ -73,7 +73,8 @@ class SlamNode(ManagedNode):
         # Idle with the mapper, which has its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=lower_priority)
         back.callback(self._line.shutdown)
-        sends = ros.publish_tf_odom and (not self._beside or ros.invert_odom_tf or not ros.embed_mapper)
+        beside = ros.invert_odom_tf if ros.embed_mapper else ros.publish_tf_map  # a leaf, or a half of map -> odom
+        sends = beside if self._beside else ros.publish_tf_odom
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self._stopping = threading.Event()
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))

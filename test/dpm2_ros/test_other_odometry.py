@@ -29,6 +29,7 @@ T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
 JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
 STEPS = 5  # samples of the wheels to a cloud
 ACCURATE = 0.05
+NONE = "ros.publish_tf_odom:=false"
 
 
 class Robot:
@@ -206,10 +207,17 @@ def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], dr
         (("own", "ros.invert_odom_tf:=true"), {("base_link", "odom"), ("odom", "map")}),
         (("tf", "ros.invert_odom_tf:=true"), {("map", "odom"), ("odom", "base_link"), ("base_link", "odom_dpm2")}),
         (("tf", "ros.embed_mapper:=false"), {("odom_dpm2", "odom"), ("odom", "base_link")}),
+        (
+            ("tf", "ros.invert_odom_tf:=true", NONE),
+            {("map", "odom"), ("odom", "base_link"), ("base_link", "odom_dpm2")},
+        ),
+        (("tf", "ros.embed_mapper:=false", NONE), {("odom_dpm2", "odom"), ("odom", "base_link")}),
+        (("tf", "ros.embed_mapper:=false", "ros.publish_tf_map:=false"), {("odom", "base_link")}),
     ],
-    ids=["own, inverted", "another's, inverted", "mapper apart"],
+    ids=["own, inverted", "another's, inverted", "mapper apart", "leaf, no odom", "apart, no odom", "apart, no map"],
 )
 def test_every_frame_has_one_parent(robot: Callable[..., Robot], parameters: tuple[str], expected: set) -> None:
+    """`publish_tf_odom` is for odom -> base alone: beside another odometry it cut the tree between map and odom."""
     r = robot(*parameters)
     r.send(0, 1, 2, wheels=parameters[0] == "tf")
     r.wait(lambda: set(r.links()) == expected and min(map(len, r.links().values())) >= 2, f"{expected}")
