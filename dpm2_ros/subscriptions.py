@@ -75,7 +75,6 @@ class Inputs:
         self.synchronizer = Synchronizer(beside, ros.queue_depth, ros.sync_timeout, settings.image_tolerance)
         self.losses = Losses()
         """Clouds that were sent, and never arrived."""
-        self._calibrated: set[str] = set()  # image topics of cameras that have a CameraInfo of use
         self._frame: str | None = None  # of the clouds
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
         others = self._others(given)
@@ -238,10 +237,8 @@ class Inputs:
         try:
             decode_camera(info, np.eye(4), "camera")
         except UsageError:
-            if camera.topic in self._calibrated:
+            if _usable(camera.info):
                 raise  # what is known stays
-        else:
-            self._calibrated.add(camera.topic)
         camera.info = info
 
     def _on_static(self, message: Any) -> None:
@@ -283,6 +280,14 @@ def _named(node: Node, given: InputSettings) -> Calibration:
         if known.second_camera.topic == known.cameras[0].topic:
             raise UsageError(f"input.second_image_topic: {known.second_camera.topic} is that of the first camera")
     return known
+
+
+def _usable(info: Any) -> bool:
+    """Whether it is a CameraInfo that can be used."""
+    try:
+        return info is not None and decode_camera(info, np.eye(4), "camera") is not None
+    except UsageError:
+        return False
 
 
 def _camera_info_beside(node: Node, image_topic: str) -> str:

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
 
-from dpm2_core.data.frames import FrameBuilder
+from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
@@ -25,6 +25,7 @@ from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import LATCHED, Inputs
 
+INFO = CameraInfo(height=6, width=8, k=[5.0, 0, 4, 0, 5, 3, 0, 0, 1], p=[5.0, 0, 4, 0, 0, 5, 3, 0, 0, 0, 1, 0])
 CLOUD: Points = np.array([[50, 0, 0, 0.5], [0, 30, 1, 0.5]], np.float32)
 
 
@@ -149,13 +150,26 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
 def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> None:
     """Latched, long before anyone listens."""
     n = node()
-    info = CameraInfo(height=6, width=8, k=[5.0, 0, 4, 0, 5, 3, 0, 0, 1], p=[5.0, 0, 4, 0, 0, 5, 3, 0, 0, 0, 1, 0])
-    n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(info)
+    n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(INFO)
     made = inputs(n, image_topic="/front/image")
     end = time.monotonic() + 20
     while made.calibration.cameras[0].info is None and time.monotonic() < end:
         rclpy.spin_once(n, timeout_sec=0.2)
-    assert made.calibration.cameras[0].info == info
+    assert made.calibration.cameras[0].info == INFO
+
+
+def test_a_camera_info_that_cannot_be_used_replaces_none_that_can(node: Callable[..., Node]) -> None:
+    """Nor one that was known before the node was deactivated, as here."""
+    n = node()
+    assert isinstance(n, GuardedNode)
+    known = Calibration("/points", camera=CameraTopic("/front/image", INFO))
+    made = Inputs(n, InputSettings(image_topic="/front/image"), RosSettings(), known)
+    n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(CameraInfo(height=6, width=8))
+    end = time.monotonic() + 20
+    while not n.rejections and made.calibration.cameras[0].info == INFO and time.monotonic() < end:
+        rclpy.spin_once(n, timeout_sec=0.2)
+    assert sum(n.rejections.values()) == 1
+    assert made.calibration.cameras[0].info == INFO
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 90.0, -5.1])
