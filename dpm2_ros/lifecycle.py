@@ -16,7 +16,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_ros.guard import GuardedNode, until
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.parameters import follow_changes, load_parameters
@@ -44,6 +44,13 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         self._config, self._robot = load_parameters(self, NodeConfig), robot_name(self)
         self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what was there before each, and its way back
         follow_changes(self, self._config, self._apply)
+
+    def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
+        """As of `Node`, which declares all that are given; ROS reads an empty list as no value, which has no type."""
+        for name, value, descriptor in parameters:
+            if value is None and not descriptor.dynamic_typing:
+                raise UsageError(f"ROS parameter: {name}: want a value, got an empty list")
+        return super().declare_parameters(namespace, parameters, ignore_override)
 
     def configure(self, back: ExitStack) -> None:
         """Load the network, open the map, announce what will be published.

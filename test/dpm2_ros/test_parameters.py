@@ -185,11 +185,15 @@ def test_mistakes_are_named(load: Load, parameter: str, message: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_process_ends_with_2_and_one_line(run: Callable[..., subprocess.CompletedProcess[str]]) -> None:
-    done = run("slam_node", "--ros-args", "-p", "ros.queue_depth:=0")
+@pytest.mark.parametrize("parameter", ["ros.queue_depth:=0", "input.T_lidar_cam:=[]"])
+def test_a_process_ends_with_2_and_one_line(
+    run: Callable[..., subprocess.CompletedProcess[str]], parameter: str
+) -> None:
+    """Also of an empty list, to which ROS gives no type."""
+    done = run("slam_node", "--ros-args", "-p", parameter)
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2
-    assert "ros.queue_depth" in line
+    assert parameter.partition(":=")[0] in line
     assert "Traceback" not in done.stderr
 
 
