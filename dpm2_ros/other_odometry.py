@@ -58,7 +58,7 @@ class OtherOdometry:
         self._history, self._changed = TransformHistory(), threading.Condition()
         self._child = ""  # whose pose the topic has
         self.source = node.resolve_topic_name("/tf" if ros.odom_source == "tf" else ros.odom_topic)
-        self.problem, self.missed, self.found, self.outweighed = f"nothing on {self.source} yet", 0, 0, 0
+        self.problem, self.missed, self.found, self.outweighed = f"nothing of use on {self.source} yet", 0, 0, 0
         self._in_a_row = 0
         self._comparison: Comparison | None = None
         self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
@@ -132,9 +132,10 @@ class OtherOdometry:
         return "; ".join(said)
 
     def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
-        static = self._static()
+        static, source = self._static(), base if self._subscription is None else self._child
+        if not source:  # no message was of use: `problem` is as at the start
+            return None
         try:
-            source = self._child or base
             T, covariance = self._history.lookup(self._frame, source, stamp, static)
             if source != base:
                 T_child_base = static.lookup(source, base)
@@ -161,6 +162,9 @@ class OtherOdometry:
         frame, child = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
         if frame != self._frame:
             raise RejectedError("frame", f"odometry in frame {frame[:80]!r}; ros.odom_frame is {self._frame!r}")
+        if not child:
+            raise RejectedError("frame", "odometry without a child_frame_id")
+        check_frame(child)
         T = transform_matrix(message.pose.pose)
         check_pose(T)
         numbers, covariance = np.asarray(message.pose.covariance, np.float64), None
@@ -168,7 +172,6 @@ class OtherOdometry:
             stated = covariance_from_ros(np.nan_to_num(numbers, posinf=-1.0), T[:3, :3])
             check_covariance(stated)
             covariance = stated
-        check_frame(child)  # it may be empty
         with self._changed:
             self._child = child
             self._history.add(frame, child, stamp_ns(message.header), message.pose.pose, covariance)

@@ -177,6 +177,18 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
         assert np.linalg.norm((transform_matrix(message.pose.pose) - r.base(n))[:3, 3]) < ACCURATE
 
 
+@pytest.mark.parametrize(("frame", "child"), [("odom", ""), ("elsewhere", "base_link")])
+def test_a_topic_without_odometry_of_use_is_named(
+    robot: Callable[..., Robot], drive: Any, frame: str, child: str
+) -> None:
+    """Not a transform that is missing: TF has no part in it."""
+    r = robot("topic")
+    r.topic.publish(edge_to_msg(np.eye(4), np.eye(6), drive.stamp(0), frame, child))
+    r.wait(lambda: list(r.node.rejections.values()) == [1], "the rejection")
+    r.send(0, wheels=False)
+    assert r.status(having(without=1)).message == "nothing of use on /odom yet; going on without"
+
+
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
     """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from what the scans show" was said of what is right."""
     r = robot("topic")
