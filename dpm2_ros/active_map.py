@@ -98,7 +98,8 @@ class ActiveMap:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
         self._complete()
-        if name and (path := self._maps.file(name)) != self._path:
+        path = self._maps.file(name) if name else None
+        if path is not None and (self._path is None or path.resolve() != self._path.resolve()):
             self._exchange(open_for_localization(path, self._config.slam))
         else:
             if self.localizer is None:

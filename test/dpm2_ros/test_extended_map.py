@@ -95,3 +95,14 @@ def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
     assert found.T_map_odom("") is None
     (told,) = (record for record in caplog.records if record.levelno == logging.ERROR)
     assert "see dpm2 map check" in told.getMessage()
+
+
+@pytest.mark.weights
+def test_the_own_map_is_known_by_any_spelling_of_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """FILE-wal stayed beside it, of two that were open at once."""
+    monkeypatch.chdir(tmp_path)
+    active = ActiveMap(described(map_directory=".", map_file=str(tmp_path / "town.dpm2map")), "", LOG)
+    active.add(street(0))
+    active.localise("town")
+    assert [path.name for path in tmp_path.iterdir()] == ["town.dpm2map"]
+    active.close()
