@@ -55,15 +55,21 @@ class SlamSettings(Settings):
     @classmethod
     def _with_preset(cls, given: Any) -> Any:
         """What the preset changes, under what is given."""
-        name = given.get("preset") if isinstance(given, Mapping) else None
-        path = Path(__file__).with_name("presets") / f"{name}.yaml"
-        return merged(read_yaml(path), given) if name in get_args(cls.model_fields["preset"].annotation)[1:] else given
+        return merged(_changes(given.get("preset")), given) if isinstance(given, Mapping) else given
 
     def indoors(self) -> SlamSettings:
-        """What is used in rooms: with `preset: auto` the preset for rooms under what differs from the defaults."""
+        """What is used in rooms: with `preset: auto` the preset for rooms under what differs from the defaults.
+
+        An upper bound of the preset gives way to a lower one that is set.
+        """
         if self.preset != "auto":
             return self
-        return SlamSettings.model_validate({**self.model_dump(exclude_defaults=True), "preset": "indoor"})
+        room = merged(_changes("indoor"), self.model_dump(exclude_defaults=True))
+        part = room["preprocess"]
+        part["source_voxel"] = max(part["source_voxel"], part["map_voxel"])
+        if part["min_range"] >= part["max_range"]:
+            part["max_range"] = self.preprocess.max_range
+        return SlamSettings.model_validate({**room, "preset": "indoor"})
 
     @property
     def uses_descriptors(self) -> bool:
@@ -73,6 +79,12 @@ class SlamSettings(Settings):
     def weights_id(self) -> str:
         """Of the weights that make descriptors, see `network.pretrained.weights_id`; empty where none are made."""
         return weights_id(self.neural.weights) if self.uses_descriptors else ""
+
+
+def _changes(preset: Any) -> dict[str, Any]:
+    """What a preset changes; nothing for what is no name of one."""
+    named = preset in get_args(SlamSettings.model_fields["preset"].annotation)[1:]
+    return read_yaml(Path(__file__).with_name("presets") / f"{preset}.yaml") if named else {}
 
 
 class Config(Settings):

@@ -146,6 +146,21 @@ def test_rooms_keep_what_is_set() -> None:
     assert (chosen.geometric.noise, chosen.geometric.gate, chosen.threads) == (0.02, 0.8, 1)
 
 
+@pytest.mark.parametrize(
+    ("given", "rooms"),
+    [
+        ({"map_voxel": 0.3}, {"map_voxel": 0.3, "source_voxel": 0.3, "min_range": 0.3}),
+        ({"map_voxel": 0.3, "source_voxel": 0.8}, {"map_voxel": 0.3, "source_voxel": 0.3}),  # 0.8 is the default
+        ({"map_voxel": 0.3, "source_voxel": 0.6}, {"map_voxel": 0.3, "source_voxel": 0.6}),
+        ({"min_range": 45}, {"min_range": 45, "max_range": 90, "source_voxel": 0.2}),
+    ],
+)
+def test_what_is_allowed_on_streets_is_allowed_in_rooms(given: dict[str, float], rooms: dict[str, float]) -> None:
+    settings = SlamSettings.model_validate({"registration": "geometric", "preprocess": given})
+    make_odometry(settings)
+    assert rooms.items() <= settings.indoors().preprocess.model_dump().items()
+
+
 def test_a_robot_that_begins_turning_on_the_spot_is_followed() -> None:
     """By 30 degrees a frame from the first one on, and then slower."""
     yaws = np.radians(30.0 * np.array([0, 1, 2, 3, 4, 4.5]))
