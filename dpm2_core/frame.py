@@ -143,6 +143,7 @@ class Fix:
         C = self.covariance
         if not np.abs(C).max() <= 1e12 or not np.allclose(C, C.T) or np.linalg.eigvalsh(C)[0] <= 0:
             raise ValueError(f"fix: {C.ravel().tolist()} is no covariance")
+        object.__setattr__(self, "stamp", int(self.stamp))  # see `Frame`
 
     def moved(self, T_new_old: Array) -> Fix:
         """The same with its antenna in another frame, by (4, 4) T_new_old."""
@@ -211,6 +212,11 @@ class Frame:
             raise ValueError(f"frame {self.index}: some time offsets are not finite")
         if not isinstance(self.stamp, int | np.integer):
             raise ValueError(f"frame {self.index}: its stamp is {self.stamp!r}, want ns, an integer")
+        if not isinstance(self.index, int | np.integer):
+            raise ValueError(f"frame {self.index!r}: its index is no integer")
+        # A map file would keep those of NumPy as bytes, and unsigned ones have no negative differences.
+        object.__setattr__(self, "stamp", int(self.stamp))
+        object.__setattr__(self, "index", int(self.index))
 
     def later(self, seconds: float) -> Frame:
         """The same, its points and images timed from a moment so much after the stamp; not moved there."""

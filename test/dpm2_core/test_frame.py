@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Camera, Frame, Guess, Image
+from dpm2_core.frame import Camera, Fix, Frame, Guess, Image
 from dpm2_core.geometry import se3
 
 CAMERA = Camera(K=np.eye(3), T_lidar_cam=np.eye(4), size=(40, 30), name="left")
@@ -53,8 +53,19 @@ def test_what_would_be_read_as_something_else_is_refused() -> None:
     with pytest.raises(ValueError, match=r"frame 0: its stamp is 1.5, want ns"):
         Frame(1.5, points)  # type: ignore[arg-type]
     assert Frame(np.int64(3), points).stamp == 3  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"frame 1.5: its index is no integer"):
+        Frame(0, points, index=1.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="frame 0: some time offsets are not finite"):
         Frame(0, points, np.array([0, np.nan, 0], np.float32))
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64, np.uint64])
+def test_stamps_and_indices_of_numpy_become_plain_integers(kind: type) -> None:
+    """SQLite keeps those of NumPy as bytes, and unsigned ones have no negative differences."""
+    frame = Frame(kind(3), np.zeros((0, 4), np.float32), index=kind(2))
+    fix = Fix(kind(3), np.array([49.0, 8.4, 110.0]), np.eye(3), np.zeros(3))
+    assert [type(number) for number in (frame.stamp, frame.index, fix.stamp)] == [int, int, int]
+    assert (frame.stamp, frame.index, fix.stamp) == (3, 2, 3)
 
 
 def test_a_frame_may_be_empty_and_may_hold_nan() -> None:
