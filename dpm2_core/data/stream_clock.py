@@ -25,11 +25,18 @@ class StreamClock:
     def __init__(self) -> None:
         self.stamp: int | None = None
         self.now = 0.0
+        self._jumped_from: int | None = None
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
 
     def advance(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period."""
+        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period.
+
+        Where only one stamp jumped back, the next is later than the one before it, from which it is then measured.
+        """
         dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
+        if self._jumped_from is not None and stamp > self._jumped_from:
+            dt = (stamp - self._jumped_from) * 1e-9 - NOMINAL  # which the jump has counted
+        self._jumped_from = self.stamp if self.stamp is not None and stamp < self.stamp else None
         if dt < _FASTEST:
             dt = NOMINAL
         if self.stamp is not None:

@@ -17,6 +17,29 @@ def test_stamps_that_do_not_advance_count_as_a_period() -> None:
     assert clock.stamp == 4_000_000_000
 
 
+@pytest.mark.parametrize("back", [150, 300, 1000, 5000, 3_600_000])
+def test_one_stamp_that_jumps_back_makes_no_pause(back: int) -> None:
+    """Back by so many ms; a clock that is set back goes on from there."""
+    clock = StreamClock()
+    stamps = [1000, 1100, 1200 - back, 1300, 1400, 1500 - back, 1600 - back, 1700 - back]
+    assert [clock.advance(stamp * 10**6) for stamp in stamps] == pytest.approx([0.1] * 8)
+    assert clock.now == pytest.approx(0.7)
+
+
+def test_one_stamp_of_a_fast_stream_that_jumps_back_makes_no_pause() -> None:
+    clock = StreamClock()
+    stamps = [1000, 1050, 100, 1150, 1200, 1250]
+    assert max(clock.advance(stamp * 10**6) for stamp in stamps) == pytest.approx(0.1)
+
+
+def test_a_pause_after_a_stamp_that_jumped_back_is_one() -> None:
+    clock = StreamClock()
+    for stamp in (1000, 1100, 200, 3200):
+        dt = clock.advance(stamp * 10**6)
+    assert dt == pytest.approx(2.0)
+    assert clock.now == pytest.approx(2.2)
+
+
 def test_lost_frames_and_two_of_a_burst_do_not_change_the_usual_period() -> None:
     """Before five periods none is usual."""
     clock = StreamClock()
