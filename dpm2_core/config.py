@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
@@ -67,6 +67,8 @@ def _kinds(annotation: Any) -> Iterator[Any]:
 def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[str] = ()) -> T:
     """Defaults, then the YAML file, then `dotted.key=value` settings, each overriding the one before.
 
+    A mapping as the value of a part changes the keys that it has; where keys are free, it replaces the one before.
+
     Raises:
         UsageError: the file is missing or no YAML mapping, or a key or value is not allowed.
     """
@@ -79,10 +81,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
         key = key.strip()
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
-        value = _value(text)
-        for part in reversed(key.split(".")):
-            value = {part: value}
-        _merge(tree, value)
+        _put(kind, tree, key.split("."), _value(text))
         origin.pop(key, None)  # the last one is to blame
         origin[key] = f"--set {setting}"
     return settings_from(kind, tree, origin, str(path) if path else "configuration")
@@ -153,6 +152,20 @@ def _merge(tree: dict[str, Any], more: dict[str, Any]) -> None:
             _merge(tree[key], value)
         else:
             tree[key] = value
+
+
+def _put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set what lies at a path of keys; `kind` is None below a field whose keys are free."""
+    key, *rest = path
+    found = kind.model_fields[key].annotation if kind is not None and key in kind.model_fields else None
+    part = None if get_origin(found) is dict else next(_settings_in(found), None)
+    if not rest and not (part and isinstance(value, dict)):
+        tree[key] = value
+        return
+    # A copy: two keys may share one mapping through a YAML anchor, and each is its own.
+    branch = tree[key] = dict(tree[key]) if isinstance(tree.get(key), dict) else {}
+    for keys, more in [(rest, value)] if rest else [([name], inner) for name, inner in value.items()]:
+        _put(part, branch, keys, more)
 
 
 def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:

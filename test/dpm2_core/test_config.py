@@ -48,6 +48,7 @@ class Outer(Settings):
     perhaps: Inner | None = None
     count: Annotated[int, Field(ge=0, le=9)] = 3
     text: str = "x"
+    free: dict[str, float] = Field({"a": 1})
     folder: Path | None = None
     switch: bool = True
 
@@ -96,6 +97,28 @@ def test_later_settings_override_earlier_ones_key_by_key(tmp_path: Path) -> None
     settings = load_settings(Outer, path, ["middle.inner.voxel=3", "text=a=b", "middle.inner.voxel=7", "folder="])
     assert settings.middle.inner == Inner(voxel=7, names=("a",))
     assert (settings.count, settings.text, settings.folder, settings.second.voxel) == (4, "a=b", None, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "free"),
+    [
+        (["free={c: 3}"], {"c": 3}),
+        (["free={}"], {}),
+        (["free.c=3"], {"b": 2, "c": 3}),
+        (["free={c: 3}", "free.d=4"], {"c": 3, "d": 4}),
+    ],
+)
+def test_a_mapping_replaces_one_whose_keys_are_free(
+    tmp_path: Path, overrides: list[str], free: dict[str, float]
+) -> None:
+    """A dotted key adds one; without a file a mapping means the same."""
+    assert load_settings(Outer, _file(tmp_path, "free: {b: 2}"), overrides).free == free
+    assert load_settings(Outer, None, ["free={c: 3}"]).free == {"c": 3}
+
+
+def test_a_mapping_changes_the_keys_of_a_part_that_it_has(tmp_path: Path) -> None:
+    path = _file(tmp_path, "middle: {inner: {voxel: 2, names: [a]}}\n")
+    assert load_settings(Outer, path, ["middle={inner: {voxel: 3}}"]).middle.inner == Inner(voxel=3, names=("a",))
 
 
 def test_an_empty_file_and_none_give_the_defaults(tmp_path: Path) -> None:
