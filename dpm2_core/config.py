@@ -46,6 +46,11 @@ class Settings(BaseModel):
         extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True, allow_inf_nan=False
     )
 
+    @classmethod
+    def implied(cls, tree: Mapping[str, Any]) -> dict[str, Any]:
+        """What a file with this tree need not say, such as the values of the preset that it names."""
+        return {}
+
     @field_validator("*", mode="before")
     @classmethod
     def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
@@ -72,10 +77,8 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
     Raises:
         UsageError: the file is missing or no YAML mapping, or a key or value is not allowed.
     """
-    tree: dict[str, Any] = {}
+    tree = {} if path is None else read_settings(kind, path)
     origin: dict[str, str] = {}
-    if path is not None:
-        _merge(tree, read_yaml(path))
     for setting in overrides:
         key, equals, text = setting.partition("=")
         key = key.strip()
@@ -125,6 +128,36 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise UsageError(f"{path}: want a mapping of keys, found {type(tree).__name__}")
     return tree
+
+
+def read_settings(kind: type[Settings], path: Path) -> dict[str, Any]:
+    """What a YAML file sets, without what is `implied`: another preset than the file's can then be put in.
+
+    Raises:
+        UsageError: the file is missing or no YAML mapping.
+    """
+    return _said(kind, read_yaml(path))
+
+
+def _said(kind: type[Settings], tree: dict[str, Any]) -> dict[str, Any]:
+    out = _without(tree, kind.implied(tree))
+    for name, info in kind.model_fields.items():
+        part = info.annotation
+        if isinstance(part, type) and issubclass(part, Settings) and isinstance(out.get(name), dict):
+            out[name] = _said(part, out[name])
+    return out
+
+
+def _without(tree: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy without the keys whose values are the same, at any depth."""
+    out: dict[str, Any] = {}
+    for key, value in tree.items():
+        other = values.get(key)
+        if isinstance(value, dict) and isinstance(other, dict):
+            out[key] = _without(value, other)
+        elif key not in values or value != other or isinstance(value, bool) != isinstance(other, bool):
+            out[key] = value
+    return out
 
 
 def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:

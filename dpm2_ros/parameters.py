@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import annotated_types
 from pydantic.fields import FieldInfo
 
-from dpm2_core.config import Settings, flat_fields, load_settings, read_yaml, settings_from
+from dpm2_core.config import Settings, flat_fields, load_settings, read_settings, settings_from
 from dpm2_core.errors import UsageError
 from dpm2_core.files import expanded
 from dpm2_ros.settings import CHANGEABLE
@@ -60,7 +60,7 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     path = Path(expanded(file)) if file else None
     load_settings(kind, path)  # its mistakes are its own
     # Only what is given: a preset may change the rest.
-    tree = _with({} if path is None else read_yaml(path), given)
+    tree = _with({} if path is None else read_settings(kind, path), given)
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)

@@ -30,9 +30,10 @@ class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
     preset: Literal["auto", "outdoor", "indoor", "highway", "paper"] = "auto"
-    """Changes to the other defaults of `slam`; what is set besides has precedence. indoor: rooms and corridors at a
-    walk. highway: far and fast. outdoor: no change. auto: indoor where the scans show rooms, else outdoor. paper: the
-    SLAM of DeepPointMap2 as published, by the network alone (docs/experiments.md)."""
+    """Changes to the other defaults of `slam`. What is set besides has precedence; but where a preset is set over a
+    file, values that are those of the file's own preset give way. indoor: rooms and corridors at a walk. highway: far
+    and fast. outdoor: no change. auto: indoor where the scans show rooms, else outdoor. paper: the SLAM of
+    DeepPointMap2 as published, by the network alone (docs/experiments.md)."""
     registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
     """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
     where they do not know (adaptive): where few of them fit, as at few frames per second, and along a tunnel."""
@@ -55,7 +56,19 @@ class SlamSettings(Settings):
     @classmethod
     def _with_preset(cls, given: Any) -> Any:
         """What the preset changes, under what is given."""
-        return merged(_changes(given.get("preset")), given) if isinstance(given, Mapping) else given
+        changes = _changes(given.get("preset")) if isinstance(given, Mapping) else {}
+        if not changes:
+            return given
+        values = {k: v.model_dump(exclude_unset=True) if isinstance(v, Settings) else v for k, v in given.items()}
+        return merged(changes, values)
+
+    @classmethod
+    def implied(cls, tree: Mapping[str, Any]) -> dict[str, Any]:
+        """The values of the preset that a tree names; see `Settings.implied`."""
+        preset = tree.get("preset", "auto")
+        if preset not in get_args(cls.model_fields["preset"].annotation):
+            return {}  # which is an error, or another one takes its place
+        return cls(preset=preset).model_dump(mode="json", exclude={"preset"})
 
     def indoors(self) -> SlamSettings:
         """What is used in rooms: with `preset: auto` the preset for rooms under what differs from the defaults.

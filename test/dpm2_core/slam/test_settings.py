@@ -14,6 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam import settings
 from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.settings import Config, SlamSettings
 
 NUMBERS = [n for n, info in flat_fields(Config) if n.startswith("slam.") and info.annotation in (int, float)]
@@ -45,6 +46,23 @@ def test_what_is_dumped_loads_back_equal(tmp_path: Path) -> None:
     config = load_settings(Config, None, ["slam.preset=paper", "slam.loops.candidates=5"])
     (tmp_path / "config.yaml").write_text(dump_settings(config))
     assert load_settings(Config, tmp_path / "config.yaml") == config
+
+
+@pytest.mark.parametrize(("first", "then"), [("indoor", "outdoor"), ("auto", "indoor"), ("highway", "paper")])
+def test_a_preset_replaces_that_of_a_file_with_every_value(tmp_path: Path, first: str, then: str) -> None:
+    """What the file sets besides its own preset stays, and single values have precedence over both."""
+    file = tmp_path / "config.yaml"
+    of_file = [f"slam.preset={first}", "slam.odometry.pause=0.9", "input.period=0.2"]
+    file.write_text(dump_settings(load_settings(Config, None, of_file)))
+    over = [f"slam.preset={then}", "slam.keyframes.distance=5.0"]
+    assert load_settings(Config, file, over) == load_settings(Config, None, [*of_file, *over])
+
+
+def test_a_part_that_is_given_as_settings_keeps_the_rest_of_the_preset() -> None:
+    part = PreprocessSettings(deskew=False)
+    assert SlamSettings(preset="indoor", preprocess=part) == SlamSettings.model_validate(
+        {"preset": "indoor", "preprocess": {"deskew": False}}
+    )
 
 
 @pytest.mark.parametrize("name", ["papers", "../paper", "3", "[paper]"])
