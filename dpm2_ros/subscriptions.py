@@ -284,10 +284,13 @@ def _named(node: Node, given: InputSettings) -> Calibration:
 
 def _usable(info: Any) -> bool:
     """Whether it is a CameraInfo that can be used."""
+    if info is None:
+        return False
     try:
-        return info is not None and decode_camera(info, np.eye(4), "camera") is not None
+        decode_camera(info, np.eye(4), "camera")
     except UsageError:
         return False
+    return True
 
 
 def _camera_info_beside(node: Node, image_topic: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dpm2_core.data.rosbag2_folder import PACKED, STORAGES
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
@@ -42,8 +43,7 @@ def is_drive(path: Path) -> bool:
 def is_rosbag2(path: Path) -> bool:
     """A .mcap or .db3 file, also a compressed one, or a folder with one or with the metadata of one."""
     files = [path] if path.is_file() else path.iterdir()
-    endings = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-    return any(file.name.endswith(endings) or file.name == "metadata.yaml" for file in files)
+    return any(file.name.endswith((*STORAGES, *PACKED)) or file.name == "metadata.yaml" for file in files)
 
 
 def _is_kitti_raw(path: Path) -> bool:

@@ -12,7 +12,8 @@ import yaml
 from dpm2_core.errors import UsageError, one_line
 
 STORAGES = (".mcap", ".db3")
-_PACKED = ".zstd"
+PACKED = tuple(f"{storage}.zstd" for storage in STORAGES)
+"""Endings of files that are compressed as a whole."""
 
 
 def recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
@@ -24,7 +25,7 @@ def recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
     try:
         text = (folder / "metadata.yaml").read_text(encoding="utf-8")
         about = yaml.safe_load(text)["rosbag2_bagfile_information"]
-        files = [folder / PurePath(name.removesuffix(_PACKED)).name for name in about["relative_file_paths"]]
+        files = [folder / PurePath(name.removesuffix(".zstd")).name for name in about["relative_file_paths"]]
         topics = [topic["topic_metadata"] for topic in about["topics_with_message_count"]]
         types = {str(topic["name"]): str(topic["type"]) for topic in topics}
     except FileNotFoundError:
@@ -43,8 +44,7 @@ def check_unpacked(files: Iterable[Path]) -> None:
     Raises:
         UsageError: one is compressed as a whole; with the command that unpacks it.
     """
-    endings = tuple(f"{storage}{_PACKED}" for storage in STORAGES)
     for file in files:
-        if file.name.endswith(endings) and not file.with_suffix("").is_file():
-            command = f"zstd -d {quote(str(file.parent))}/*{_PACKED}"
+        if file.name.endswith(PACKED) and not file.with_suffix("").is_file():
+            command = f"zstd -d {quote(str(file.parent))}/*.zstd"
             raise UsageError(f"{file}: compressed as a whole (--compression-mode file); unpack it: {command}")

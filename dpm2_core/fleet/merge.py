@@ -102,14 +102,15 @@ def _record(out: Path, folder: Path) -> Merged | None:
         merged = TypeAdapter(Merged).validate_json(_beside(out).read_bytes())
     except (OSError, ValueError):
         merged = None
-    if out.exists() and merged is None:
+    if not out.exists():
+        return merged
+    if merged is None:
         raise UsageError(f"{out}: there is a file already, which is no merge of drives")
-    if out.exists() and merged is not None:
-        drives = merged.drives.keys() | {path.parent.name for path in folder.glob(f"*/{MAP}")}
-        with MapStore.open(out) as store:
-            others = sum(str(robot).partition("/")[0] not in drives for (robot,) in store.rows("keyframes", "robot"))
-        if others:  # by `dpm2 run --extend`, or the file of another program beside an old record
-            raise UsageError(f"{out}: {others} of its keyframes are of no drive of {folder}; give another --out")
+    drives = merged.drives.keys() | {path.parent.name for path in folder.glob(f"*/{MAP}")}
+    with MapStore.open(out) as store:
+        others = sum(str(robot).partition("/")[0] not in drives for (robot,) in store.rows("keyframes", "robot"))
+    if others:  # by `dpm2 run --extend`, or the file of another program beside an old record
+        raise UsageError(f"{out}: {others} of its keyframes are of no drive of {folder}; give another --out")
     return merged
 
 
