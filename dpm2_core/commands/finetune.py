@@ -31,9 +31,9 @@ def finetune(
     """
     from dpm2_core.data.open import open_source
     from dpm2_core.data.packed import open_packed, packed_digest
-    from dpm2_core.experiments.begun import begin_or_resume
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
+    from dpm2_core.learning.begun import begin_or_resume
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.settings import SlamSettings
 

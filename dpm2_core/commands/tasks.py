@@ -114,10 +114,11 @@ Scans = tuple[Path, Sequence[str]]
 
 def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tuple[Scans, Scans | None]) -> None:
     """Train a task on the first scans, measuring on the second."""
-    from dpm2_core.experiments.begun import begin_or_resume
+    from dpm2_core.learning.begun import begin_or_resume
+    from dpm2_core.learning.checkpoint import WEIGHTS
     from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
-    from dpm2_core.tasks.training import WEIGHTS, new_task, train_task
+    from dpm2_core.tasks.training import new_task, train_task
 
     kind = task_type(name)
     (src, sequences), val = sets

@@ -196,7 +196,7 @@ def _begin(
 ) -> None:
     """Ready `out` for a training on packed drives, see `begin_or_resume`."""
     from dpm2_core.data.packed import open_packed, packed_digest
-    from dpm2_core.experiments.begun import begin_or_resume
+    from dpm2_core.learning.begun import begin_or_resume
 
     drives = {folder: open_packed(Path(folder)) for folder in settings.data.packed}
     frames = {folder: sum(map(len, found)) for folder, found in drives.items()}

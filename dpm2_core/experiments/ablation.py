@@ -16,9 +16,10 @@ from pydantic import Field
 from dpm2_core.config import Settings, dump_settings, merged
 from dpm2_core.data.packed import open_packed, packed_digest
 from dpm2_core.evaluation.pair_set import PairSet
-from dpm2_core.experiments.begun import begin_training
 from dpm2_core.experiments.paired import Gain, paired_gain
 from dpm2_core.files import atomic_write
+from dpm2_core.learning.begun import begin_training
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.weights import load_model
 from dpm2_core.tables import FigureTable
@@ -90,11 +91,11 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     optimiser = settings.training.optimiser.model_copy(update={"seed": seed})
     training = settings.training.model_copy(update={"network": network, "optimiser": optimiser})
     folder = out / name.replace(" ", "_") / str(seed)
-    weights, known = folder / "weights.safetensors", folder / "figures.json"
+    weights, known = folder / WEIGHTS, folder / "figures.json"
     asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
     read = [Path(training.start)] if training.start else []
     text = dump_settings(training) + "".join(f"# {line}\n" for line in _content(training.data.packed))
-    resume = begin_training(folder, text, weights.name, read)
+    resume = begin_training(folder, text, read)
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():

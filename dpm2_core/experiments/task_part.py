@@ -12,13 +12,14 @@ from typing import Literal, TypedDict
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
-from dpm2_core.experiments.begun import LOG, begin_training
 from dpm2_core.files import make_folder
 from dpm2_core.fleet.part import Advance, Figures
+from dpm2_core.learning.begun import begin_training
+from dpm2_core.learning.checkpoint import LOG
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.slam_figures import figures_of, slam_runs
 from dpm2_core.tasks.task import SlamTaskTraining, task_type
-from dpm2_core.tasks.training import WEIGHTS, load_task, mean_figures, measure, new_task, train_task
+from dpm2_core.tasks.training import load_task, mean_figures, measure, new_task, train_task
 
 TRAIN = "dpm2_core.experiments.task_part:train"
 MEASURE = "dpm2_core.experiments.task_part:measure_on"
@@ -77,7 +78,7 @@ def train(
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     text = dump_settings(settings) + json.dumps({"training": training, "until": until}) + "\n"
-    resume = begin_training(folder, text, WEIGHTS, start=None if start is None else Path(start))
+    resume = begin_training(folder, text, start=None if start is None else Path(start))
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)
     advance(1, 1)

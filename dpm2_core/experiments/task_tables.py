@@ -31,8 +31,8 @@ from dpm2_core.experiments.task_part import (
     settings_of,
 )
 from dpm2_core.fleet.part import Figures, Part
+from dpm2_core.learning.checkpoint import CHECKPOINT, WEIGHTS
 from dpm2_core.tasks.open import sequence_names
-from dpm2_core.tasks.training import WEIGHTS
 
 SEEDS = 3
 ARMS: tuple[Arm, ...] = ("without", "with", "placebo")
@@ -91,7 +91,7 @@ class TaskTable:
             for arm in ARMS:
                 name = self._name(seed, arm)
                 training = self._training(request, seed, arm)
-                checkpoint = [] if start is None else [Path(start) / "checkpoint.pt"]
+                checkpoint = [] if start is None else [Path(start) / CHECKPOINT]
                 inputs = [*request.config_files, *checkpoint]
                 arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs))
                 weights = request.out / name / WEIGHTS

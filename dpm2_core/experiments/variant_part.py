@@ -11,8 +11,9 @@ from typing import Any
 from dpm2_core.config import dump_settings, load_settings, merged
 from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import PackedDrive
-from dpm2_core.experiments.begun import LOG, begin_training
 from dpm2_core.fleet.part import Advance, Figures
+from dpm2_core.learning.begun import begin_training
+from dpm2_core.learning.checkpoint import LOG
 from dpm2_core.learning.generate import pack as write_packed_drive
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.pretrained import weights_path
@@ -21,7 +22,6 @@ from dpm2_core.slam.settings import Config
 
 PACK = "dpm2_core.experiments.variant_part:pack"
 TRAIN = "dpm2_core.experiments.variant_part:train"
-WEIGHTS = "weights.safetensors"
 DRIVE = "drive"
 """In the folder of a part that packs."""
 
@@ -74,7 +74,7 @@ def train(
         UsageError: no such weights, or no packed drive.
     """
     chosen = training_of(training["config"], training["settings"], training["start"], network, [*map(Path, packed)])
-    resume = begin_training(folder, dump_settings(chosen), WEIGHTS, [Path(chosen.start)])
+    resume = begin_training(folder, dump_settings(chosen), [Path(chosen.start)])
     weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps
     advance(steps, steps)

@@ -17,8 +17,9 @@ from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, learned_note, missing_note, own_part, present, run_folders
 from dpm2_core.experiments.table import MEAN, ResultTable
-from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN, WEIGHTS
+from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN
 from dpm2_core.fleet.part import Figures, Part
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.slam.settings import Config

@@ -17,6 +17,9 @@ from torch import nn
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write, make_folder
 
+CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.jsonl", "weights.safetensors"
+"""What a training leaves in its folder."""
+
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
     """Weights, averaged weights, optimizer and step. Everything random follows from seed and step.
@@ -78,7 +81,7 @@ class Log:
         """Goes on where a run that was stopped left off, before step `start`; what it had logged after that is done
         again."""
         make_folder(folder)
-        path = folder / "log.jsonl"
+        path = folder / LOG
         kept = _lines_before(path, start)
         with atomic_write(path) as file:
             file.writelines(kept)

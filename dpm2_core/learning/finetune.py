@@ -21,6 +21,7 @@ from dpm2_core.data.packed import PackedDrive
 from dpm2_core.diffslam.trajectory_loss import trajectory_loss
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.frame import Array
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings, draw_group
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.pair_sampling import SetPairs, sample_set_pairs
@@ -105,7 +106,7 @@ def finetune(
     Raises:
         UsageError: no such weights, no drives, or nothing to resume.
     """
-    start_from, optimizer, weights = weights_path(settings.weights), settings.optimiser, out / "weights.safetensors"
+    start_from, optimizer, weights = weights_path(settings.weights), settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     module = Finetuned(load_model(start_from), settings)
 

@@ -23,6 +23,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Image
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import augment_image
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.losses import cosine, info_nce, label_distances
@@ -151,7 +152,7 @@ class ImageTraining(nn.Module):
 
 def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
     """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
-    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
     module = ImageTraining(network, settings.shift)

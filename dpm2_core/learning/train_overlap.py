@@ -19,6 +19,7 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, open_packed
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3_torch
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.encoder import to_device
@@ -151,7 +152,7 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
 def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
     """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new heads, to
     `out`."""
-    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     network = network_settings(Path(settings.start))
     module = OverlapTraining(network)

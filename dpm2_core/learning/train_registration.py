@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.evaluation.pair_set import FAR, PairSet
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.pair_sampling import SetPairs, merge_tokens, sample_set_pairs
 from dpm2_core.learning.registration_loss import LossSettings, registration_loss
@@ -140,7 +141,7 @@ def train_registration(
 
     until: stop after this step; `resume` continues from there.
     """
-    optimizer, weights = settings.optimiser, out / "weights.safetensors"
+    optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
     module = RegistrationTraining(network, settings.loss, settings.encoder)

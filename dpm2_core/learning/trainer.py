@@ -22,7 +22,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
+from dpm2_core.learning.checkpoint import CHECKPOINT, Log, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
@@ -166,7 +166,7 @@ class Trainer:
             module = self.module.to(device)
             ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
             optimizer = make_optimizer(module, self.settings)
-            start = load_checkpoint(self.out / "checkpoint.pt", module, ema, optimizer) if resume else 0
+            start = load_checkpoint(self.out / CHECKPOINT, module, ema, optimizer) if resume else 0
             if start > self.settings.steps:
                 raise UsageError(f"{self.out}: has {start} steps, optimiser.steps wants {self.settings.steps}")
             steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))
@@ -227,4 +227,4 @@ class Trainer:
         if self.validate is not None and (last or done % self.settings.validate_every == 0):
             log.write(done - 1, self.validate(ema))
         if last or done % self.settings.save_every == 0:
-            save_checkpoint(self.out / "checkpoint.pt", self.module, ema, optimizer, done)
+            save_checkpoint(self.out / CHECKPOINT, self.module, ema, optimizer, done)

@@ -14,13 +14,11 @@ from torch import nn
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskTraining, task_type
-
-WEIGHTS = "weights.safetensors"
-"""What a training leaves in its folder, beside checkpoint.pt and log.jsonl."""
 
 
 def new_task(name: str, settings: TaskTraining) -> Task:

@@ -12,10 +12,11 @@ from torch.distributions import Normal, kl_divergence
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.open import open_scans
-from dpm2_core.tasks.training import WEIGHTS, draw, measure, new_task, train_task
+from dpm2_core.tasks.training import draw, measure, new_task, train_task
 
 SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 

@@ -13,6 +13,7 @@ from torch import nn
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
 from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
@@ -20,7 +21,7 @@ from dpm2_core.tasks.dslr_task import DslrTask, DslrTraining
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.range_scans import RangeReader
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.training import WEIGHTS, draw, measure, new_task, train_task
+from dpm2_core.tasks.training import draw, measure, new_task, train_task
 
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from dpm2_core.diffslam import SlamLoss
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.perception import gndnet
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import (
-    WEIGHTS,
     draw,
     load_task,
     mean_figures,

@@ -10,10 +10,9 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.experiments.begun import begin_or_resume, begin_training
+from dpm2_core.learning.begun import begin_or_resume, begin_training
+from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
 from dpm2_core.learning.trainer import OptimizerSettings
-
-WEIGHTS = "weights.safetensors"
 
 
 class Training(Settings):
@@ -26,7 +25,7 @@ class Training(Settings):
 
 def left(folder: Path) -> None:
     """What a training leaves."""
-    for name in ("checkpoint.pt", "log.jsonl", WEIGHTS):
+    for name in (CHECKPOINT, LOG, WEIGHTS):
         (folder / name).write_text("of the training before")
 
 
@@ -40,9 +39,9 @@ def read(tmp_path: Path) -> Path:
 
 def test_the_same_training_goes_on(tmp_path: Path, read: Path) -> None:
     folder = tmp_path / "training"
-    assert not begin_training(folder, "steps: 10\n", WEIGHTS, [read])
+    assert not begin_training(folder, "steps: 10\n", [read])
     left(folder)
-    assert begin_training(folder, "steps: 10\n", WEIGHTS, [read])
+    assert begin_training(folder, "steps: 10\n", [read])
     assert (folder / WEIGHTS).exists()
 
 
@@ -50,13 +49,13 @@ def test_the_same_training_goes_on(tmp_path: Path, read: Path) -> None:
 def test_another_one_begins_anew(tmp_path: Path, read: Path, changed: str) -> None:
     """Also where only the content of a file of the same name is another."""
     folder = tmp_path / "training"
-    begin_training(folder, "steps: 10\n", WEIGHTS, [read])
+    begin_training(folder, "steps: 10\n", [read])
     left(folder)
     if changed == "content":
         read.write_text("others!")
     elif changed == "missing":
         read.unlink()
-    assert not begin_training(folder, "steps: 20\n" if changed == "text" else "steps: 10\n", WEIGHTS, [read])
+    assert not begin_training(folder, "steps: 20\n" if changed == "text" else "steps: 10\n", [read])
     assert not (folder / WEIGHTS).exists()
 
 
@@ -66,19 +65,19 @@ def test_it_goes_on_from_the_checkpoint_of_another_one(tmp_path: Path) -> None:
     start.mkdir()
     left(start)
     for _ in range(2):
-        assert begin_training(folder, "steps: 10\n", WEIGHTS, start=start)
-        assert (folder / "checkpoint.pt").read_text() == "of the training before"
+        assert begin_training(folder, "steps: 10\n", start=start)
+        assert (folder / CHECKPOINT).read_text() == "of the training before"
     (folder / WEIGHTS).write_text("its own")
-    (start / "checkpoint.pt").write_text("of another one")
-    assert begin_training(folder, "steps: 10\n", WEIGHTS, start=start)
-    assert (folder / "checkpoint.pt").read_text() == "of another one"
+    (start / CHECKPOINT).write_text("of another one")
+    assert begin_training(folder, "steps: 10\n", start=start)
+    assert (folder / CHECKPOINT).read_text() == "of another one"
     assert not (folder / WEIGHTS).exists()
 
 
 def test_a_folder_that_cannot_be_is_an_error_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file/training: no folder can be made there: Not a directory"):
-        begin_training(tmp_path / "file" / "training", "", WEIGHTS)
+        begin_training(tmp_path / "file" / "training", "")
 
 
 @pytest.mark.parametrize(
@@ -125,6 +124,6 @@ def test_a_checkpoint_that_does_not_say_how_it_began_is_gone_on_with(tmp_path: P
     begin_or_resume(tmp_path, True, Training())
     with pytest.raises(UsageError, match="holds a training; --resume continues it"):
         begin_or_resume(tmp_path, False, Training())
-    (tmp_path / "checkpoint.pt").unlink()
+    (tmp_path / CHECKPOINT).unlink()
     with pytest.raises(UsageError, match=r"no checkpoint\.pt to resume"):
         begin_or_resume(tmp_path, True, Training())

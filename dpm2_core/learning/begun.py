@@ -14,17 +14,16 @@ from typing import Any
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write, file_digest, json_text, make_folder
+from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
 
-_BEGUN, _CHECKPOINT, LOG = "begun.yaml", "checkpoint.pt", "log.jsonl"
-_ASKED = "begun.json"
+_BEGUN, _ASKED = "begun.yaml", "begun.json"
 _FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
 
 
-def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] = (), start: Path | None = None) -> bool:
+def begin_training(folder: Path, text: str, read: Sequence[Path] = (), start: Path | None = None) -> bool:
     """Ready a folder for a training that is asked for by `text`; whether there is a checkpoint to go on from.
 
-    What a training that was asked for by another text, or from other files, has left there is removed, the file
-    `weights` among it.
+    What a training that was asked for by another text, or from other files, has left there is removed.
 
     Args:
         read: files that the training begins with, such as weights.
@@ -32,17 +31,17 @@ def begin_training(folder: Path, text: str, weights: str, read: Sequence[Path] =
     """
     make_folder(folder)
     begun = folder / _BEGUN
-    files = [*read, *([] if start is None else [start / _CHECKPOINT])]
+    files = [*read, *([] if start is None else [start / CHECKPOINT])]
     text += "".join(f"# {path}: {_content(path)}\n" for path in files)
     if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
-        for old in (_CHECKPOINT, LOG, weights):
+        for old in (CHECKPOINT, LOG, WEIGHTS):
             (folder / old).unlink(missing_ok=True)
         if start is not None:
-            for kept in (_CHECKPOINT, LOG):
+            for kept in (CHECKPOINT, LOG):
                 shutil.copy(start / kept, folder / kept)
         with atomic_write(begun) as file:  # the last: what is killed before is begun anew
             file.write(text)
-    return (folder / _CHECKPOINT).exists()
+    return (folder / CHECKPOINT).exists()
 
 
 def begin_or_resume(
@@ -61,11 +60,11 @@ def begin_or_resume(
         UsageError: there is a training that is not to be resumed, there is none to resume, or it was asked for
             something else; the message names the first setting that differs, and both values.
     """
-    asked, there = folder / _ASKED, (folder / _CHECKPOINT).exists()
+    asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
     if there and not resume:
         raise UsageError(f"{folder}: holds a training; --resume continues it, another --out keeps it")
     if resume and not there:
-        raise UsageError(f"{folder}: no checkpoint.pt to resume")
+        raise UsageError(f"{folder}: no {CHECKPOINT} to resume")
     now = dict(_values(settings)) | {f"content of {path}": _content(path) for path in read} | (data or {})
     now["processes"] = int(os.environ.get("WORLD_SIZE", "1"))
     now = json.loads(json_text(now))  # as it is read again
