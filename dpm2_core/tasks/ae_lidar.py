@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -13,7 +11,6 @@ from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dslr import down, initialize, up
 from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings
-from dpm2_core.network.perception.task_weights import load_network
 
 
 class AeLidarImage(RangeImageSettings):
@@ -90,8 +87,3 @@ class LidarAutoencoder(nn.Module):
         """Images made from the codes, and the divergence (B,)."""
         code, divergence = self.encode(images)
         return self.decoder(code[:, :, None, None]), divergence
-
-
-def load(path: Path) -> LidarAutoencoder:
-    """A trained autoencoder, ready for inference on the CPU; raises as `weights.load_network`."""
-    return load_network(path, "ae_lidar", "network", AeLidarSettings, LidarAutoencoder)

@@ -12,14 +12,7 @@ from torch import Tensor
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.chamfer import chamfer_figures
-from dpm2_core.tasks.range_scans import (
-    RangeReader,
-    RangeScans,
-    clouds,
-    image_error,
-    slam_of,
-    variety,
-)
+from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task
 from dpm2_core.tasks.training import mean_figures
@@ -70,41 +63,35 @@ class AeLidarTask(Task):
         loss = image_error(made, scans.images)
         if self.settings.network.variational:
             loss = loss + self._ratio * divergence.clamp(min=_LEAST_DIVERGENCE).mean()
-        scale = self.settings.network.image.scale
-        return loss, lambda: slam_of(self.slam_loss, made, scans, scale, self.windows(len(made)))
+        return loss, lambda: slam_of(self.slam_loss, made, scans, self.windows(len(made)))
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans: `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) to the scan, and
         `d_error_m`, the mean error of the distance over ground. And the `variety` of what is made and of the scans,
         `varies_m` and `target_varies_m`."""
-        rows, scale = [], self.settings.network.image.scale
-        images: dict[str, list[Tensor]] = {"varies_m": [], "target_varies_m": []}
+        rows, seen = [], list[tuple[RangeScans, RangeScans]]()
         for index in range(len(scans)):
             true = self._reader.read([scans[index].to(self.device)])
             made = self._made(true)
-            images["varies_m"].append(made.images)
-            images["target_varies_m"].append(true.images)
-            error = (made.images - true.images)[:, 0].abs()[true.masks] * scale
-            row = chamfer_figures(clouds(made, scale)[0], clouds(true, scale)[0])
-            rows.append(row | {"d_error_m": float(error.mean())})
-        return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
+            seen.append((made, true))
+            row = chamfer_figures(made.clouds()[0], true.clouds()[0])
+            rows.append(row | {"d_error_m": float(made.off(true)[true.masks].mean())})
+        found, target = zip(*seen, strict=True)
+        return mean_figures(rows) | {"varies_m": variety(found), "target_varies_m": variety(target)}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """The reconstruction and the scan, as range images show them."""
-        scans, scale = self._reader.read([scan]), self.settings.network.image.scale
-        return {"output": clouds(self._made(scans), scale)[0], "input": clouds(scans, scale)[0]}
+        scans = self._reader.read([scan])
+        return {"output": self._made(scans).clouds()[0], "input": scans.clouds()[0]}
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan and its reconstruction: range images, and seen from above."""
         from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 
         scans = self._reader.read([scan])
-        rows = {
-            "scan": (scans.images[0], scans.masks[0]),
-            "reconstruction": (self._made(scans).images[0], scans.masks[0]),
-        }
-        range_png(path, rows, self.settings.network.image.scale, f"AE_lidar: {scan.sequence}, scan {scan.number}")
+        rows = {"scan": scans, "reconstruction": self._made(scans)}
+        range_png(path, rows, f"AE_lidar: {scan.sequence}, scan {scan.number}")
 
     def _made(self, scans: RangeScans) -> RangeScans:
         """What the network makes of them; a slot has a point where the scan had one."""
-        return RangeScans(self.network(scans.images)[0], scans.masks, scans.frames)
+        return scans.with_images(self.network(scans.images)[0])

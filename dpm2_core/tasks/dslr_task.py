@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,14 +15,7 @@ from torch.nn import functional
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
 from dpm2_core.tasks.chamfer import chamfer_figures
-from dpm2_core.tasks.range_scans import (
-    RangeReader,
-    RangeScans,
-    clouds,
-    image_error,
-    slam_of,
-    variety,
-)
+from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task
 from dpm2_core.tasks.training import mean_figures
@@ -114,7 +108,7 @@ class DslrTask(Task):
         passes = _adversarial_loss(network.discriminator(codes[other], moved), 1.0)
 
         def slam() -> Tensor:
-            return slam_of(self.slam_loss, made, static, self.settings.network.image.scale, self.windows(len(made)))
+            return slam_of(self.slam_loss, made, static, self.windows(len(made)))
 
         weight = self.settings.adversarial / (len(window) if self.settings.adversarial_shared else 1)
         return image_error(made, static.images) + weight * passes, slam
@@ -126,49 +120,48 @@ class DslrTask(Task):
         where something moves, `moved_m`, the mean error of the distance; `input_...` the same without translation.
         And the `variety` of the translated scans and of the twins, `varies_m` and `target_varies_m`.
         """
-        rows, scale = [], self.settings.network.image.scale
-        images: dict[str, list[Tensor]] = {"varies_m": [], "target_varies_m": []}
+        rows, seen = [], list[tuple[RangeScans, RangeScans]]()
         for begin in range(0, len(scans), _BATCH):
             part = [scans[i].to(self.device) for i in range(begin, min(begin + _BATCH, len(scans)))]
             dynamic, static = self._reader.read(part), self._reader.read(part, static=True)
-            made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
-            images["varies_m"].append(made.images)
-            images["target_varies_m"].append(static.images)
+            made = self._made(dynamic)
+            seen.append((made, static))
             for i in range(len(part)):
                 of = static.part(i, i + 1)
-                row = self._compared(made.part(i, i + 1), dynamic.part(i, i + 1), of)
-                before = self._compared(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
+                row = _compared(made.part(i, i + 1), dynamic.part(i, i + 1), of)
+                before = _compared(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
                 rows.append(row | {f"input_{name}": value for name, value in before.items()})
-        return mean_figures(rows) | {name: variety(of, scale) for name, of in images.items()}
-
-    def _compared(self, result: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
-        scale = self.settings.network.image.scale
-        moved = dynamic.masks & static.masks & ((dynamic.images - static.images)[:, 0].abs() * scale > _MOVED)
-        error = (result.images - static.images)[:, 0].abs()[moved] * scale
-        return chamfer_figures(clouds(result, scale)[0], clouds(static, scale)[0]) | {"moved_m": float(error.mean())}
+        found, target = zip(*seen, strict=True)
+        return mean_figures(rows) | {"varies_m": variety(found), "target_varies_m": variety(target)}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, those of the scan that
         stay by `Dslr.in_front`, `input`, the scan, and `target`, its static twin."""
-        scale = self.settings.network.image.scale
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
-        made = RangeScans(self.network(dynamic.images), dynamic.masks, dynamic.frames)
+        made = self._made(dynamic)
         moving = self.network.in_front(dynamic.images[:, 0], made.images[:, 0])
-        kept = RangeScans(dynamic.images, dynamic.masks & ~moving, dynamic.frames)
+        kept = replace(dynamic, masks=dynamic.masks & ~moving)
         kinds = {"output": made, "kept": kept, "input": dynamic, "target": static}
-        return {name: clouds(of, scale)[0] for name, of in kinds.items()}
+        return {name: of.clouds()[0] for name, of in kinds.items()}
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan, its translation and its static twin: range images, and seen from above."""
         from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
 
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
-        rows = {
-            "scan": (dynamic.images[0], dynamic.masks[0]),
-            "translated": (self.network(dynamic.images)[0], dynamic.masks[0]),
-            "static twin": (static.images[0], static.masks[0]),
-        }
-        range_png(path, rows, self.settings.network.image.scale, f"DSLR: {scan.sequence}, scan {scan.number}")
+        rows = {"scan": dynamic, "translated": self._made(dynamic), "static twin": static}
+        range_png(path, rows, f"DSLR: {scan.sequence}, scan {scan.number}")
+
+    def _made(self, dynamic: RangeScans) -> RangeScans:
+        """The translated scans; a slot has a point where the scan had one."""
+        return dynamic.with_images(self.network(dynamic.images))
+
+
+def _compared(result: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
+    """Figures of one scan's translation against its static twin."""
+    moved = dynamic.masks & static.masks & (dynamic.off(static) > _MOVED)
+    error = float(result.off(static)[moved].mean())
+    return chamfer_figures(result.clouds()[0], static.clouds()[0]) | {"moved_m": error}
 
 
 def _adversarial_loss(logits: Tensor, requested: float) -> Tensor:

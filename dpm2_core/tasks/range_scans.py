@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,17 +24,32 @@ class RangeScans:
     """B scans.
 
     Attributes:
-        images: (B, 2, rows, columns) filled, in units of the scale. masks: (B, rows, columns), where there was a point.
-        frames: (sequence, number) of each.
+        images: (B, 2, rows, columns) filled, in units of `scale`, m. masks: (B, rows, columns), where there was a
+            point. frames: (sequence, number) of each.
     """
 
     images: Tensor
     masks: Tensor
     frames: list[tuple[str, int]]
+    scale: float
 
     def part(self, begin: int, end: int) -> RangeScans:
         """Some of them."""
-        return RangeScans(self.images[begin:end], self.masks[begin:end], self.frames[begin:end])
+        chosen = slice(begin, end)
+        return replace(self, images=self.images[chosen], masks=self.masks[chosen], frames=self.frames[chosen])
+
+    def with_images(self, images: Tensor) -> RangeScans:
+        """Others, such as what a network makes of these, in the same slots."""
+        return replace(self, images=images)
+
+    def off(self, true: RangeScans) -> Tensor:
+        """How far the distances over ground are from the true ones, m: (B, rows, columns)."""
+        return (self.images - true.images)[:, 0].abs() * self.scale
+
+    def clouds(self) -> list[Tensor]:
+        """The points (N_b, 3), m, of the slots that had one."""
+        points = to_points(self.images, self.scale)
+        return [cloud[mask.flatten()] for cloud, mask in zip(points, self.masks, strict=True)]
 
 
 class RangeReader:
@@ -58,7 +73,8 @@ class RangeReader:
         """
         pairs = [self._kept_or_made(scan, static) if keep else self._made(scan, static) for scan in scans]
         frames = [(scan.sequence, scan.number) for scan in scans]
-        return RangeScans(torch.stack([image for image, _ in pairs]), torch.stack([mask for _, mask in pairs]), frames)
+        images, masks = (torch.stack(list(part)) for part in zip(*pairs, strict=True))
+        return RangeScans(images, masks, frames, self._settings.scale)
 
     def _kept_or_made(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
         key = (scan.sequence, scan.number, static)
@@ -94,23 +110,18 @@ class RangeReader:
         return fill(image * near, near), mask & near
 
 
-def clouds(scans: RangeScans, scale: float) -> list[Tensor]:
-    """The points (N_b, 3), m, of the slots that had one."""
-    points = to_points(scans.images, scale)
-    return [cloud[mask.flatten()] for cloud, mask in zip(points, scans.masks, strict=True)]
-
-
 def image_error(made: Tensor, true: Tensor) -> Tensor:
     """Sum of the absolute errors of an image (B, 2, rows, columns), the mean over the images; a scalar."""
     return (made - true).abs().sum((1, 2, 3)).mean()
 
 
-def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, windows: Sequence[slice]) -> Tensor:
+def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, windows: Sequence[slice]) -> Tensor:
     """SLAM loss of images (B, 2, rows, columns) against the true ones, m2; the mean over the windows.
 
     Slots that are empty in the true scan do not count.
     """
-    found, requested, weights = to_points(made, scale), to_points(true.images, scale), true.masks.flatten(1).to(made)
+    found, requested = to_points(made, true.scale), to_points(true.images, true.scale)
+    weights = true.masks.flatten(1).to(made)
     values = []
     for part in windows:
         w = weights[part]
@@ -118,7 +129,8 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, scale: float, w
     return torch.stack(values).mean()
 
 
-def variety(images: Sequence[Tensor], scale: float) -> float:
-    """How much the distances in images (B, 2, rows, columns) differ from scan to scan: their standard deviation in a
-    slot, m, the mean over the slots. Zero if a network makes one image of everything."""
-    return float(torch.cat([image[:, 0] for image in images]).std(0, correction=0).mean()) * scale
+def variety(scans: Sequence[RangeScans]) -> float:
+    """How much the distances differ from scan to scan: their standard deviation in a slot, m, the mean over the slots.
+    Zero if a network makes one image of everything."""
+    distances = torch.cat([part.images[:, 0] for part in scans])
+    return float(distances.std(0, correction=0).mean()) * scans[0].scale

@@ -13,10 +13,10 @@ from torch.distributions import Normal, kl_divergence
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import WEIGHTS
-from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder, load
+from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.open import open_scans
-from dpm2_core.tasks.training import draw, measure, new_task, train_task
+from dpm2_core.tasks.training import draw, load_task, measure, new_task, train_task
 
 SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 
@@ -104,13 +104,13 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
         assert task.clouds(scans[0])["output"].shape == task.clouds(scans[0])["input"].shape
     draw(task, scans, 0, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
-    loaded = load(tmp_path / WEIGHTS)
+    loaded = load_task("ae_lidar", tmp_path / WEIGHTS)
     image = torch.rand(1, 2, 16, 64)
-    torch.testing.assert_close(loaded(image)[0], task.network(image)[0])
+    torch.testing.assert_close(loaded.network(image)[0], task.network(image)[0])
 
 
 def test_weights_of_another_task_are_rejected(tmp_path: Path) -> None:
     """The task's name is in the file."""
     shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
     with pytest.raises(UsageError, match="not of ae_lidar"):
-        load(shipped)
+        load_task("ae_lidar", shipped)

@@ -13,7 +13,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.range_image import RangeImageSettings, to_points
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.pairs import SCALE, ImageScan, open_pairs
-from dpm2_core.tasks.range_scans import RangeReader, clouds
+from dpm2_core.tasks.range_scans import RangeReader
 
 
 def images(scans: int, rows: int = 64, columns: int = 512, seed: int = 0) -> np.ndarray:
@@ -74,7 +74,7 @@ def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.masks[0].numpy(), near)
     assert 0 < float(read.images[0, 0].min()) <= float(read.images[0, 0].max()) < 1
     np.testing.assert_allclose(read.images[0, 0].numpy()[near] * 60.0, d[1][near], rtol=1e-5)
-    result = clouds(read, 60.0)[0]  # the columns' own azimuths: the points are where they were
+    result = read.clouds()[0]  # the columns' own azimuths: the points are where they were
     np.testing.assert_allclose(result.numpy(), xyz[1][near][:, :3], atol=1e-3)
 
 
