@@ -25,7 +25,6 @@ TRAIN = "dpm2_core.experiments.task_part:train"
 MEASURE = "dpm2_core.experiments.task_part:measure_on"
 SLAM = "dpm2_core.experiments.task_part:slam_on"
 Arm = Literal["without", "with", "placebo"]
-_PERIOD = 100_000_000  # ns between scans
 
 
 class Training(TypedDict):
@@ -107,12 +106,11 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tupl
     rows = {}
     for run in slam_runs(load_task(task, Path(weights)), Path(drive[0]), drive[1]):
         rows[run.sequence] = figures_of(run)
-        stamps = [(i + 1) * _PERIOD for i in range(len(run.truth))]
         for kind, poses in run.poses.items():
             place = folder / folder_name(run.sequence) / kind
             make_folder(place)
-            write_tum(place / TRAJECTORY, stamps, poses)
-            write_truth(place / TRUTH, stamps, run.truth)
+            write_tum(place / TRAJECTORY, run.stamps, poses)
+            write_truth(place / TRUTH, run.stamps, run.truth)
         advance(len(rows), len(rows))
     return {"sequences": rows, **mean_figures(list(rows.values()))}
 

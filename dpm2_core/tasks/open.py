@@ -26,7 +26,7 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
     path = Path(path)
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
-    found: list[ScanSequence] = [pair for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
+    found: list[ScanSequence] = [*pairs_of(path, sequences)]
     for folder in folders_of(path, sequences):
         found += kitti_runs(folder, path, needs)
     if sequences:
@@ -36,7 +36,13 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
     return TaskScans(found)
 
 
-def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
+def pairs_of(path: Path, sequences: Sequence[str]) -> list[ArrayPair]:
+    """The pairs of arrays in a folder that have one of these numbers; all if none is named."""
+    numbers = {int(name) for name in sequences if name.isdecimal()}
+    return [pair for pair in open_pairs(path) if not sequences or pair.number in numbers]
+
+
+def folders_of(path: Path, sequences: Sequence[str]) -> list[Path]:
     """The sequence folders below `path` that have one of these names, or are below one; all if none is named.
 
     A name is that of the outermost folders that have it: of train/00/sequences/00 and train/01/sequences/00, 00 is the
@@ -50,20 +56,15 @@ def folders_of(path: Path, sequences: Sequence[str] = ()) -> list[Path]:
     return [folder for folder in names if folder in taken]
 
 
-def sequence_names(path: Path, sequences: Sequence[str] = ()) -> list[str]:
+def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
     """What the sequences and pairs that `open_scans` takes are called, however they were named."""
-    pairs = [pair.name for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
+    pairs = [pair.name for pair in pairs_of(path, sequences)]
     return pairs + ["/".join(names_of(folder, path)) for folder in folders_of(path, sequences)]
 
 
 def names_of(folder: Path, path: Path) -> list[str]:
     """The names that a sequence folder below `path` can be chosen by: those of the folders on the way, its own last."""
     return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]
-
-
-def is_among(number: int, sequences: Sequence[str]) -> bool:
-    """Whether a pair of that number is named."""
-    return any(name.isdecimal() and int(name) == number for name in sequences)
 
 
 def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSequence]) -> None:

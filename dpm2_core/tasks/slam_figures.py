@@ -16,8 +16,7 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tasks.open import folders_of, is_among, names_of, open_scans
-from dpm2_core.tasks.pairs import open_pairs
+from dpm2_core.tasks.open import folders_of, names_of, open_scans, pairs_of
 from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.task import Task
 from dpm2_core.tasks.training import mean_figures
@@ -32,6 +31,11 @@ class TaskRun:
     sequence: str
     truth: Array
     poses: dict[str, Array]
+
+    @property
+    def stamps(self) -> list[int]:
+        """Of its scans, ns."""
+        return _stamps(len(self.truth))
 
 
 def slam_figures(task: Task, path: Path, sequences: Sequence[str] = ()) -> dict[str, float]:
@@ -81,9 +85,7 @@ def slam_runs(task: Task, path: Path, sequences: Sequence[str] = ()) -> Iterator
 
 def _with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tuple[str, Array, TaskScans]]:
     """Name, true poses (N, 4, 4) and scans of every sequence."""
-    for pair in open_pairs(path):
-        if sequences and not is_among(pair.number, sequences):
-            continue
+    for pair in pairs_of(path, sequences):
         if (truth := pair.poses) is None:
             raise UsageError(f"{path}: no poses{pair.number}.txt beside the pairs; the SLAM cannot be evaluated")
         yield pair.name, truth, TaskScans([pair])
@@ -98,10 +100,14 @@ def _odometry(clouds: list[np.ndarray]) -> Array:
     """Poses (N, 4, 4) of clouds (M, 3), m."""
     odometry = make_odometry(SlamSettings(registration="geometric"))
     poses = []
-    for i, cloud in enumerate(clouds):
+    for i, (stamp, cloud) in enumerate(zip(_stamps(len(clouds)), clouds, strict=True)):
         points = np.concatenate([cloud, np.zeros((len(cloud), 1))], 1).astype(np.float32)
-        poses.append(odometry.process(Frame(stamp=(i + 1) * _PERIOD, index=i, points=points)).T_odom_lidar)
+        poses.append(odometry.process(Frame(stamp=stamp, index=i, points=points)).T_odom_lidar)
     return np.stack(poses)
+
+
+def _stamps(scans: int) -> list[int]:
+    return [(i + 1) * _PERIOD for i in range(scans)]
 
 
 def _number(value: float | None) -> float:
