@@ -15,7 +15,7 @@ from benchmarks.diffslam_pypose import beside_pypose
 from benchmarks.harness import Options, Report, processors, rounded, torch_threads
 from dpm2_core.config import load_settings
 from dpm2_core.diffslam.clouds import window
-from dpm2_core.diffslam.icp import Cloud, problem
+from dpm2_core.diffslam.icp import Cloud, Matching
 from dpm2_core.diffslam.soft_lm import iterates
 from dpm2_core.diffslam.trajectory_loss import SlamLoss, SlamLossSettings, odometry, trajectory_loss
 from dpm2_core.geometry import se3, se3_torch
@@ -78,7 +78,7 @@ def known_motion(scan: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
     begin = torch.eye(4, dtype=torch.float64)[None, None]
     for gate in ("soft", "none", "gradslam", "paper"):
         icp = with_solver(settings, gate=gate).icp
-        found = torch.cat([T[0] for T in iterates(problem(source, target, icp), begin, icp.solver)]).numpy()
+        found = torch.cat([T[0] for T in iterates(Matching(source, target, icp), begin, icp.solver)]).numpy()
         error = se3.inverse(MOTION) @ found
         meters, radians = np.linalg.norm(error[:, :3, 3], axis=1), se3.angle(error)
         out[gate] = {"mm": [rounded(1e3 * x) for x in meters], "deg": [rounded(x) for x in np.degrees(radians)]}

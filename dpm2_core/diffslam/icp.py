@@ -70,22 +70,17 @@ def register(source: Cloud, target: Cloud, T_init: Tensor, settings: IcpSettings
     Args:
         source, target: B clouds each. T_init: (B, 4, 4), detached.
     """
-    return solve(_Matching(source, target, settings), T_init.detach().double()[:, None], settings.solver)[:, 0]
+    return solve(Matching(source, target, settings), T_init.detach().double()[:, None], settings.solver)[:, 0]
 
 
 @torch.no_grad()
 def matched(source: Cloud, target: Cloud, T: Tensor, settings: IcpSettings) -> Tensor:
     """(B,) share of the source's weight that has a counterpart at T_target_source (B, 4, 4); without gradient."""
-    return problem(source, target, settings).associate(T[:, None]).total / source.weights.sum(1).clamp(min=1e-9)
+    return Matching(source, target, settings).associate(T[:, None]).total / source.weights.sum(1).clamp(min=1e-9)
 
 
-def problem(source: Cloud, target: Cloud, settings: IcpSettings) -> _Matching:
-    """What `register` solves, for `soft_lm.iterates`."""
-    return _Matching(source, target, settings)
-
-
-class _Matching:
-    """`soft_lm.Problem`: matches each point of the source to the nearest of the target."""
+class Matching:
+    """What `register` solves, a `soft_lm.Problem`: each point of the source is matched to the nearest of the target."""
 
     def __init__(self, source: Cloud, target: Cloud, settings: IcpSettings) -> None:
         self._source, self._target, self._settings = source, target, settings

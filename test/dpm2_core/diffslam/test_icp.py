@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpm2_core.diffslam.icp import Cloud, IcpSettings, problem, register
+from dpm2_core.diffslam.icp import Cloud, IcpSettings, Matching, register
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, iterates
 from dpm2_core.geometry import se3, se3_torch
 
@@ -50,7 +50,7 @@ def test_printed_gate_does_not_converge_and_gradslam_hides_it(scans: list[Tensor
 
 def test_error_falls_with_every_iteration(scans: list[Tensor], motion: Tensor) -> None:
     """Until it is below 0.1 mm."""
-    solving = problem(Cloud(scans[1][None]), Cloud(scans[0][None]), settings())
+    solving = Matching(Cloud(scans[1][None]), Cloud(scans[0][None]), settings())
     errors = [error(T[0, 0], motion)[0] for T in iterates(solving, EYE[:, None], SoftLmSettings())]
     assert all(b < a for a, b in pairwise(errors) if a > 1e-4)
 
