@@ -18,6 +18,7 @@ import numpy as np
 from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge
+from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.files import atomic_write, make_folder
 from dpm2_core.frame import Array
 
@@ -95,8 +96,8 @@ def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
     Raises:
         Dpm2Error: it could not be written.
     """
-    known = np.isfinite(poses).all((1, 2))
-    write_tum(path, np.asarray(stamps, np.int64)[known], poses[known])
+    there = known(poses)
+    write_tum(path, np.asarray(stamps, np.int64)[there], poses[there])
 
 
 def remove_results(folder: Path, *names: str) -> None:

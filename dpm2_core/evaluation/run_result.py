@@ -169,7 +169,7 @@ class Result:
         if truth is None:
             return None
         if not isinstance(self.ground_truth, Trajectory):
-            if np.isfinite(truth[:, 0, 0]).sum() < 2:
+            if known(truth).sum() < 2:
                 return None
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)

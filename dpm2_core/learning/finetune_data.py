@@ -11,6 +11,7 @@ import numpy as np
 
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.pair_set import FAR, NEAR, has_pair
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
@@ -69,9 +70,9 @@ def prepare(
             check_same(out / DRIVES / name, asked)
             continue
         referenced = refer(source, slam, partial(advance, f"{name}: reference by SLAM"))
-        known = np.flatnonzero(np.isfinite(referenced.poses[:, 0, 0]))
-        if len(known) < 2 * settings.frames:
-            raise UsageError(f"{source.name}: the SLAM followed {len(known)} of {len(source)} scans; nothing to learn")
+        followed = int(known(referenced.poses).sum())
+        if followed < 2 * settings.frames:
+            raise UsageError(f"{source.name}: the SLAM followed {followed} of {len(source)} scans; nothing to learn")
         cut = round(len(source) * (1 - settings.held_out))
         packing = partial(advance, f"{name}: packing")
         if _is_measurable(referenced.poses[cut:]):
