@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.evaluation.canvas import new_figure, save_png
+from dpm2_core.evaluation.canvas import BACKGROUND, INK, new_figure, save_png
 from dpm2_core.extras import needs
 
-_BACKGROUND, _INK, _WITH_CAMERA, _WITHOUT = "#0d1117", "#c9d1d9", "#ff9f1c", "#3d4f8f"
+_WITH_CAMERA, _WITHOUT = "#ff9f1c", "#3d4f8f"
 _VERDICTS = {
     "right": ("#b7dfb0", "right"),
     "said": ("#f6df9a", "wrong, and says so"),
@@ -30,18 +30,18 @@ def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, 
         Dpm2Error: the file could not be written.
     """
     rows = [(kind, method, figures) for kind, methods in kinds.items() for method, figures in methods.items()]
-    figure = new_figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=_BACKGROUND)
-    axes = figure.add_axes((0.38, 0.12, 0.58, 0.8), facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(9, 0.36 * len(rows) + 1.4), dpi=120, facecolor=BACKGROUND)
+    axes = figure.add_axes((0.38, 0.12, 0.58, 0.8), facecolor=BACKGROUND)
     for y, (_, method, figures) in enumerate(rows):
         axes.barh(y, 100 * figures["success"], color=_WITH_CAMERA if "with camera" in method else _WITHOUT)
         median = figures["median_m"]
         message = "no result for most" if median is None else f"{median:.2f} m"
-        axes.text(100 * figures["success"] + 1, y, message, color=_INK, va="center", fontsize=8)
-    axes.set_yticks(range(len(rows)), [f"{kind}: {method}" for kind, method, _ in rows], color=_INK, fontsize=8)
+        axes.text(100 * figures["success"] + 1, y, message, color=INK, va="center", fontsize=8)
+    axes.set_yticks(range(len(rows)), [f"{kind}: {method}" for kind, method, _ in rows], color=INK, fontsize=8)
     axes.set(xlim=(0, 115), ylim=(len(rows) - 0.4, -0.6))
-    axes.set_xlabel("pairs registered, %; median error beside the bar", color=_INK)
-    axes.tick_params(colors=_INK)
-    figure.text(0.02, 0.95, title, color=_INK, fontsize=11)
+    axes.set_xlabel("pairs registered, %; median error beside the bar", color=INK)
+    axes.tick_params(colors=INK)
+    figure.text(0.02, 0.95, title, color=INK, fontsize=11)
     save_png(path, figure)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""matplotlib without a window: a new figure, and a figure as a file."""
+"""matplotlib without a window: a new figure, a figure as a file, and the colors that pictures have in common."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from dpm2_core.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+BACKGROUND, INK, ESTIMATE = "#0d1117", "#c9d1d9", "#ff9f1c"
+"""Dark ground, what is written on it, and what was found."""
 
 
 def new_figure(**attributes: Any) -> Figure:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from dpm2_core.evaluation.canvas import new_figure, save_png
+from dpm2_core.evaluation.canvas import BACKGROUND, ESTIMATE, INK, new_figure, save_png
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
 from dpm2_core.extras import needs
@@ -20,7 +20,7 @@ from dpm2_core.frame import Array, Frame, Points
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_BACKGROUND, _INK, _ESTIMATE, _TRUTH = "#0d1117", "#c9d1d9", "#ff9f1c", "#ffffff"
+_TRUTH = "#ffffff"
 _HEIGHTS = ("#3d4f8f", "#2f8f9d", "#7fd1ae", "#f6f3c0")  # ground to roofs
 _PIXELS = 1100  # of the map raster along its longer side: about 0.15 m on a street, where voxels are 0.2 m
 _MARGIN = 45.0  # m of map shown around the trajectory; beyond it a LiDAR map is mostly stray points
@@ -43,22 +43,20 @@ def trajectory_png(
     est = est[known(est)]
     low, high = _bounds(est[:, :3, 3], cloud)
     width, height = high - low
-    figure = new_figure(
-        figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=_BACKGROUND
-    )
-    axes = figure.add_axes((0.01, 0.01, 0.98, 0.92), facecolor=_BACKGROUND, aspect="equal")
+    figure = new_figure(figsize=(12, float(np.clip(12 * height / width, 3.5, 12)) + 0.8), dpi=150, facecolor=BACKGROUND)
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.92), facecolor=BACKGROUND, aspect="equal")
     axes.set_axis_off()
     if cloud is not None and len(cloud):
         axes.imshow(_raster(cloud, est[:, :3, 3], low, high), extent=(low[0], high[0], low[1], high[1]), origin="lower")
     if truth is not None:
         axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.2, label="ground truth (aligned)", zorder=4)
-    axes.plot(est[:, 0, 3], est[:, 1, 3], color=_ESTIMATE, lw=3.0, label="estimate", zorder=3)
-    axes.plot(*est[0, :2, 3], "o", color=_ESTIMATE, ms=8, mec=_BACKGROUND, label="start", zorder=5)
-    axes.plot(*est[-1, :2, 3], "s", color=_ESTIMATE, ms=8, mec=_BACKGROUND, label="end", zorder=5)
+    axes.plot(est[:, 0, 3], est[:, 1, 3], color=ESTIMATE, lw=3.0, label="estimate", zorder=3)
+    axes.plot(*est[0, :2, 3], "o", color=ESTIMATE, ms=8, mec=BACKGROUND, label="start", zorder=5)
+    axes.plot(*est[-1, :2, 3], "s", color=ESTIMATE, ms=8, mec=BACKGROUND, label="end", zorder=5)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.legend(loc="upper right", facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK, framealpha=0.7)
+    axes.legend(loc="upper right", facecolor=BACKGROUND, edgecolor="none", labelcolor=INK, framealpha=0.7)
     _scale_bar(axes, low, high)
-    figure.text(0.02, 0.955, title, color=_INK, fontsize=14)
+    figure.text(0.02, 0.955, title, color=INK, fontsize=14)
     save_png(path, figure)
 
 
@@ -68,16 +66,16 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
     Raises:
         Dpm2Error: the file could not be written.
     """
-    figure = new_figure(figsize=(9, 9), dpi=130, facecolor=_BACKGROUND)
-    axes = figure.add_axes((0.07, 0.05, 0.9, 0.9), facecolor=_BACKGROUND, aspect="equal")
+    figure = new_figure(figsize=(9, 9), dpi=130, facecolor=BACKGROUND)
+    axes = figure.add_axes((0.07, 0.05, 0.9, 0.9), facecolor=BACKGROUND, aspect="equal")
     if truth is not None:
         axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.5, label="ground truth", zorder=9)
     for name, way in ways.items():
         axes.plot(way[:, 0], way[:, 1], lw=1.5, label=name)
-    axes.tick_params(colors=_INK)
-    axes.set_xlabel("m", color=_INK)
-    axes.legend(facecolor=_BACKGROUND, edgecolor="none", labelcolor=_INK)
-    figure.text(0.07, 0.965, title, color=_INK, fontsize=13)
+    axes.tick_params(colors=INK)
+    axes.set_xlabel("m", color=INK)
+    axes.legend(facecolor=BACKGROUND, edgecolor="none", labelcolor=INK)
+    figure.text(0.07, 0.965, title, color=INK, fontsize=13)
     save_png(path, figure)
 
 
@@ -88,16 +86,16 @@ def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = ""
         Dpm2Error: the file could not be written.
     """
     rows = 2 if before.images else 1
-    figure = new_figure(figsize=(12, 6.4 * rows - 3 * (rows - 1)), dpi=110, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(12, 6.4 * rows - 3 * (rows - 1)), dpi=110, facecolor=BACKGROUND)
     for column, frame in enumerate((before, after)):
-        axes = figure.add_subplot(rows, 2, 1 + column, facecolor=_BACKGROUND, aspect="equal")
-        axes.scatter(frame.points[:, 0], frame.points[:, 1], s=0.15, c=_ESTIMATE, linewidths=0)
+        axes = figure.add_subplot(rows, 2, 1 + column, facecolor=BACKGROUND, aspect="equal")
+        axes.scatter(frame.points[:, 0], frame.points[:, 1], s=0.15, c=ESTIMATE, linewidths=0)
         axes.set(xlim=(-40, 40), ylim=(-40, 40), xticks=[], yticks=[])
         if frame.images:
-            axes = figure.add_subplot(rows, 2, 3 + column, facecolor=_BACKGROUND)
+            axes = figure.add_subplot(rows, 2, 3 + column, facecolor=BACKGROUND)
             axes.imshow(frame.images[0].pixels)
             axes.set_axis_off()
-    figure.suptitle(title, color=_INK)
+    figure.suptitle(title, color=INK)
     save_png(path, figure)
 
 
@@ -131,7 +129,7 @@ def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray
 
     cloud = cloud[np.logical_and.reduce((cloud[:, :2] > low) & (cloud[:, :2] < high), axis=1), :3]
     if not len(cloud):
-        return np.full((1, 1, 3), to_rgb(_BACKGROUND))
+        return np.full((1, 1, 3), to_rgb(BACKGROUND))
     nearest = KDTree(cloud).query(cloud[:: len(cloud) // 2000 + 1], k=[2])[0]
     pixel = max((high - low).max() / _PIXELS, np.median(np.minimum(nearest, 1.0)))  # inf for a single point
     width, height = np.ceil((high - low) / pixel).astype(int)
@@ -145,7 +143,7 @@ def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray
     heights = LinearSegmentedColormap.from_list("heights", _HEIGHTS)
     hue = heights(np.clip((top - bottom) / max(ceiling - bottom, 1e-3), 0, 1))[:, :3]
     strength = np.where(count > 0, 0.4 + 0.6 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
-    return (np.array(to_rgb(_BACKGROUND)) * (1 - strength) + hue * strength).reshape(height, width, 3)
+    return (np.array(to_rgb(BACKGROUND)) * (1 - strength) + hue * strength).reshape(height, width, 3)
 
 
 def _scale_bar(axes: Axes, low: Array, high: Array) -> None:
@@ -154,5 +152,5 @@ def _scale_bar(axes: Axes, low: Array, high: Array) -> None:
     decade = 10.0 ** np.floor(np.log10(width / 6))
     length = decade * max(step for step in (1, 2, 5) if step * decade <= width / 6)
     x, y = low + 0.03 * width
-    axes.plot([x, x + length], [y, y], color=_INK, lw=3, solid_capstyle="butt", zorder=5)
-    axes.text(x + length / 2, y + 0.008 * width, f"{length:g} m", color=_INK, ha="center", va="bottom", zorder=5)
+    axes.plot([x, x + length], [y, y], color=INK, lw=3, solid_capstyle="butt", zorder=5)
+    axes.text(x + length / 2, y + 0.008 * width, f"{length:g} m", color=INK, ha="center", va="bottom", zorder=5)

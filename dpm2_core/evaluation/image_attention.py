@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.canvas import new_figure, save_png
+from dpm2_core.evaluation.canvas import BACKGROUND, ESTIMATE, INK, new_figure, save_png
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry.rays import project
 from dpm2_core.network.attention import Attention
@@ -30,8 +30,6 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.network.spatial import seen_from
 from dpm2_core.network.views import collate_views
-
-_INK, _CHOSEN = "#c9d1d9", "#ff9f1c"
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +130,12 @@ def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str =
     Raises:
         Dpm2Error: the file could not be written.
     """
-    figure = new_figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor="#0d1117")
+    figure = new_figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor=BACKGROUND)
     for row, (name, attention) in enumerate(looked.items()):
-        axes = figure.add_subplot(len(looked), 1, 1 + row, facecolor="#0d1117")
+        axes = figure.add_subplot(len(looked), 1, 1 + row, facecolor=BACKGROUND)
         draw_attention(axes, attention)
-        axes.set_title(f"{name}: {axes.get_title()}", color=_INK)
-    figure.suptitle(title, color=_INK)
+        axes.set_title(f"{name}: {axes.get_title()}", color=INK)
+    figure.suptitle(title, color=INK)
     save_png(path, figure)
 
 
@@ -151,9 +149,9 @@ def draw_attention(axes: Any, looked: ImageAttention) -> None:
     near = np.linalg.norm(looked.points, axis=1)
     axes.scatter(*looked.uv[looked.seen].T, c=near[looked.seen], cmap="viridis_r", s=14, linewidths=0)
     x, y = looked.uv[looked.chosen]
-    axes.plot(x, y, "o", markersize=16, markerfacecolor="none", markeredgecolor=_CHOSEN, markeredgewidth=2)
+    axes.plot(x, y, "o", markersize=16, markerfacecolor="none", markeredgecolor=ESTIMATE, markeredgewidth=2)
     axes.set_title(
         f"reference points, near ones light; attention of point {looked.chosen}, {near[looked.chosen]:.1f} m away",
-        color=_INK,
+        color=INK,
     )
     axes.set_axis_off()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from dpm2_core.evaluation.canvas import BACKGROUND, ESTIMATE, INK, new_figure
 from dpm2_core.evaluation.image_attention import ImageAttention, draw_attention
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
@@ -20,7 +21,7 @@ from dpm2_core.network.model import DeepPointMap2
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BACKGROUND, _INK, _TARGET, _SOURCE = "#0d1117", "#c9d1d9", "#3f7fbf", "#ff9f1c"
+_TARGET, _SOURCE = "#3f7fbf", ESTIMATE
 _REACH = 50.0  # m of each scan that is drawn around its sensor
 
 
@@ -41,7 +42,7 @@ def matches_png(
     Raises:
         Dpm2Error: too few points, or the file could not be written.
     """
-    _write(path, [_figure(network, source, target, title, looked)])
+    compared_png(path, [(title, network, looked)], source, target)
 
 
 def compared_png(
@@ -58,7 +59,16 @@ def compared_png(
     Raises:
         Dpm2Error: too few points, or the file could not be written.
     """
-    _write(path, [_figure(network, source, target, title, looked) for title, network, looked in networks])
+    with needs("plot", "drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    images = []
+    for title, network, looked in networks:
+        canvas = FigureCanvasAgg(_figure(network, source, target, title, looked))
+        canvas.draw()
+        images.append(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])  # BGR
+    with atomic_write(path, "wb") as file:
+        file.write(cv2.imencode(".png", np.vstack(images))[1].tobytes())  # all are equally wide
 
 
 def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, looked: ImageAttention | None) -> Figure:
@@ -67,18 +77,17 @@ def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, lo
     at_source, at_target, confidence = network.matches(of_source, of_target)
     with needs("plot", "drawing"):
         from matplotlib.collections import LineCollection  # half a second to import: not for every command
-        from matplotlib.figure import Figure
 
     low = 0.0 if looked is None else 0.43  # the image's fraction of the height, below the scans
-    figure = Figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=_BACKGROUND)
+    figure = new_figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=BACKGROUND)
 
     def place(left: float, width: float) -> tuple[float, float, float, float]:
         return left, low + 0.02 * (1 - low), width, 0.88 * (1 - low)
 
-    beside = figure.add_axes(place(0.01, 0.63), facecolor=_BACKGROUND, aspect="equal")
-    above = figure.add_axes(place(0.66, 0.33), facecolor=_BACKGROUND, aspect="equal")
+    beside = figure.add_axes(place(0.01, 0.63), facecolor=BACKGROUND, aspect="equal")
+    above = figure.add_axes(place(0.66, 0.33), facecolor=BACKGROUND, aspect="equal")
     if looked is not None:
-        draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=_BACKGROUND), looked)
+        draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=BACKGROUND), looked)
     right = np.array([2.1 * _REACH, 0.0])
     for axes, points, shift, color in (
         (beside, target.points, np.zeros(2), _TARGET),
@@ -100,27 +109,13 @@ def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, lo
     beside.set(xlim=(-_REACH, right[0] + _REACH), ylim=(-_REACH, _REACH))
     above.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH))
     bar = figure.colorbar(lines, ax=beside, fraction=0.02, pad=0.01)
-    bar.set_label("confidence of a match", color=_INK)
-    bar.ax.tick_params(colors=_INK)
+    bar.set_label("confidence of a match", color=INK)
+    bar.ax.tick_params(colors=INK)
     meters, degrees = se3.magnitude(result.T_target_source)
     outcome = (
         f"{meters:.2f} m, {degrees:.2f} deg apart; confidence {result.confidence:.2f}, rmse {result.rmse:.2f} m"
         if result.ok
         else f"not registered: {result.reason}"
     )
-    figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=_INK, fontsize=13)
+    figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=INK, fontsize=13)
     return figure
-
-
-def _write(path: Path | str, figures: Sequence[Figure]) -> None:
-    """All figures, which are equally wide, below each other."""
-    with needs("plot", "drawing"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    images = []
-    for figure in figures:
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        images.append(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])  # BGR
-    with atomic_write(path, "wb") as file:
-        file.write(cv2.imencode(".png", np.vstack(images))[1].tobytes())
