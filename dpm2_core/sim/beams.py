@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Array
+from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.settings import LidarConfig
-
-Array = NDArray[np.float64]
-Float = NDArray[np.float32]
 
 _CAR_BODY = (1.5, 1.67, 0.85, 0.56)
 """Edges of the roof ahead, behind and aside, and the sensor's height over it, m: hides what it hides on KITTI's car."""

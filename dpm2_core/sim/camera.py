@@ -9,19 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Camera
+from dpm2_core.frame import Array, Camera
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lens import through_lens
 from dpm2_core.sim.light import Light
 from dpm2_core.sim.materials import Material
-from dpm2_core.sim.mesh import Hits, Mesh, rotated
+from dpm2_core.sim.mesh import Float, Hits, Mesh, rotated
 from dpm2_core.sim.settings import CameraConfig
 from dpm2_core.sim.shading import Surface
 from dpm2_core.sim.traffic import DynamicObjects
 from dpm2_core.sim.world import World
 
-Array = NDArray[np.float64]
-Float = NDArray[np.float32]
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
 _RESPONSE = 255 * np.minimum(np.arange(4096, dtype=np.float32) / 4096 * 1.25, 1) ** np.float32(1 / 2.2)
 _HAZE = np.array([0.72, 0.78, 0.86], np.float32)

@@ -12,10 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
 from dpm2_core.files import file_digest, new_folder
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
@@ -25,7 +25,6 @@ from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
-Array = NDArray[np.float64]
 NOTE = "dpm2_sim.json"
 OVERLAP = 16.0
 """How far a closed drive goes on beyond its start, m."""

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 
-Array = NDArray[np.float64]
 RoomKind = Literal["room", "corridor", "hall", "stairs", "deck"]
 _NARROW = 2.4
 """Least width of a room that is no corridor, m."""

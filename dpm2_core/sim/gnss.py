@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.settings import GnssConfig
 
-Array = se3.Array
 _OFFSET = 0.03  # s after the first scan: a fix comes between two scans
 
 

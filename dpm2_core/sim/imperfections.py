@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.settings import LidarConfig
 
-Float = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 _EDGE = (0.2, 1.5)
 """Two surfaces so far apart along the beam, m, answer one pulse as one surface between them."""

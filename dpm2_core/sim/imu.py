@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim.settings import ImuConfig
 
-Array = se3.Array
 GRAVITY = 9.81
 
 

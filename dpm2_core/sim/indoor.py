@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dpm2_core.frame import Array
 from dpm2_core.sim.buildings import WALL_COLORS
 from dpm2_core.sim.floorplan import AISLE, ROW, FloorPlan, Room
 from dpm2_core.sim.materials import Label, Material, Surface
@@ -16,7 +16,6 @@ from dpm2_core.sim.mesh import Mesh, merge, placed, pose
 from dpm2_core.sim.shapes import box, rod
 from dpm2_core.sim.vehicles import car
 
-Array = NDArray[np.float64]
 _WALL = 0.07
 """Half of the thickness of a wall: what each room contributes, m."""
 _FREE = 0.55

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from dpm2_core.frame import Array
 from dpm2_core.sim import plants
 from dpm2_core.sim.buildings import building
 from dpm2_core.sim.furniture import FURNITURE, street_box
@@ -21,7 +22,6 @@ from dpm2_core.sim.shapes import box, leaves
 from dpm2_core.sim.terrain import RESOLUTION, Kerbline, Terrain, kerbside_ribbon
 from dpm2_core.sim.vehicles import car, truck
 
-Array = NDArray[np.float64]
 CLEAR_OF_DRIVE = 2.15
 """Nothing as low as a car reaches nearer to the path of the car's middle than this (parked cars: their middle), m."""
 

@@ -9,18 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.sim.beams import Beams
 from dpm2_core.sim.imperfections import Returns, SensorErrors
 from dpm2_core.sim.materials import DARK, MISS, MOVING_LABEL, REFLECTANCE, RETRO, ROUGHNESS, Label
-from dpm2_core.sim.mesh import Hits, Mesh, rotated
+from dpm2_core.sim.mesh import Float, Hits, Mesh, rotated
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.shading import road_marking
 from dpm2_core.sim.world import World
-
-Array = NDArray[np.float64]
-Float = NDArray[np.float32]
 
 
 @dataclass(eq=False)

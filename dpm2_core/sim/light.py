@@ -6,12 +6,10 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.sim.materials import Material
+from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.shading import Surface, Textures
-
-Float = NDArray[np.float32]
 
 
 class Light:
@@ -25,8 +23,7 @@ class Light:
     def __init__(self, seed: int, tunnel: bool) -> None:
         rng = np.random.default_rng([seed, 78])
         elevation, azimuth = np.radians(rng.uniform(22, 60)), rng.uniform(0, 2 * np.pi)
-        level = np.cos(elevation)
-        self.sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)
+        self.sun = _towards(elevation, azimuth)
         self.overcast = float(rng.beta(0.5, 1.2))
         warm = np.array([1.0, 0.95, 0.86], np.float32)
         self.direct = warm * np.float32(2.1 * (1 - 0.9 * self.overcast))
@@ -42,8 +39,7 @@ class Light:
         out = copy.copy(self)
         elevation = np.clip(np.arcsin(self.sun[2]) - np.radians(5 * hours), np.radians(8), np.radians(75))
         azimuth = np.arctan2(self.sun[1], self.sun[0]) - np.radians(15 * hours)
-        level = np.cos(elevation)
-        out.sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)
+        out.sun = _towards(elevation, azimuth)
         return out
 
     def sky(self, view: Float) -> Float:
@@ -70,3 +66,9 @@ class Light:
         facing = np.where(leaf, 0.35 * lit + 0.5 * facing, facing)
         open_sky = 0.6 + 0.4 * surface.normal[:, 2]
         return facing[:, None] * self.direct + open_sky[:, None] * self.ambient
+
+
+def _towards(elevation: float, azimuth: float) -> Float:
+    """(3,) unit vector there; both rad."""
+    level = np.cos(elevation)
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)

@@ -16,7 +16,6 @@ class Label(IntEnum):
 
     OUTLIER = 1
     CAR = 10
-    BICYCLE = 11
     TRUCK = 18
     PERSON = 30
     BICYCLIST = 31

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 from dpm2_core.sim.floorplan import FloorPlan, car_park, office
 from dpm2_core.sim.settings import Preset
 
-Array = NDArray[np.float64]
 ROAD_KINDS = ("straight", "loop", "figure8", "random")
 STEP = 0.5
 """Distance of the samples of a path, m."""

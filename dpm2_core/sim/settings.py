@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,7 @@ from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 
 PresetName = Literal["city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park"]
-PRESET_NAMES: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park")
+PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
 
 
 class Imperfections(Settings):

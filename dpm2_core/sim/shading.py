@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.sim.materials import Material
+from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.terrain import Terrain
 
-Float = NDArray[np.float32]
 Int = NDArray[np.integer]
 _TILE = 512
 

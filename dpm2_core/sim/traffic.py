@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpm2_core.sim.mesh import Hits, Mesh, Scene, merge, placed, pose
+from dpm2_core.frame import Array
+from dpm2_core.sim.mesh import Float, Hits, Mesh, Scene, merge, placed, pose
 from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import Preset
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.vehicles import car, cyclist, person, truck
 
-Array = NDArray[np.float64]
-Float = NDArray[np.float32]
 SIGHT = 110.0
 """Dynamic objects farther from the sensor are left out, m."""
 GAP = 6.5

@@ -11,10 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim import sections
 from dpm2_core.sim.indoor import Interior
@@ -25,8 +26,6 @@ from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.settings import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.terrain import Terrain
 from dpm2_core.sim.traffic import DynamicObjects, Traffic, make_traffic
-
-Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)
