@@ -71,7 +71,7 @@ def _lap() -> SimulatedDrive:
     again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
     lap = way[(way > 50) & (again < 10)]
     end = int(np.searchsorted(way, _LAPS * lap[0])) if len(lap) else len(way)
-    drive.times, drive.T_world_lidar = drive.times[:end:_EVERY], drive.T_world_lidar[:end:_EVERY]
+    drive.times, drive.poses = drive.times[:end:_EVERY], drive.poses[:end:_EVERY]
     return drive
 
 

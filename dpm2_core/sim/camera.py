@@ -54,7 +54,7 @@ def render(
     """
     light = world.light.later(hours)
     eye = T_world_cam[:3, 3].astype(np.float32)
-    dynamic_objects = world.dynamic_objects(time, eye)
+    dynamic_objects = world.traffic.dynamic_objects(time, eye)
     radiance = np.empty((config.height, config.width, 3), np.float32)
     for top in range(0, config.height, _BAND):  # bands fit the processor's cache: a sixth less work
         rows = slice(top, min(top + _BAND, config.height))

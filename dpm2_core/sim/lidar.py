@@ -91,7 +91,7 @@ class Lidar:
         self.errors.finish(twin, draws)
         static = self._points(aim, twin, believed)
         moving = np.zeros(len(directions), bool)
-        if dynamic_objects := world.dynamic_objects(time, T_world_lidar[:3, 3]):
+        if dynamic_objects := world.traffic.dynamic_objects(time, T_world_lidar[:3, 3]):
             one_eye = twist is None and not any(self.config.real.emitters)
             hits, toward = dynamic_objects.cast(origins[0] if one_eye else origins, directions, self.config.range)
             near = hits.distance < still.distance[toward]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,15 +26,35 @@ _FASTEST = np.radians(100.0)  # rad/s
 _RAMP = 0.25  # s in which it begins to turn
 
 
-class SimulatedDrive:
-    """A `data.source.Source`: the drive along a road, with traffic, at 10 Hz, LiDAR alone.
+class _Simulated(ABC):
+    """A `data.source.Source` of a LiDAR alone.
 
     Attributes:
-        world: what it drives through. T_world_lidar: (N, 4, 4).
+        world: what it drives through. times: (N,) s. poses: (N, 4, 4) T_world_lidar at these times, exact.
     """
 
     T_cam_lidar = None
     truth = "simulation"
+    times: Array
+    poses: Array
+
+    def __init__(self, name: str, world: World) -> None:
+        self.name, self.world, self.notes = name, world, list[str]()
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @abstractmethod
+    def frame(self, i: int) -> Frame:
+        """Frame i, the same whenever it is asked for."""
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1, simulated ahead in another thread."""
+        return prefetch(map(self.frame, range(len(self))[start:stop]))
+
+
+class SimulatedDrive(_Simulated):
+    """The drive along a road, with traffic, at 10 Hz."""
 
     def __init__(self, road: str, preset: PresetName = "suburb", seed: int = 0, name: str = "") -> None:
         """`road`, `preset` and `seed` as in `build_world`, `name` what reports call it.
@@ -41,32 +62,18 @@ class SimulatedDrive:
         Raises:
             UsageError: no such road or preset.
         """
-        self.name = name or f"{road} {preset} {seed}"
-        self.notes: list[str] = []
-        self.world = build_world(road, preset, seed)
+        super().__init__(name or f"{road} {preset} {seed}", build_world(road, preset, seed))
         self.times = self.world.road.times
         self._lidar = Lidar(LidarConfig())
         height = self._lidar.config.height
-        self.T_world_lidar: Array = np.stack([self.world.drive_pose(float(t), height) for t in self.times])
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    @property
-    def poses(self) -> Array:
-        """(N, 4, 4) T_world_lidar, exact."""
-        return self.T_world_lidar
+        self.poses = np.stack([self.world.drive_pose(float(t), height) for t in self.times])
 
     def frame(self, i: int) -> Frame:
-        """Frame i, the same whenever it is asked for."""
+        """As `_Simulated`."""
         time = float(self.times[i])
         rng = np.random.default_rng([self.world.seed, _STREAM, i])
-        scan = self._lidar.scan(self.world, self.T_world_lidar[i], time, rng)
+        scan = self._lidar.scan(self.world, self.poses[i], time, rng)
         return Frame(round(time * 1e9), scan.points, index=i)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1, simulated ahead in another thread."""
-        return prefetch(map(self.frame, range(len(self))[start:stop]))
 
 
 @dataclass(frozen=True)
@@ -99,16 +106,10 @@ RIDES = {
 """On a car, carried by a walker, waved by hand, on four legs that trot, and below a drone."""
 
 
-class TurningRobot:
-    """A `data.source.Source`: a robot that drives along a road and turns fast. Scans are as a driver delivers them,
-    with the time of each point, from poses that change within a sweep; an IMU measures beside.
+class TurningRobot(_Simulated):
+    """A robot that drives along a road and turns fast. Scans are as a driver delivers them, with the time of each
+    point, from poses that change within a sweep, stamped in its middle; an IMU measures beside."""
 
-    Attributes:
-        times, T_world_lidar: (N,) s and (N, 4, 4) at the stamps, in the middle of the sweeps.
-    """
-
-    T_cam_lidar = None
-    truth = "simulation"
     PERIOD = 0.1
     """s between two scans."""
 
@@ -121,29 +122,21 @@ class TurningRobot:
         imu: ImuConfig | None = None,
     ) -> None:
         """Stands for 1 s, then drives, slower in curves: but for its shakes no turn is faster than 100 deg/s."""
-        self.name, self.notes, self._count = f"{world.preset} {world.seed}", list[str](), frames
         rng = np.random.default_rng([world.seed, _IMU_STREAM])
         end = frames * self.PERIOD + 1
-        self._world = replace(world, road=_robot_progress(world.road, end, ride, rng))
+        world = replace(world, road=_robot_progress(world.road, end, ride, rng))
+        super().__init__(f"{world.preset} {world.seed}", world)
         self._lidar = Lidar(lidar)
         at = np.arange(0.0, end, _STEP)
-        level = np.stack([self._world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
+        level = np.stack([self.world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
         self._T = level @ ride.shaken(at)
-        self.times: Array = 0.5 + np.arange(frames, dtype=np.float64) * self.PERIOD
-        self.T_world_lidar: Array = self.pose(self.times)
+        self.times = 0.5 + np.arange(frames, dtype=np.float64) * self.PERIOD
+        self.poses = self.pose(self.times)
         self._imu = None if imu is None else Imu(imu, rng)
         if self._imu is not None:
             times = self._imu.times(0.1, end - 0.1)
             self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(times, self.pose))
             self._stamps = np.round(times * 1e9).astype(np.int64)
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def poses(self) -> Array:
-        """(N, 4, 4) T_world_lidar, exact."""
-        return self.T_world_lidar
 
     def pose(self, times: Array) -> Array:
         """T_world_lidar (M, 4, 4) at times (M,) s."""
@@ -152,11 +145,11 @@ class TurningRobot:
         return np.asarray(self._T[k] @ se3.exp(part * se3.log(se3.inverse(self._T[k]) @ self._T[k + 1])))
 
     def frame(self, i: int) -> Frame:
-        """Frame i, the same whenever it is asked for; its samples are those since the sweep before."""
-        time, T, offsets = float(self.times[i]), self.T_world_lidar[i], self._lidar.beams.column_time.astype(float)
+        """As `_Simulated`; its samples are those since the sweep before."""
+        time, T, offsets = float(self.times[i]), self.poses[i], self._lidar.beams.column_time.astype(float)
         turning = se3.inverse(T) @ self.pose(time + offsets)
-        rng = np.random.default_rng([self._world.seed, _STREAM, i])
-        scan = self._lidar.scan(self._world, T, time, rng, turning)
+        rng = np.random.default_rng([self.world.seed, _STREAM, i])
+        scan = self._lidar.scan(self.world, T, time, rng, turning)
         stamp, imu = round(time * 1e9), None
         if self._imu is not None:
             end = time + float(offsets.max())
@@ -165,10 +158,6 @@ class TurningRobot:
             )
             imu = Inertial(self._stamps[first:last], self._rates[first:last], self._forces[first:last])
         return Frame(stamp, scan.points, scan.time_offset, index=i, imu=imu)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1, simulated ahead in another thread."""
-        return prefetch(map(self.frame, range(len(self))[start:stop]))
 
 
 def _moving(time: ArrayLike) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.errors import UsageError
@@ -25,7 +24,7 @@ from dpm2_core.sim.mesh import Mesh, Scene, merge
 from dpm2_core.sim.road import Road, make_road
 from dpm2_core.sim.settings import PRESET_NAMES, PRESETS, Preset, PresetName, varied, with_traffic
 from dpm2_core.sim.terrain import Terrain
-from dpm2_core.sim.traffic import DynamicObjects, Traffic, make_traffic
+from dpm2_core.sim.traffic import Traffic, make_traffic
 
 
 @dataclass(eq=False)
@@ -102,10 +101,6 @@ class World:
             height + rng.normal(0, 0.01),
         )
         return T @ se3.make(tilt, np.zeros(3)), time
-
-    def dynamic_objects(self, time: float, around: ArrayLike) -> DynamicObjects | None:
-        """What moves in sight of a place (2 or 3,) at a time, s; None if nothing does."""
-        return self.traffic.dynamic_objects(time, around)
 
 
 def build_world(

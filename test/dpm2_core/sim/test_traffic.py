@@ -39,7 +39,7 @@ def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
     usual = build_world("straight", "city", seed=2, length=200)
     assert _share_moving(usual) < 0.1
     none = build_world("straight", "city", seed=2, length=60, traffic=0)
-    assert none.dynamic_objects(3.0, none.drive_pose(3.0)[:3, 3]) is None
+    assert none.traffic.dynamic_objects(3.0, none.drive_pose(3.0)[:3, 3]) is None
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_where_a_sudden_turn_shows_a_wrong_orientation_no_scan_is_lost() -> None
     """At the first sudden turn the scan fitted nowhere, prepared by the reversed turn; none after it fitted either."""
     world, lidar = build_world("random", "suburb", 2), LidarConfig(beams=16, columns=900, height=1.0)
     drive = TurningRobot(world, 32, Ride(3.0, turns=60.0), lidar, ImuConfig())
-    frames, truth = list(drive.frames()), drive.T_world_lidar
+    frames, truth = list(drive.frames()), drive.poses
     lies = run(with_imu(frames, lambda rates, forces: (rates * [1, 1, -1], forces)))
     assert lies[-1].imu is not None
     assert lies[-1].imu.startswith("its turns are not those of the scans")
