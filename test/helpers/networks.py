@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dpm2_core.config import settings_from
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings
 
 TINY = {
@@ -25,3 +29,10 @@ def tiny(**changes: dict[str, object]) -> NetworkSettings:
     """The tiny network with sections changed."""
     tree = {key: {**value, **changes.get(key, {})} if isinstance(value, dict) else value for key, value in TINY.items()}
     return settings_from(NetworkSettings, tree)
+
+
+def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
+    """Random descriptors."""
+    return Descriptors.of(
+        noise.normal(0, 15, (n, 3)).astype(np.float32), noise.normal(0, 1, (n, model.settings.channels))
+    )

@@ -18,7 +18,6 @@ from dpm2_core.data.messages import MessageError
 from test.helpers.messages import cloud, field, header, info, xyz
 
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
-NUMPY = {"b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "f": "f4", "d": "f8"}
 
 
 @st.composite

@@ -15,6 +15,7 @@ from dpm2_core.experiments.slam_part import Drive, given
 from dpm2_core.geometry import se3
 
 from ...helpers.command import dpm2
+from ...helpers.experiments import first_table
 from ...helpers.layouts import DRIVE_360, kitti_360, kitti_odometry
 
 QUICK = ("--registration", "geometric", "--set", "slam.loops.enabled=false", "--set", "slam.threads=1")
@@ -25,11 +26,6 @@ QUICK = ("--registration", "geometric", "--set", "slam.loops.enabled=false", "--
 def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sequences 06 and 10, six scans each, with images."""
     return kitti_odometry(recording, tmp_path_factory.mktemp("kitti"), ("06", "10"), 6, images=True)
-
-
-def rows(path: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Cells of the first table of an experiment's JSON."""
-    return {row["name"]: row["cells"] for row in json.loads(path.read_text())["tables"][0]["rows"]}
 
 
 @pytest.mark.slow
@@ -46,7 +42,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
             "--peer", f"other-slam={tmp_path}/given_{{sequence}}.txt")  # fmt: skip
     done = dpm2(*call)
     assert done.returncode == 0, done.stderr
-    found = rows(out / "kitti.json")
+    found = first_table(out / "kitti.json")
     assert list(found) == ["dpm2 geometric", *programs, "other-slam", "DeepPointMap2"]
     assert found["other-slam"]["06"]["t_err_percent"] == pytest.approx(0, abs=1e-4)
     assert 0 < found["dpm2 geometric"]["mean"]["t_err_percent"] < 5
@@ -68,7 +64,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in out.rglob("part.json")}
     assert len(before) == 2 * (2 + len(programs))
     again = dpm2(*call)
-    assert rows(out / "kitti.json") == found
+    assert first_table(out / "kitti.json") == found
     assert again.stdout == done.stdout
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
@@ -79,7 +75,7 @@ def test_kitti_360_by_mean_position_error(recording: Path, tmp_path: Path) -> No
     out = tmp_path / "out"
     done = dpm2("experiment", "kitti360", data, "--out", out, "--lengths", "2", *QUICK)
     assert done.returncode == 0, done.stderr
-    found = rows(out / "kitti360.json")
+    found = first_table(out / "kitti360.json")
     cell = found["dpm2 geometric"]["0007"]
     assert 0 < cell["ape_mean_m"] <= cell["ape_rmse_m"] < 0.3
     assert found["DeepPointMap2"]["0007"]["ape_mean_m"] == 26.00

@@ -19,6 +19,7 @@ from dpm2_core.experiments.task_tables import GNDNET
 from dpm2_core.tasks.task import task_type
 
 from ...helpers.command import dpm2
+from ...helpers.experiments import first_table
 from ..tasks.conftest import labelled_drive, write_pairs
 
 QUICK = ("window=2", "every=1", "batch=1", "warmup=0", "slam_loss.points=150", "slam.gamma=0.5", "slam.every=2")
@@ -35,11 +36,6 @@ def options(*settings: str) -> Iterator[str]:
         yield from ("--set", setting)
 
 
-def table(path: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Cells of the first table."""
-    return {row["name"]: row["cells"] for row in json.loads(path.read_text())["tables"][0]["rows"]}
-
-
 @pytest.mark.slow
 def test_gndnet_in_three_arms(tmp_path: Path) -> None:
     """Trained on one sequence, tested on another, an unlabelled one beside them; a second call only reads."""
@@ -51,7 +47,7 @@ def test_gndnet_in_three_arms(tmp_path: Path) -> None:
     call = ("experiment", "gndnet", data, "--out", out, "--learn", "00", "--sequences", "05", "--seeds", "1", *small)
     done = dpm2(*call)
     assert done.returncode == 0, done.stderr
-    found = table(out / "gndnet.json")
+    found = first_table(out / "gndnet.json")
     assert list(found)[:3] == ["without SLAM loss", "with SLAM loss", "with that of another window"]
     assert found["GndNet with SLAM loss"]["ground_recall"] == {"mean": 0.97}
     arms = [found[name]["mse"]["mean"] for name in list(found)[:3]]
@@ -85,7 +81,7 @@ def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
     rest = (data, "--out", out, "--learn", "0", "--sequences", "1", "--seeds", "1", *small)
     done = dpm2("experiment", "dslr", *rest)
     assert done.returncode == 0, done.stderr
-    assert table(out / "dslr.json")["DSLR, CARLA-64"]["chamfer"] == {"mean": 7.85}
+    assert first_table(out / "dslr.json")["DSLR, CARLA-64"]["chamfer"] == {"mean": 7.85}
     assert "DSLR-UDA" in done.stderr
     trained = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
     done = dpm2("experiment", "dslr-slam", *rest)
@@ -113,7 +109,7 @@ def test_ae_lidar_says_that_its_last_epoch_has_the_slam_loss(tmp_path: Path) -> 
     done = dpm2("experiment", "ae-lidar", *rest, *options(*QUICK, *RANGE, "epochs=2", "slam.begin=0"))
     assert done.returncode == 0, done.stderr
     assert "the last epoch has the SLAM loss" in done.stderr
-    assert table(out / "ae-lidar.json")["AE_lidar with SLAM loss, CARLA-64"]["chamfer"] == {"mean": 2.83}
+    assert first_table(out / "ae-lidar.json")["AE_lidar with SLAM loss, CARLA-64"]["chamfer"] == {"mean": 2.83}
     missing = dpm2("experiment", "ae-lidar", data, "--out", out, "--learn", "7", "--sequences", "1")
     assert missing.returncode == 2
     assert "no sequence 7; there are 0, 1" in missing.stderr

@@ -26,6 +26,8 @@ from dpm2_core.network.pose_solver import (
 )
 from dpm2_core.network.tokens import Tokens, to_tokens
 
+from ...helpers.networks import described
+
 
 def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tuple[Correspondences, torch.Tensor]:
     """Matches without error, and the pose."""
@@ -249,13 +251,6 @@ def test_offset_head_starts_without_offset() -> None:
     torch.testing.assert_close(L, torch.eye(3).expand(5, 3, 3) * 2.0, atol=0.03, rtol=0)
     torch.nn.init.normal_(head.out.weight)
     assert (head(torch.randn(5, 32), torch.randn(5, 32))[1].diagonal(dim1=-2, dim2=-1) > 0).all()
-
-
-def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
-    """Random descriptors."""
-    return Descriptors.of(
-        noise.normal(0, 15, (n, 3)).astype(np.float32), noise.normal(0, 1, (n, model.settings.channels))
-    )
 
 
 def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(

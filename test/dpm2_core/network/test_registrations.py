@@ -18,14 +18,7 @@ from dpm2_core.network.registrations import LEAST
 from dpm2_core.network.solved import Solved, confidence_of, overlap_features
 from dpm2_core.network.tokens import to_tokens
 
-from ...helpers.networks import tiny
-
-
-def described(model: DeepPointMap2, noise: np.random.Generator, n: int) -> Descriptors:
-    """Random descriptors."""
-    return Descriptors.of(
-        noise.normal(0, 15, (n, 3)).astype(np.float32), noise.normal(0, 1, (n, model.settings.channels))
-    )
+from ...helpers.networks import described, tiny
 
 
 def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np.random.Generator) -> None:
