@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.estimates import Edge
-from dpm2_core.evaluation.page import data_url, escape, page
+from dpm2_core.evaluation.page import asset, data_url, escape, page
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.voxel import voxel_first
@@ -43,8 +42,7 @@ def write_map_page(path: Path, data: MapData, voxel: float) -> None:
 
 def map_page(data: MapData, voxel: float, title: str) -> str:
     """The page as text."""
-    assets = files("dpm2_core.evaluation") / "assets"
-    style, body, script = (assets.joinpath(f"map.{kind}").read_text("utf-8") for kind in ("css", "html", "js"))
+    style, body, script = (asset(f"map.{kind}") for kind in ("css", "html", "js"))
     return page(title, body.replace("TITLE", escape(title)), style=style, script=script, data=_content(data, voxel))
 
 

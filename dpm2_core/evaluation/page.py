@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+from pathlib import Path
 from typing import Any
 
 _PAGE = """<!doctype html>
@@ -45,6 +46,11 @@ def page(title: str, body: str, *, style: str = "", script: str = "", data: Any 
     held = "" if data is None else f'<script type="application/json" id="data">{_json(data)}</script>\n'
     run = f"<script>\n{script}\n</script>\n" if script else ""
     return _PAGE.format(policy=_POLICY, title=escape(title), style=style, body=body, data=held, script=run)
+
+
+def asset(name: str) -> str:
+    """A file of this package's that belongs into a page."""
+    return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")
 
 
 def escape(text: object) -> str:

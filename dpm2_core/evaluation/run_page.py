@@ -16,7 +16,7 @@ from dpm2_core.data.trajectory import matched
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.metrics import align
-from dpm2_core.evaluation.page import escape, page
+from dpm2_core.evaluation.page import asset, escape, page
 from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
 from dpm2_core.frame import Array
 
@@ -71,12 +71,11 @@ def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[Htm
     parts = [f"<h1>{escape(title)}</h1>", *(_table(table) for table in [*tables, *([_figures(read)] if read else [])])]
     if groups:
         parts.append('<div id="groups"></div><noscript>The drawings need JavaScript.</noscript>')
-    assets = Path(__file__).with_name("assets")
     return page(
         title,
         "\n".join(parts),
-        style=(assets / "run_page.css").read_text(encoding="utf-8"),
-        script=(assets / "run_page.js").read_text(encoding="utf-8") if groups else "",
+        style=asset("run_page.css"),
+        script=asset("run_page.js") if groups else "",
         data=[_group(group) for group in groups] if groups else None,
     )
 

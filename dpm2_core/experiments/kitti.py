@@ -42,7 +42,7 @@ _SPEED = {"ape_rmse_m": ".3f", "fps": ".0f"}
 _APE = {"ape_mean_m": ".2f", "ape_rmse_m": ".2f", **SHOWN}
 
 
-def _parts(request: Request, paper: Sequence[str], settings: Sequence[str]) -> Sequence[Sequence[Part]]:
+def _parts(request: Request, paper: Sequence[str], settings: Sequence[str] = ()) -> Sequence[Sequence[Part]]:
     sequences = present(request, paper, settings)
     own = [
         own_part(name, sequence, request, [*settings, *chosen])
@@ -50,10 +50,6 @@ def _parts(request: Request, paper: Sequence[str], settings: Sequence[str]) -> S
         for sequence in sequences
     ]
     return [[*own, *peer_parts(sequences, request, settings)]]
-
-
-def _kitti_parts(request: Request) -> Sequence[Sequence[Part]]:
-    return _parts(request, TESTED, ORIGINAL_POSES)
 
 
 def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
@@ -75,10 +71,6 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     runs = run_folders(names, sequences, request.out)
     _pictures(runs, sequences, request.out, notes)
     return Outcome([table, speed], notes, runs)
-
-
-def _kitti360_parts(request: Request) -> Sequence[Sequence[Part]]:
-    return _parts(request, TESTED_360, [])
 
 
 def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
@@ -118,5 +110,5 @@ def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array |
     return ways, truth
 
 
-KITTI = Experiment(USES, _kitti_parts, _kitti_outcome)
-KITTI_360 = Experiment(USES, _kitti360_parts, _kitti360_outcome)
+KITTI = Experiment(USES, partial(_parts, paper=TESTED, settings=ORIGINAL_POSES), _kitti_outcome)
+KITTI_360 = Experiment(USES, partial(_parts, paper=TESTED_360), _kitti360_outcome)

@@ -264,7 +264,6 @@ AE_LIDAR_SLAM = replace(
     paper={},
     notes=("the paper has no such table; the SLAM loss asks for this",),
 )
-TABLES = {
-    "gndnet": GNDNET, "dslr": DSLR, "dslr-slam": DSLR_SLAM, "ae-lidar": AE_LIDAR, "ae-lidar-slam": AE_LIDAR_SLAM,
-}  # fmt: skip
-gndnet, dslr, dslr_slam, ae_lidar, ae_lidar_slam = (table.experiment() for table in TABLES.values())
+gndnet, dslr, dslr_slam, ae_lidar, ae_lidar_slam = (
+    table.experiment() for table in (GNDNET, DSLR, DSLR_SLAM, AE_LIDAR, AE_LIDAR_SLAM)
+)

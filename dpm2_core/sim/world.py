@@ -82,16 +82,13 @@ class World:
     def sample_pose(
         self,
         rng: np.random.Generator,
-        lateral: float | None = None,
         heading: float = 0.1,
         height: float = 1.73,
         sway: float = 1.0,
     ) -> tuple[Array, float]:
-        """T_world_lidar (4, 4) at a random place, up to `lateral` m and `heading` rad off the drive; its time, s.
-
-        `lateral` is 1 m by default, indoors 0.15 m. It is tilted by as much as the suspension does, `sway` times.
-        """
-        lateral = (0.15 if self.road.plan else 1.0) if lateral is None else lateral
+        """T_world_lidar (4, 4) at a random place, up to 1 m, indoors 0.15 m, and `heading` rad off the drive; its
+        time, s. It is tilted by as much as the suspension does, `sway` times."""
+        lateral = 0.15 if self.road.plan else 1.0
         time = float(rng.uniform(0, self.road.times[-1]))
         tilt = Rotation.from_rotvec([*rng.normal(0, 0.006 * sway, 2), 0]).as_matrix()
         T = self.pose_at(
