@@ -25,6 +25,10 @@ Weights = Sequence[Tensor] | Tensor | None
 """T tensors (N_t,), or one (T, N), in 0..1; zero is padding; None is one everywhere."""
 
 
+ROTATION_WEIGHT = 25.0
+"""What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
+
+
 class SlamLossSettings(Settings):
     """Odometry over a window of scans, and what its errors cost."""
 
@@ -38,7 +42,7 @@ class SlamLossSettings(Settings):
     """Scans this far apart are registered. More than the span of 1 makes a pose graph, which is relaxed."""
     graph: SoftLmSettings = SoftLmSettings(iterations=5)
     """Of that relaxation."""
-    rotation_weight: float = Field(default=25.0, ge=0)
+    rotation_weight: float = Field(default=ROTATION_WEIGHT, ge=0)
     """Squared meters that a squared radian counts for, m2 / rad2."""
     warm_start: bool = False
     """Both trajectories start where that of the target scans has ended, instead of at the guess: for scans so far apart
@@ -58,8 +62,15 @@ class SlamLossSettings(Settings):
         return self
 
 
-def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 25.0) -> Tensor:
-    """Eq. 3: mean of |t - t_ref|^2 + rotation_weight |Log(R_ref^T R)|^2 over all poses but the first; a scalar, m2.
+def squared_errors(poses: Tensor, reference: Tensor, rotation_weight: float = ROTATION_WEIGHT) -> Tensor:
+    """|t - t_ref|^2 + rotation_weight |Log(R_ref^T R)|^2 of poses (N, 4, 4), m2: (N,)."""
+    translation = (poses[:, :3, 3] - reference[:, :3, 3]).square().sum(-1)
+    rotation = se3_torch.log_rotation(reference[:, :3, :3].mT @ poses[:, :3, :3]).square().sum(-1)
+    return translation + rotation_weight * rotation
+
+
+def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = ROTATION_WEIGHT) -> Tensor:
+    """Eq. 3: mean of `squared_errors` over all poses but the first; a scalar, m2.
 
     Args:
         poses, reference: (T, 4, 4) T_map_scan of the same scans, both relative to their first. The reference has no
@@ -72,10 +83,7 @@ def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = 2
         raise UsageError(
             f"trajectory loss: poses {tuple(poses.shape)} against {tuple(reference.shape)}; want (T, 4, 4)"
         )
-    poses, reference = poses[1:].double(), reference[1:].detach().double()
-    translation = (poses[:, :3, 3] - reference[:, :3, 3]).square().sum(-1)
-    rotation = se3_torch.log_rotation(reference[:, :3, :3].mT @ poses[:, :3, :3]).square().sum(-1)
-    return (translation + rotation_weight * rotation).mean()
+    return squared_errors(poses[1:].double(), reference[1:].detach().double(), rotation_weight).mean()
 
 
 def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = None,
@@ -96,7 +104,7 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
     scans = Cloud(points, w, settings.icp.normal_neighbours)
     steps = _edges([1], len(points))
     found, evidence = _register(scans, steps, _guessed_steps(guess, points), settings.icp)
-    poses = _chain(found, settings.truncate)
+    poses = chained(found, settings.truncate)
     longer = _edges(sorted(set(settings.spans) - {1}), len(points))
     if not len(longer):
         return poses
@@ -202,10 +210,11 @@ def _guessed_steps(guess: Tensor | None, points: Tensor) -> Tensor:
     return steps.expand(len(points) - 1, 4, 4)
 
 
-def _chain(steps: Tensor, truncate: int) -> Tensor:
-    """Poses (T, 4, 4) from the motions (T - 1, 4, 4) between them, the first the identity."""
-    poses = [torch.eye(4, dtype=steps.dtype, device=steps.device)]
-    for i, step in enumerate(steps):
+def chained(steps: Tensor, truncate: int = 0) -> Tensor:
+    """Poses (..., T, 4, 4) from the motions (..., T - 1, 4, 4) between them, the first the identity; for `truncate`
+    see `SlamLossSettings`."""
+    poses = [torch.eye(4, dtype=steps.dtype, device=steps.device).expand(*steps.shape[:-3], 4, 4)]
+    for i, step in enumerate(steps.unbind(-3)):
         last = poses[-1].detach() if truncate and i % truncate == 0 else poses[-1]
         poses.append(last @ step)
-    return torch.stack(poses)
+    return torch.stack(poses, -3)

@@ -50,7 +50,6 @@ class LiveView:
         self._rr = rerun
         self._stream = rerun.RecordingStream(f"dpm2 {name}")
         layout = _layout(blueprint)
-        sinks: list[Any] = []
         if viewer:
             if not _shown():
                 raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
@@ -58,11 +57,8 @@ class LiveView:
                 self._stream.spawn(default_blueprint=layout)
             except Exception as error:
                 raise Dpm2Error(f"--view: rerun's viewer does not start: {error}; --record FILE.rrd does") from None
-            sinks.append(rerun.GrpcSink())
-        if record is not None:
-            sinks.append(rerun.FileSink(str(record)))
         if viewer and record is not None:
-            self._stream.set_sinks(*sinks, default_blueprint=layout)
+            self._stream.set_sinks(rerun.GrpcSink(), rerun.FileSink(str(record)), default_blueprint=layout)
         elif record is not None:
             self._stream.save(record, default_blueprint=layout)
         self._stages: list[str] = []

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.distance import pdist
 from dpm2_core.data.packed import open_packed
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, collate
@@ -27,6 +28,11 @@ def has_pair(poses: Array, low: float, high: float) -> bool:
     """Whether two of (N, 4, 4) poses are so far apart, m; those that are NaN are not looked at."""
     distance = pdist(poses[:, :3, 3])
     return bool(((distance > low) & (distance <= high)).any())
+
+
+def _turned(image: Image, turn: Array) -> Image:
+    """The same where the axes of the LiDAR are turned."""
+    return replace(image, camera=replace(image.camera, T_lidar_cam=turn @ image.camera.T_lidar_cam))
 
 
 class PairSet:
@@ -77,11 +83,7 @@ class PairSet:
             for drive, index, yaw in keys[begin : begin + 8]:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
-                turned = [
-                    type(i)(i.pixels, type(i.camera)(i.camera.K, turn @ i.camera.T_lidar_cam, i.camera.size))
-                    for i in sample.images
-                ]
-                images.append(turned if self.images else [])
+                images.append([_turned(image, turn) for image in sample.images] if self.images else [])
                 pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network, images[-1]))
             out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
         return out

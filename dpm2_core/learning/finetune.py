@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpm2_core.data.packed import PackedDrive
-from dpm2_core.diffslam.trajectory_loss import trajectory_loss
+from dpm2_core.diffslam.trajectory_loss import chained, trajectory_loss
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.frame import Array
 from dpm2_core.learning.checkpoint import WEIGHTS
@@ -82,10 +82,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     truth = (torch.linalg.inv(poses[:, :-1]) @ poses[:, 1:]).flatten(0, 1)
     T, usable = differentiable_poses(decoder, source, target, decoder(source, target), truth)
     steps = torch.where(usable[:, None, None], T, truth).unflatten(0, (groups, frames - 1))
-    chain = [torch.eye(4, dtype=steps.dtype, device=steps.device).expand(groups, 4, 4)]
-    for i in range(frames - 1):
-        chain.append(chain[-1] @ steps[:, i])
-    return torch.stack(chain, 1), (~usable).double().mean()
+    return chained(steps), (~usable).double().mean()
 
 
 def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:

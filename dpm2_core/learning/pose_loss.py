@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.geometry import se3_torch
+from dpm2_core.diffslam.trajectory_loss import squared_errors
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.gauss_newton import weighted_gauss_newton
 from dpm2_core.network.matching import correspond, guided_scores, match_scores
@@ -20,8 +20,6 @@ from dpm2_core.network.tokens import Tokens
 DIVERGED = 1.0
 """A registration that is wrong by more than this has no gradient that leads back, m: what counts then is what pulls
 its pairs away from the truth, and the less the farther."""
-ROTATION = 25.0
-"""What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
 FINE = 0.05
 """Errors well above this count as they are, not squared: the tail does not rule the step, m."""
 
@@ -53,9 +51,6 @@ def differentiable_poses(
 
 def pose_loss(T: Tensor, truth: Tensor) -> Tensor:
     """Mean over poses (B, 4, 4) of their errors, m: of d / (1 + d / DIVERGED), which never exceeds `DIVERGED`, with
-    d = sqrt(|t|^2 + ROTATION |r|^2 + FINE^2) - FINE."""
-    t = T[:, :3, 3] - truth[:, :3, 3]
-    r = se3_torch.log_rotation(truth[:, :3, :3].mT @ T[:, :3, :3])
-    squared = t.square().sum(-1) + ROTATION * r.square().sum(-1)
-    distance = (squared + FINE**2).sqrt() - FINE
+    d = sqrt(squared_errors + FINE^2) - FINE."""
+    distance = (squared_errors(T, truth) + FINE**2).sqrt() - FINE
     return (distance / (1 + distance / DIVERGED)).mean()
