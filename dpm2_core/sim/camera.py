@@ -16,7 +16,7 @@ from dpm2_core.sim.light import Light
 from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Float, Hits, Mesh, rotated
 from dpm2_core.sim.settings import CameraConfig
-from dpm2_core.sim.shading import Surface
+from dpm2_core.sim.shading import VisiblePoints
 from dpm2_core.sim.traffic import DynamicObjects
 from dpm2_core.sim.world import World
 
@@ -85,7 +85,7 @@ def _band(
 
 def _visible(
     world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
-) -> tuple[Surface, NDArray[np.bool_], Float]:
+) -> tuple[VisiblePoints, NDArray[np.bool_], Float]:
     """The nearest surface points of the rays that meet one, static or moving; which rays these are; their distances."""
     hits = world.scene.cast(np.broadcast_to(eye, view.shape).copy(), view, REACH)
     if dynamic_objects is not None:
@@ -107,7 +107,7 @@ def _visible(
     normal *= scale[:, None]
     footprint = distance / np.float32(config.focal) / np.sqrt(np.maximum(-slope * scale, np.float32(0.02)))
     position = direction * distance[:, None] + eye
-    return Surface(position, normal, direction, uv, texture, material, _LINEAR[color], footprint), seen, distance
+    return VisiblePoints(position, normal, direction, uv, texture, material, _LINEAR[color], footprint), seen, distance
 
 
 def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -124,7 +124,7 @@ def _sunlit(
     world: World,
     sun: Float,
     dynamic_objects: DynamicObjects | None,
-    surface: Surface,
+    surface: VisiblePoints,
     seen: NDArray[np.bool_],
     width: int,
 ) -> Float:

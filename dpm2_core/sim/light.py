@@ -9,7 +9,7 @@ import numpy as np
 
 from dpm2_core.sim.materials import Material
 from dpm2_core.sim.mesh import Float
-from dpm2_core.sim.shading import Surface, Textures
+from dpm2_core.sim.shading import Textures, VisiblePoints
 
 
 class Light:
@@ -56,7 +56,7 @@ class Light:
         glow = np.exp((view @ self.sun - 1) * 12)[:, None] * (1 - 0.7 * self.overcast)
         return 1.5 * (blue * (1 - cover) + gray * cover) + glow
 
-    def shine(self, surface: Surface, lit: Float) -> Float:
+    def shine(self, surface: VisiblePoints, lit: Float) -> Float:
         """(P, 3) light on each point, of which the sun's share reaches `lit` (P,)."""
         if self.tunnel:
             falloff = 0.35 + 0.5 * np.clip(-surface.normal[:, 2] * 0.3 + np.abs(surface.normal[:, 2]), 0, 1)

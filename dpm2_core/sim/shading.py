@@ -7,7 +7,7 @@ do not divide one another and with an own offset for each object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ _TILE = 512
 
 
 @dataclass(eq=False)
-class Surface:
+class VisiblePoints:
     """P visible points.
 
     Attributes:
@@ -40,9 +40,9 @@ class Surface:
     color: Float
     footprint: Float
 
-    def part(self, which: NDArray[np.intp]) -> Surface:
+    def part(self, which: NDArray[np.intp]) -> VisiblePoints:
         """Some of the points."""
-        return Surface(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return VisiblePoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 class Textures:
@@ -70,7 +70,7 @@ class Textures:
         )
         return out.reshape(-1)[:n] if channels == 1 else out.reshape(-1, channels)[:n]
 
-    def albedo(self, surface: Surface, terrain: Terrain) -> Float:
+    def albedo(self, surface: VisiblePoints, terrain: Terrain) -> Float:
         """(P, 3) fraction of the light that each point reflects, by color."""
         uv = surface.uv + np.stack([surface.texture % 251, surface.texture // 251], -1).astype(np.float32) * np.float32(
             1.37
@@ -127,7 +127,7 @@ def _lines(at: Float, spacing: float, width: float, footprint: Float) -> Float:
     return inside * np.minimum(1, width / soft) if width < 0.2 else inside
 
 
-def _asphalt(t: Textures, s: Surface, out: Float, uv: Float, terrain: Terrain) -> Float:
+def _asphalt(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrain) -> Float:
     lateral, along, crossing = terrain.lane_coordinates(s.position[:, :2])
     # repairs: rectangles of another mix; cracks: the zero crossings of a slow noise
     h = _hash(np.floor(along / 3.1), np.floor(lateral / 1.7), s.texture)
@@ -169,20 +169,20 @@ def road_marking(
     return np.where(crossing, 0, np.minimum(paint + symbol + bar, 1)).astype(np.float32)
 
 
-def _paving(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _paving(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     grid = np.maximum(_lines(uv[:, 0], 0.5, 0.02, s.footprint), _lines(uv[:, 1], 0.5, 0.02, s.footprint))
     h = _hash(np.floor(uv[:, 0] * 2), np.floor(uv[:, 1] * 2), s.texture)
     return out * ((1 - 0.4 * grid) * (0.9 + 0.2 * _unit(h)))[:, None]
 
 
-def _grass(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _grass(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     dry = np.clip(0.5 + 0.45 * t.noise(uv + 3, 9.0) + 0.25 * t.noise(uv + 7, 1.7), 0, 1)[:, None]
     bare = (t.noise(uv + 13, 4.3) > 1.3)[:, None]
     out = out * (1 - dry) + out * np.array([1.5, 1.2, 0.9], np.float32) * dry
     return np.where(bare, out * np.array([1.3, 0.95, 0.9], np.float32), out)
 
 
-def _plaster(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _plaster(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     streak = np.clip(t.noise(uv * np.array([1, 0.12], np.float32) + 41, 0.7), 0, 2)
     out = out * (1 - 0.12 * streak)[:, None]
     # posters and graffiti within reach of a hand
@@ -192,7 +192,7 @@ def _plaster(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Floa
     return np.where(tag[:, None], _vivid(h), out)
 
 
-def _brick(t: Textures, s: Surface, out: Float, uv: Float, terrain: Terrain) -> Float:
+def _brick(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrain) -> Float:
     course = np.floor(uv[:, 1] / 0.075)
     shift = np.remainder(course, 2) * 0.12
     mortar = np.maximum(_lines(uv[:, 1], 0.075, 0.012, s.footprint), _lines(uv[:, 0] + shift, 0.24, 0.012, s.footprint))
@@ -202,17 +202,17 @@ def _brick(t: Textures, s: Surface, out: Float, uv: Float, terrain: Terrain) -> 
     return _plaster(t, s, out * (1 - mortar[:, None]) + 0.33 * mortar[:, None], uv, terrain)
 
 
-def _roof(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _roof(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     rows: Float = np.maximum(_lines(uv[:, 1], 0.34, 0.08, s.footprint), _lines(uv[:, 0], 0.25, 0.04, s.footprint))
     return out * (1 - 0.35 * rows)[:, None]
 
 
-def _wood(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _wood(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     grain = 0.1 * t.noise(uv * np.array([8, 0.5], np.float32), 0.6)
     return out * (1 + grain - 0.45 * _lines(uv[:, 0], 0.15, 0.015, s.footprint))[:, None]
 
 
-def _panels(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _panels(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     """Barriers and tunnel walls: panels of many tints, dirt, graffiti: the image's only hold in these places."""
     # panels of unequal width: a slowly varying stretch keeps the seams from repeating
     along, up = s.uv[:, 0], s.uv[:, 1]
@@ -230,7 +230,7 @@ def _panels(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float
     return np.where(tag[:, None], _vivid(_hash(patch, np.floor(t.noise(uv + 53, 0.9) * 1.5))), out)
 
 
-def _glass(t: Textures, s: Surface, out: Float, uv: Float, _: Terrain) -> Float:
+def _glass(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     """Frames, and the sky and street that a pane mirrors the more the flatter one looks at it."""
     slope = np.abs(np.einsum("ij,ij->i", s.normal, s.view))
     mirror = 0.12 + 0.6 * (1 - slope) ** 3

@@ -14,7 +14,7 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.settings import CameraConfig, LidarConfig
-from dpm2_core.sim.shading import Surface, Textures
+from dpm2_core.sim.shading import Textures, VisiblePoints
 from dpm2_core.sim.world import World
 
 SMALL = CameraConfig(width=320, height=96, focal=190, noise=0)
@@ -98,7 +98,7 @@ def test_textures_do_not_repeat(material: Material, highway: World) -> None:
     n = len(along)
     street = highway.road.streets[0]
     xy = street.at(np.minimum(along, 200), 0.9)[0] if material == Material.ASPHALT else np.zeros((n, 2))
-    strip = Surface(
+    strip = VisiblePoints(
         position=np.column_stack([xy, np.zeros(n)]).astype(np.float32),
         normal=np.tile(np.float32([1, 0, 0]), (n, 1)),
         view=np.tile(np.float32([-1, 0, 0]), (n, 1)),
