@@ -13,6 +13,7 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -85,7 +86,7 @@ def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dic
 
 def _rates(poses: Array) -> NDArray[np.float64]:
     """Of each step, deg/s."""
-    return np.degrees(se3.angle(se3.inverse(poses[:-1]) @ poses[1:])) / TurningRobot.PERIOD
+    return np.degrees(se3.angle(se3.inverse(poses[:-1]) @ poses[1:])) / FRAME_PERIOD
 
 
 def _tilt(poses: Array, truth: Array) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.experiments.peers import KissIcp
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
@@ -73,7 +74,7 @@ def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[st
         return None
     for frame in frames:
         peer.add(frame)
-    at_end = robot.pose(robot.times + robot.PERIOD / 2)
+    at_end = robot.pose(robot.times + FRAME_PERIOD / 2)
     return min((_errors(peer.poses(), truth) for truth in (robot.poses, at_end)), key=lambda e: float(e["rpe_m"]))
 
 

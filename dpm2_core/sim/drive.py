@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.errors import UsageError
 from dpm2_core.files import file_digest, new_folder
 from dpm2_core.frame import Array
@@ -21,7 +22,7 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.gnss import Receiver
 from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.road import FRAME_PERIOD, ROAD_KINDS, make_road, read_drive
+from dpm2_core.sim.road import ROAD_KINDS, make_road, read_drive
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 

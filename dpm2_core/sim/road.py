@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.sim.floorplan import FloorPlan, car_park, office
@@ -20,8 +21,6 @@ from dpm2_core.sim.settings import Preset
 ROAD_KINDS = ("straight", "loop", "figure8", "random")
 STEP = 0.5
 """Distance of the samples of a path, m."""
-FRAME_PERIOD = 0.1
-"""Time between two poses of a file, s."""
 
 
 class Path:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.sim.imu import Imu
@@ -110,9 +111,6 @@ class TurningRobot(_Simulated):
     """A robot that drives along a road and turns fast. Scans are as a driver delivers them, with the time of each
     point, from poses that change within a sweep, stamped in its middle; an IMU measures beside."""
 
-    PERIOD = 0.1
-    """s between two scans."""
-
     def __init__(
         self,
         world: World,
@@ -123,14 +121,14 @@ class TurningRobot(_Simulated):
     ) -> None:
         """Stands for 1 s, then drives, slower in curves: but for its shakes no turn is faster than 100 deg/s."""
         rng = np.random.default_rng([world.seed, _IMU_STREAM])
-        end = frames * self.PERIOD + 1
+        end = frames * FRAME_PERIOD + 1
         world = replace(world, road=_robot_progress(world.road, end, ride, rng))
         super().__init__(f"{world.preset} {world.seed}", world)
         self._lidar = Lidar(lidar)
         at = np.arange(0.0, end, _STEP)
         level = np.stack([self.world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
         self._T = level @ ride.shaken(at)
-        self.times = 0.5 + np.arange(frames, dtype=np.float64) * self.PERIOD
+        self.times = 0.5 + np.arange(frames, dtype=np.float64) * FRAME_PERIOD
         self.poses = self.pose(self.times)
         self._imu = None if imu is None else Imu(imu, rng)
         if self._imu is not None:
@@ -154,7 +152,7 @@ class TurningRobot(_Simulated):
         if self._imu is not None:
             end = time + float(offsets.max())
             first, last = np.searchsorted(
-                self._stamps, [round((end - (self.PERIOD if i else 1)) * 1e9), round(end * 1e9)]
+                self._stamps, [round((end - (FRAME_PERIOD if i else 1)) * 1e9), round(end * 1e9)]
             )
             imu = Inertial(self._stamps[first:last], self._rates[first:last], self._forces[first:last])
         return Frame(stamp, scan.points, scan.time_offset, index=i, imu=imu)

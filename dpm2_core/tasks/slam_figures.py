@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dpm2_core.data.open import open_source
+from dpm2_core.data.trajectory import stamps_of
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
@@ -20,8 +21,6 @@ from dpm2_core.tasks.open import folders_of, names_of, open_scans, pairs_of
 from dpm2_core.tasks.scan import TaskScans
 from dpm2_core.tasks.task import Task
 from dpm2_core.tasks.training import mean_figures
-
-_PERIOD = 100_000_000  # ns between scans
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +106,7 @@ def _odometry(clouds: list[np.ndarray]) -> Array:
 
 
 def _stamps(scans: int) -> list[int]:
-    return [(i + 1) * _PERIOD for i in range(scans)]
+    return stamps_of(np.arange(1, scans + 1)).tolist()
 
 
 def _number(value: float | None) -> float:
