@@ -92,7 +92,8 @@ measure: setup  ## every record that stands on the weights, again, at a clean co
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.
 train-data: setup  ## the synthetic worlds that train-small and ablation learn from (2 cores: 65 minutes, 2.4 GB)
 	$(DPM2) train data out/train/lidar --set worlds=64
-	$(DPM2) train data out/train/camera --config config/worlds_camera.yaml
+	$(DPM2) train data out/train/camera --set worlds=110 --set first_seed=5000 --set frames=56 --set images=true \
+		--set 'mixture={city: 0.22, suburb: 0.2, rural: 0.3, highway: 0.14, tunnel: 0.14}'
 	$(DPM2) train data out/train/traffic --set worlds=20 --set first_seed=6000 --set frames=32 --set traffic=20 \
 		--set 'mixture={city: 0.4, suburb: 0.3, rural: 0.3}'
 	$(DPM2) train data out/train/val --set first_seed=900000 --set worlds=12 --set frames=30 --set images=true

@@ -10,7 +10,6 @@ import pytest
 from dpm2_core.config import Settings, load_settings
 from dpm2_core.experiments.ablation import AblationSettings
 from dpm2_core.experiments.variants import AS_PAPER, TABLE_4
-from dpm2_core.learning.generate import GenerateSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_overlap import OverlapTrainingSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings
@@ -36,7 +35,6 @@ READ_BY: dict[str, type[Settings]] = {
     "train_small_pose": RegistrationTrainingSettings,
     "train_small_real": RegistrationTrainingSettings,
     "train_small_rooms": RegistrationTrainingSettings,
-    "worlds_camera": GenerateSettings,
 }
 
 
