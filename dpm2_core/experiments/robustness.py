@@ -10,6 +10,7 @@ from itertools import islice
 from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
+from dpm2_core.data.source import Source
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
@@ -44,17 +45,18 @@ def _sees(request: Request, settings: Sequence[str]) -> bool:
     """Whether there are images, and a camera would be used: where not, black images change nothing."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     config = load_settings(Config, None, [*settings, *weights, *request.overrides])
-    return make_odometry(config.slam).uses_images and _first_with_images(request) != ""
+    return make_odometry(config.slam).uses_images and _has_images(request)
 
 
-def _first_with_images(request: Request) -> str:
-    """A sequence whose first frame has an image; empty if there is none."""
-    for sequence in present(request, TESTED, ORIGINAL_POSES):
-        settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES])
-        source = open_source(request.data, settings.input)
-        if any(frame.images for frame in islice(source.frames(0, 1), 1)):
-            return sequence
-    return ""
+def _has_images(request: Request) -> bool:
+    """Whether the first frame of a sequence has an image."""
+    sources = (_opened(request, sequence) for sequence in present(request, TESTED, ORIGINAL_POSES))
+    return any(frame.images for source in sources for frame in islice(source.frames(0, 1), 1))
+
+
+def _opened(request: Request, sequence: str) -> Source:
+    settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES])
+    return open_source(request.data, settings.input)
 
 
 def _parts(request: Request) -> Sequence[Sequence[Part]]:
@@ -98,8 +100,7 @@ def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
 
 def _picture(request: Request, sequence: str, notes: list[str]) -> None:
     """The paper's figure 6: a frame as it is, and with both sensors hit."""
-    settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES]).input
-    source = open_source(request.data, settings)
+    source = _opened(request, sequence)
     at = min(_PICTURED, len(source) - 1)
     hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
     (before,), (after,) = (list(of.frames(at, at + 1)) for of in (source, hit))

@@ -80,6 +80,7 @@ class TaskTable:
         shared: list[Part] = []
         arms: list[Part] = []
         measured: list[Part] = []
+        drive = [str(request.data), list(request.sequences or self.test)]
         for seed in range(request.seeds or SEEDS):
             common = first_slam_epoch(settings_of(self._training(request, seed, "with")))
             start = None
@@ -95,7 +96,7 @@ class TaskTable:
                 inputs = [*request.config_files, *checkpoint]
                 arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs))
                 weights = request.out / name / WEIGHTS
-                tested = {"task": self.task, "weights": str(weights), "drive": self._tested(request)}
+                tested = {"task": self.task, "weights": str(weights), "drive": drive}
                 measured.append(Part(self._measured(seed, arm), self.measured, tested, [weights]))
         return [stage for stage in (shared, arms, measured) if stage]
 
@@ -171,9 +172,6 @@ class TaskTable:
             config=None if request.config is None else str(request.config),
             settings=[*defaults, *request.overrides], seed=seed, arm=arm,
         )  # fmt: skip
-
-    def _tested(self, request: Request) -> list[Any]:
-        return [str(request.data), list(request.sequences or self.test)]
 
     def _name(self, seed: int, arm: str) -> str:
         return f"{self.task}/seed_{seed}/{arm}"
