@@ -18,7 +18,7 @@ JOBS ?= -n 3 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup demo test test-long test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup ros demo test test-long test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -36,7 +36,6 @@ $(READY): setup.py pyproject.toml
 demo: setup ros  ## simulate a drive, replay it into slam_node, check and show what comes out; SRC=<bag, KITTI sequence or another recording> for your own
 	$(BIN)/python -m tools.demo $(if $(SRC),"$(SRC)") --out out/demo
 
-.PHONY: ros
 ros:  # of all targets the demo alone is nothing without it
 	@$(BIN)/python -c 'import rclpy' 2>/dev/null || { echo "rclpy has no wheel for $$(uname -m): docs/ros2.md says how to run the demo with an installed ROS 2" >&2; exit 2; }
 
