@@ -60,7 +60,7 @@ def trajectory_png(
     save_png(path, figure)
 
 
-def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None = None, title: str = "") -> None:
+def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None, title: str) -> None:
     """Draw the ways (N, 3), m, of several methods and the true one from above, all in one frame.
 
     Raises:
@@ -79,7 +79,7 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
     save_png(path, figure)
 
 
-def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str = "") -> None:
+def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str) -> None:
     """Draw a frame as it is and as a failing sensor delivers it: the scan from above, and the image.
 
     Raises:

@@ -124,7 +124,7 @@ def _projected(xyz: Tensor, views: Any) -> Array:
     return uv[0].cpu().numpy().astype(np.float64)
 
 
-def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str = "") -> None:
+def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str) -> None:
     """A panel of several networks' attention, one below the other (the paper's Figure 7).
 
     Raises:

@@ -97,7 +97,7 @@ def tables_in(folder: Path) -> list[HtmlTable]:
     return tables
 
 
-def carry_out(name: str, request: Request, progress: Progress | None = None) -> Outcome:
+def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome:
     """Do all parts that are not done yet, and write OUT/NAME.json and OUT/NAME.html.
 
     Raises:

@@ -57,13 +57,13 @@ class _Simulated(ABC):
 class SimulatedDrive(_Simulated):
     """The drive along a road, with traffic, at 10 Hz."""
 
-    def __init__(self, road: str, preset: PresetName = "suburb", seed: int = 0, name: str = "") -> None:
+    def __init__(self, road: str, preset: PresetName, seed: int, name: str) -> None:
         """`road`, `preset` and `seed` as in `build_world`, `name` what reports call it.
 
         Raises:
             UsageError: no such road or preset.
         """
-        super().__init__(name or f"{road} {preset} {seed}", build_world(road, preset, seed))
+        super().__init__(name, build_world(road, preset, seed))
         self.times = self.world.road.times
         self._lidar = Lidar(LidarConfig())
         height = self._lidar.config.height

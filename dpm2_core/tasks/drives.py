@@ -37,7 +37,7 @@ class TaskDriveSettings(Settings):
 def make_task_drives(
     out: Path,
     settings: TaskDriveSettings,
-    workers: int = 2,
+    workers: int,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> None:
     """Write out/train/NN and out/val/NN, each in the layout of `dpm2 sim`; those that are there already stay.

@@ -64,7 +64,7 @@ def figures_of(run: TaskRun) -> dict[str, float]:
 
 
 @torch.no_grad()
-def slam_runs(task: Task, path: Path, sequences: Sequence[str] = ()) -> Iterator[TaskRun]:
+def slam_runs(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[TaskRun]:
     """The odometry on every sequence.
 
     Raises:
