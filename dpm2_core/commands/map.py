@@ -173,7 +173,9 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
 def prune(
     path: MapFile,
     out: Annotated[Path, typer.Option(help="New map file.")],
-    distance: Annotated[float, typer.Option(min=0, help="From an older keyframe, m; 0: only what borrows.")] = 3.0,
+    distance: Annotated[
+        float, typer.Option(min=0, help="From an older keyframe, m; height counts four times; 0: only what borrows.")
+    ] = 3.0,
     angle: Annotated[float, typer.Option(min=0, max=180, help="Between their headings, degrees.")] = 30.0,
 ) -> None:
     """Take out the keyframes that revisits made redundant; what they constrain and where they were stays."""

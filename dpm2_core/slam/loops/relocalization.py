@@ -38,8 +38,9 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
 
+HEIGHT = 4.0
+"""m that a meter of height counts for between two places: 3 m up, on the next storey, one sees other things."""
 _REACH = 1.0  # m, along the road around a place that a picture has found
-_HEIGHT = 4.0  # m, that a meter of height counts for: 3 m up, on the next storey, one sees other things
 
 
 class RelocalizationSettings(Settings):
@@ -230,7 +231,7 @@ def _is_elsewhere(place: Registration, other: Registration) -> bool:
 
 def _distance(poses: Array, pose: Array) -> Array:
     """Between the positions of (..., 4, 4) poses and another (4, 4), m."""
-    return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, _HEIGHT], axis=-1)
+    return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, HEIGHT], axis=-1)
 
 
 def nowhere(reason: str) -> Registration:

@@ -15,6 +15,7 @@ from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import Index
+from dpm2_core.slam.loops.relocalization import HEIGHT
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
@@ -29,11 +30,12 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known.
 
     Args:
-        distance: m, at most; 0: only those without a payload. angle: degrees between their headings, at most.
+        distance: m, at most, where a meter of height counts for four; 0: only those without a payload.
+        angle: degrees between their headings, at most.
     """
     if not len(data):
         return []
-    positions, parts, session = data.poses[:, :3, 3], parts_of(data), np.array(data.session)
+    positions, parts, session = data.poses[:, :3, 3] * [1, 1, HEIGHT], parts_of(data), np.array(data.session)
     tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
     needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
     stays = np.ones(len(data), np.bool_)

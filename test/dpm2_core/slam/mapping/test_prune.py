@@ -94,6 +94,14 @@ def test_pruning_laps_leaves_one_with_all_constraints() -> None:
     np.testing.assert_array_equal(again.clouds[5], less.clouds[7])
 
 
+def test_the_next_storey_is_no_revisit() -> None:
+    """A car park: the lap above the first one is 2.8 m away, nearer than what `dpm2 map prune` takes for a revisit."""
+    data = laps(2)
+    poses = data.poses.copy()
+    poses[40:, 2, 3] += 2.8
+    assert redundant_nodes(replace(data, poses=poses), 3.0, 30.0) == []
+
+
 def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revisit() -> None:
     """Without a place found, a second drive begins in the frame of the first, on top of it, wherever it was."""
     data = laps(2, session=True)
