@@ -27,7 +27,8 @@ _LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     """Keyframes without a payload of their own, and those near an older one that stays; never the last of a part.
 
-    Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known.
+    Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known. Nor
+    does one with descriptors go for one without: nobody would be found there any more.
 
     Args:
         distance: m, at most, where a meter of height counts for four; 0: only those without a payload.
@@ -38,13 +39,14 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     positions, parts, session = data.poses[:, :3, 3] * [1, 1, HEIGHT], parts_of(data), np.array(data.session)
     tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
     needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
-    stays = np.ones(len(data), np.bool_)
+    stays, described = np.ones(len(data), np.bool_), np.array([k.descriptors is not None for k in data.keyframes])
     for node in range(len(data)):
         if node in needed:
             continue
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
         near = near[(near < node) & stays[near] & (parts[near] == parts[node])]
         near = near[(node - near >= _LAP) | (session[near] != session[node])]
+        near = near[described[near] >= described[node]]
         turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
         stays[node] = data.clouds.loan(node) is None and np.min(turned) > np.radians(angle)
     return np.flatnonzero(~stays).tolist()

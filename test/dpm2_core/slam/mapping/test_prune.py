@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import Array, Fix
 from dpm2_core.geometry import se3
@@ -100,6 +101,18 @@ def test_the_next_storey_is_no_revisit() -> None:
     poses = data.poses.copy()
     poses[40:, 2, 3] += 2.8
     assert redundant_nodes(replace(data, poses=poses), 3.0, 30.0) == []
+
+
+def test_what_has_descriptors_does_not_go_for_what_has_none() -> None:
+    """As of a first drive with the points alone, or one whose payloads `dpm2 map check --recover` could not read."""
+    data = laps(2, session=True)
+    seen = Descriptors(np.zeros((1, 3), np.float32), np.ones((1, 4), np.int8), np.ones(1, np.float32))
+    described = [replace(keyframe, descriptors=seen) for keyframe in data.keyframes]
+    mixed = replace(data, keyframes=[*data.keyframes[:20], *described[20:]])
+    assert redundant_nodes(mixed, 3.0, 30.0) == list(range(60, 79))
+    assert redundant_nodes(replace(data, keyframes=described), 3.0, 30.0) == list(range(40, 79))
+    bare = replace(data, keyframes=[*described[:40], *data.keyframes[40:]])
+    assert redundant_nodes(bare, 3.0, 30.0) == list(range(40, 79))
 
 
 def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revisit() -> None:
