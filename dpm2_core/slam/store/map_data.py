@@ -271,12 +271,15 @@ def _thinned(clouds: Sequence[Points], voxel: float) -> Points:
 
 
 def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of each drive (robot, session) by time, those of pruned keyframes too."""
-    steps = [(k.robot, s, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
-    steps += [(p.robot, p.session, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
-    steps.sort(key=lambda step: step[:3])
+    """Stamps (ns) and (K, 4, 4) T_map_kf of each drive (robot, session) as it went, those of pruned keyframes too.
+
+    Ids tell the order, not stamps: a clock may be set back, and a recording be played again.
+    """
+    steps = [(k.robot, s, k.id, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
+    steps += [(p.robot, p.session, p.id, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
+    steps.sort(key=lambda step: step[:4])
     drives = {drive: list(way) for drive, way in groupby(steps, lambda step: step[:2])}
-    return {drive: ([step[2] for step in way], np.array([step[3] for step in way])) for drive, way in drives.items()}
+    return {drive: ([step[3] for step in way], np.array([step[4] for step in way])) for drive, way in drives.items()}
 
 
 def trajectory(data: MapData) -> tuple[list[int], Array]:
