@@ -99,8 +99,7 @@ def run(
         make_folder(out)  # the recording may go there
         if resume and (out / TRAJECTORY).exists():
             first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
-            before = out / f"before_{first}"
-            set_aside(out, before)
+            before = set_aside(out, f"before_{first}")
             typer.echo(f"{before}: the results so far; those of this run begin at frame {first}", err=True)
         live = None
         if view or record is not None:

@@ -10,6 +10,7 @@ import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -113,19 +114,25 @@ def remove_results(folder: Path, *names: str) -> None:
             raise Dpm2Error(f"{folder / name}: not removed: {error.strerror or error}") from error
 
 
-def set_aside(folder: Path, into: Path) -> None:
-    """Move the results of a run to another folder, so that the next one replaces none of them.
+def set_aside(folder: Path, name: str) -> Path:
+    """Move the results of a run to a folder in theirs, so that the next one replaces none of them.
+
+    Returns:
+        That folder: `name`, or NAME-2, -3, ... where an earlier run was set aside under that name.
 
     Raises:
         Dpm2Error: one could not be moved.
     """
+    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
+    into = next(path for path in map(folder.joinpath, names) if not path.exists())
     make_folder(into)
-    for name in (TRAJECTORY, *MAPPING):
+    for result in (TRAJECTORY, *MAPPING):
         try:
-            if (folder / name).exists():
-                (folder / name).replace(into / name)
+            if (folder / result).exists():
+                (folder / result).replace(into / result)
         except OSError as error:
-            raise Dpm2Error(f"{folder / name}: not moved to {into}: {error.strerror or error}") from error
+            raise Dpm2Error(f"{folder / result}: not moved to {into}: {error.strerror or error}") from error
+    return into
 
 
 def read_run(path: Path) -> RunFolder:

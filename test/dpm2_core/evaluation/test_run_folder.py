@@ -17,6 +17,7 @@ from dpm2_core.evaluation.run_folder import (
     TRAJECTORY,
     TRUTH,
     read_run,
+    set_aside,
     write_frames,
     write_loops,
     write_truth,
@@ -78,3 +79,14 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str, content: str, proble
 def test_another_folder_is_no_run(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no run; want a folder with trajectory\.tum"):
         read_run(tmp_path)
+
+
+def test_results_that_are_set_aside_again_replace_none(tmp_path: Path) -> None:
+    """A run that is resumed twice from one keyframe, as after a Ctrl-C: the first results are the longest."""
+    for count in (3, 1, 1):
+        write_tum(tmp_path / "trajectory.tum", range(count), np.tile(np.eye(4), (count, 1, 1)))
+        into = set_aside(tmp_path, "before_358")
+        assert len(read_run(into).trajectory) == count
+        assert not (tmp_path / "trajectory.tum").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["before_358", "before_358-2", "before_358-3"]
+    assert len(read_run(tmp_path / "before_358").trajectory) == 3
