@@ -208,9 +208,12 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
     rows, columns = np.triu_indices(size)
     information = np.zeros((len(upper), size, size))
     information[:, rows, columns] = information[:, columns, rows] = upper
-    weights = np.linalg.eigvalsh(information)
-    if len(bad := np.flatnonzero(weights[:, 0] <= 1e-12 * np.abs(weights[:, -1]))):
-        least = weights[bad[0], 0]
+    # By its diagonal, since units differ, and what is not measured may have 1e-15 of the weight of the rest.
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.where(diagonal > 1e-100, diagonal, 1.0))
+    weights = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])
+    if len(bad := np.flatnonzero(weights[:, 0] <= 1e-12)):
+        least = np.linalg.eigvalsh(information[bad[0]])[0]
         raise UsageError(
             f"{path}:{lines.at[bad[0]]}: information matrix not positive definite, least value {least:.3g}"
         )

@@ -14,6 +14,7 @@ import pytest
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
+from dpm2_core.slam.graph.g2o import read_g2o
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
 
@@ -208,6 +209,9 @@ def test_in_a_file_the_local_frame_is_one_more_vertex(clean: PoseGraph, tmp_path
     known = clean.georeference
     assert known is not None
     np.testing.assert_allclose(values.atPose3(120).matrix(), se3.inverse(known.T_enu_map), atol=1e-6)
+    read = read_g2o(tmp_path / "graph.g2o")  # the level says nothing of the place: 1e-14 of the weight of its tilt
+    np.testing.assert_allclose(read.graph.poses[:120], clean.poses, atol=1e-9)
+    assert (int(read.graph.chained.sum()), len(read.graph.ends)) == (120, 120)
 
 
 def test_robots_that_no_loop_ties_keep_their_fixes_to_themselves(clean: PoseGraph) -> None:

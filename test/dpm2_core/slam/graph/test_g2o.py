@@ -90,6 +90,8 @@ def test_edges_in_no_order_are_not_taken_for_a_drive(tmp_path: Path) -> None:
         ([f"EDGE_SE2 0 1 1 -1e300 0 {I3}"], r"graph.g2o:1: farther than 1000000 km"),
         ([f"EDGE_SE3:QUAT 0 1 1 0 1e10 0 0 0 1 {I6}"], r"graph.g2o:1: farther than 1000000 km"),
         (["", "EDGE_SE2 0 1 1 0 0 1 0 0 0 0 1"], r"graph.g2o:2: information matrix not positive definite"),
+        (["EDGE_SE2 0 1 1 0 0 1 0 0 -1e9 0 1"], r"graph.g2o:1: information matrix not .* least value -1e\+09"),
+        (["EDGE_SE2 0 1 1 0 0 1 1e-6 0 1e-12 0 1"], r"graph.g2o:1: information matrix not positive definite"),
         ([f"EDGE_SE2 0 0 1 0 0 {I3}"], r"graph.g2o:1: edge from vertex 0 to itself"),
         ([f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 2 {I6}"], r"graph.g2o:1: the quaternion is not of unit length"),
         (["VERTEX_SE2 0 0 0 0", f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: edge of vertex 1, which has no VERTEX"),
