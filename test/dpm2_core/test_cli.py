@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -22,6 +23,7 @@ from dpm2_core.cli import COMMANDS, GROUPS, load_command
 from dpm2_core.commands.options import progress_bar
 from dpm2_core.console import Console
 from dpm2_core.data.trajectory import write_kitti
+from dpm2_core.errors import exit_code
 from dpm2_core.geometry import se3
 
 from ..helpers.command import dpm2, dpm2_process
@@ -180,6 +182,20 @@ def test_a_reader_that_stops_early_is_no_error() -> None:
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
     assert done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_a_path_that_may_not_be_entered_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the folder of another user, and a name that no file can have: asked whether it is there, Python raises."""
+    name = tmp_path / ("n" * 300)
+    for arguments in (["info", name], ["prune", tmp_path / "a", "--out", name], ["export", name, tmp_path / "a.ply"]):
+        done = dpm2("map", *arguments)
+        assert (done.returncode, done.stderr) == (1, f"dpm2: {name}: File name too long\n")
+
+    def denied() -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", "/root/a")
+
+    assert exit_code(denied, "dpm2") == 1
+    assert capsys.readouterr().err == "dpm2: /root/a: Permission denied\n"
 
 
 def test_the_page_of_exit_codes_lists_those_that_there_are() -> None:
