@@ -107,7 +107,7 @@ def _registered(
         for i in {a, b} - scans.keys():
             scans[i] = registration.prepare(frames[i], np.zeros(6))
         T = se3.inverse(poses[a]) @ poses[b]
-        registration.clear()
+        registration = registration.fresh()
         registration.update(scans[a], np.eye(4))
         result = registration.register(scans[b], Prediction([T if method == "geometric" else np.eye(4)]))
         if result.ok:

@@ -69,12 +69,12 @@ def by_registration(registration: ScanRegistration) -> Callable[..., Array | Non
         return prepared[frame.index]
 
     def register(first: Frame, second: Frame, T_first_second: Array | None = None) -> Array | None:
-        registration.clear()
-        registration.update(scan_of(first), np.eye(4))
+        map_of_first = registration.fresh()
+        map_of_first.update(scan_of(first), np.eye(4))
         start = Prediction([np.eye(4)], widen=2.0)
         if T_first_second is not None:
             start = Prediction([T_first_second], unique=True)  # from afar fewer of a scan's points fit
-        result = registration.register(scan_of(second), start)
+        result = map_of_first.register(scan_of(second), start)
         return result.T_target_source if result.ok else None
 
     return register

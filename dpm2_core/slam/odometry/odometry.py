@@ -71,7 +71,7 @@ class Odometry:
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
         self._broken = 0  # id of the first keyframe after the last break
-        self._registration.clear()
+        self._registration = self._registration.fresh()
         self._keyframes.reset()
 
     @property
@@ -185,7 +185,7 @@ class Odometry:
     def _forget_first(self, dt: float) -> None:
         """The first scan shows a part of the scene, as drivers begin in mid-sweep: the next one is the first."""
         self._first = None
-        self._registration.clear()
+        self._registration = self._registration.fresh()
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
 
@@ -283,7 +283,7 @@ class Odometry:
         twist = se3.log(T_first_this) / seconds
         # The first pose was handed out at its stamp.
         motion.T = motion.T_registered = motion.T @ se3.exp(self._first_sweep.middle * twist)
-        self._registration.clear()
+        self._registration = self._registration.fresh()
         self._registration.update(self._registration.prepare(first, twist), motion.T)
         scan = self._registration.prepare(frame, twist)
         known = Prediction([motion.T @ T_first_this], information=np.eye(6) / _KNOWN**2)

@@ -35,9 +35,6 @@ class DescriptorMap:
     def __len__(self) -> int:
         return len(self._places)
 
-    def clear(self) -> None:
-        self._places.clear()
-
     def wants(self, T_odom_lidar: Array) -> bool:
         """Whether a frame taken at that pose would show enough that is new."""
         if not self._places:

@@ -52,10 +52,6 @@ class FusedScanRegistration:
     def __len__(self) -> int:
         return len(self._geometric)
 
-    def clear(self) -> None:
-        self._neural.clear()
-        self._geometric.clear()
-
     def fresh(self) -> FusedScanRegistration:
         return FusedScanRegistration(self._neural.fresh(), self._geometric.fresh(), self._always)
 

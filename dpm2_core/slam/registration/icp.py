@@ -193,10 +193,6 @@ class GeometricScanRegistration:
     def __len__(self) -> int:
         return len(self._local_map)
 
-    def clear(self) -> None:
-        self._local_map.clear()
-        self._forget_second()
-
     def _forget_second(self) -> None:
         """Both motions begin anew: a scan that has just entered the map fits there."""
         self._scans = 0  # since then

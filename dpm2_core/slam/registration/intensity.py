@@ -60,10 +60,6 @@ class IntensitySearch:
         self._missed = 0  # scans since the way was known
         self._searched = _Scan(np.empty((0, 4), np.float32))  # the last one: it is often the next to be remembered
 
-    def clear(self) -> None:
-        self._scans.clear()
-        self._missed = 0
-
     def update(self, points: Points, T_odom_lidar: Array, tied: bool = True) -> None:
         """A scan (P, 4) that is now at a pose (4, 4); `tied` if its way from those before is known."""
         self._missed = 0 if tied else self._missed + 1

@@ -40,9 +40,6 @@ class LocalMap:
 
     def __init__(self, settings: LocalMapSettings) -> None:
         self._settings = settings
-        self.clear()
-
-    def clear(self) -> None:
         self.points: Array = np.zeros((0, 3))
         self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
         self._inserted = 0

@@ -74,9 +74,6 @@ class NeuralScanRegistration:
     def __len__(self) -> int:
         return len(self._map)
 
-    def clear(self) -> None:
-        self._map.clear()
-
     def fresh(self) -> NeuralScanRegistration:
         return NeuralScanRegistration(self._settings, self._preprocessor, self._model)
 

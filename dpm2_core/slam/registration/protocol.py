@@ -120,10 +120,6 @@ class ScanRegistration(Protocol):
         """0 while there is nothing to register to."""
         ...
 
-    def clear(self) -> None:
-        """Forget everything."""
-        ...
-
     def fresh(self) -> Self:
         """Another one like it that remembers nothing yet."""
         ...

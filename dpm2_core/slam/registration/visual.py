@@ -42,11 +42,6 @@ class VisualScanRegistration:
     def __len__(self) -> int:
         return len(self._registration)
 
-    def clear(self) -> None:
-        self._registration.clear()
-        self._last = self._reference = None
-        self._intensity.clear()
-
     def fresh(self) -> VisualScanRegistration:
         return VisualScanRegistration(self._settings, self._registration.fresh())
 

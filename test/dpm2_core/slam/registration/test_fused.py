@@ -39,9 +39,6 @@ class Oracle:
     def __len__(self) -> int:
         return self.size
 
-    def clear(self) -> None:
-        self.size = 0
-
     def describe(self, points: Points, images: tuple[Image, ...]) -> None:
         return None
 

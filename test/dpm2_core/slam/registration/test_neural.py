@@ -247,7 +247,7 @@ def test_what_is_remembered_of_a_scan_gives_its_descriptors(noise: np.random.Gen
     )
     results = []
     for described in (False, True):
-        registration.clear()
+        registration = registration.fresh()
         if described:
             assert first.descriptors is not None
         registration.keep(first, np.eye(4))
