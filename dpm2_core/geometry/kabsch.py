@@ -6,7 +6,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpm2_core.geometry.full_precision import full_precision
 from dpm2_core.geometry.se3_torch import make
 
 
@@ -30,10 +29,3 @@ def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     sign[:, 2] = torch.linalg.det(U @ Vt).sign()  # reflection guard
     R = (U * sign[:, None]) @ Vt
     return make(R, target_mean - (R @ source_mean[..., None])[..., 0])
-
-
-@full_precision
-def transform(T: Tensor, points: Tensor) -> Tensor:
-    """T (B, 4, 4) applied to points (B, N, 3), in the dtype of the points."""
-    T = T.to(points.dtype)
-    return points @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]

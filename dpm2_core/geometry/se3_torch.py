@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpm2_core.geometry.full_precision import full_precision
+
 _SMALL = 1e-4  # rad: the series' first omitted term, theta^4 / 120, is below the rounding of float64
 
 
@@ -32,8 +34,10 @@ def inverse(T: Tensor) -> Tensor:
     return make(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
 
+@full_precision
 def transform(T: Tensor, points: Tensor) -> Tensor:
-    """T (..., 4, 4) applied to points (..., N, 3)."""
+    """T (..., 4, 4) applied to points (..., N, 3), in the dtype of the points."""
+    T = T.to(points.dtype)
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpm2_core.geometry.full_precision import full_precision
-from dpm2_core.geometry.kabsch import transform
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.tokens import Tokens
 
 

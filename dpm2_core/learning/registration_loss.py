@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from dpm2_core.config import Settings
-from dpm2_core.geometry.kabsch import transform
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.learning.pose_loss import differentiable_poses, pose_loss
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.heads import residuals_in_view

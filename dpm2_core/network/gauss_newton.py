@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpm2_core.geometry.compiled import compiled
-from dpm2_core.geometry.se3_torch import hat
+from dpm2_core.geometry.se3_torch import exp, hat
 from dpm2_core.network.matching import Correspondences
 
 Array = NDArray[np.float64]
@@ -57,13 +57,6 @@ def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUND
         gradient = weighted.flatten(1, 2).transpose(1, 2) @ residual.flatten(1, 2)[..., None]
         T = T @ exp(-torch.linalg.solve(information, gradient)[..., 0])
     return T, information
-
-
-def exp(xi: Tensor) -> Tensor:
-    """SE(3) exponential of (B, 6) [rotation, translation]."""
-    out = xi.new_zeros(len(xi), 4, 4)
-    out[:, :3, :3], out[:, :3, 3] = hat(xi[:, :3]), xi[:, 3:]
-    return torch.linalg.matrix_exp(out)
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")

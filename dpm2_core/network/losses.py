@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from dpm2_core.geometry import se3_torch
-from dpm2_core.geometry.kabsch import transform
 
 RIGHT_M, RIGHT_DEG = 1.0, 3.0  # errors of a pose that is right; few lie between these and meters
 SOFT = 3.0  # degrees of freedom of the Student distribution of offset residuals
@@ -34,7 +33,7 @@ class Labels(NamedTuple):
 
 def label_pairs(source: Tensor, target: Tensor, T_target_source: Tensor, masks: tuple[Tensor, Tensor]) -> Labels:
     """source (B, N, 3), target (B, M, 3), m, their true relation (B, 4, 4), masks (B, N), (B, M); the limit is 1 m."""
-    moved = transform(T_target_source, source)
+    moved = se3_torch.transform(T_target_source, source)
     distance = torch.cdist(moved, target, compute_mode="donot_use_mm_for_euclid_dist")
     valid = masks[0][:, :, None] & masks[1][:, None]
     return label_distances(distance.masked_fill(~valid, torch.inf), 1.0)

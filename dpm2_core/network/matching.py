@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpm2_core.geometry.kabsch import transform
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.heads import into_set_frame
 from dpm2_core.network.losses import cosine

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpm2_core.geometry.kabsch import transform, weighted_kabsch
+from dpm2_core.geometry.kabsch import weighted_kabsch
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.consensus import TOLERANCE, alternatives, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.kabsch import transform
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.matching import Correspondences
 

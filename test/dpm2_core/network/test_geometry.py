@@ -11,10 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.kabsch import transform, weighted_kabsch
+from dpm2_core.geometry.kabsch import weighted_kabsch
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.geometry.sampling import farthest_points, neighbours
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.spatial import point_bias
 
 

@@ -11,7 +11,7 @@ import torch
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.kabsch import transform
+from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.consensus import alternatives, consensus
 from dpm2_core.network.gauss_newton import weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.heads import OffsetHead, into_set_frame
