@@ -118,7 +118,7 @@ class Localizer:
     def _track(self, keyframe: Keyframe, picture: Image | None) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        result = self._relocalizer.verify(keyframe.cloud, T_predicted, picture=picture)
+        result = self._relocalizer.verify(keyframe.cloud, T_predicted, picture)
         if result.ok:
             return self._located(keyframe, result, jumped=False)
         self._failures += 1

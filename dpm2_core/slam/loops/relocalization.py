@@ -75,9 +75,7 @@ class FindsPlaces(Protocol):
     ) -> Registration:
         """T_map_lidar of a cloud (M, 4), or why it is not known."""
 
-    def verify(
-        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
-    ) -> Registration:
+    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
         """Verifies a pose in the map by the points."""
 
 
@@ -135,26 +133,20 @@ class Relocalizer:
             return found
         if not place.ok:
             return nowhere(f"{found.reason}; {place.reason}")
-        return self._verified(cloud, place.T_target_source, along=partial(self._pictures.along, texture, _REACH))
+        return self._verified(cloud, place.T_target_source, partial(self._pictures.along, texture, _REACH))
 
-    def verify(
-        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
-    ) -> Registration:
-        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not; `widen` as in `Verifier.verify`.
+    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not.
 
         Args:
             picture: taken with the cloud, for where the points leave a direction open.
         """
         texture = self._pictures.texture(picture)
         along = None if texture is None else partial(self._pictures.along, texture, BETWEEN)
-        return self._verified(cloud, T_map_lidar, widen, along)
+        return self._verified(cloud, T_map_lidar, along)
 
     def _verified(
-        self,
-        cloud: Points,
-        T_map_lidar: Array,
-        widen: float = 1.0,
-        along: Callable[[Sequence[int]], Along] | None = None,
+        self, cloud: Points, T_map_lidar: Array, along: Callable[[Sequence[int]], Along] | None = None
     ) -> Registration:
         """As `verify`; `along` gives, of the keyframes around, what finds the way along an open direction."""
         distance = self._distance(T_map_lidar)
@@ -166,7 +158,7 @@ class Relocalizer:
         verifier = self._verifier.suited_to(cloud)
         around = verifier.surroundings([self._clouds[n] for n in nodes], T_at_map @ self._poses[nodes])
         open_way = None if along is None else along(nodes)
-        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, widen, open_way)
+        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, along=open_way)
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
 

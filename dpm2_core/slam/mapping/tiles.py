@@ -215,9 +215,7 @@ class TiledRelocalizer:
         here = self._at(tiles)
         return nowhere("outside the map") if here is None else here.find(cloud, hint, descriptors, picture)
 
-    def verify(
-        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
-    ) -> Registration:
+    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
         """As `Relocalizer.verify`.
 
         Raises:
@@ -227,7 +225,7 @@ class TiledRelocalizer:
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
             self._at(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
         here = self._here
-        return nowhere("outside the map") if here is None else here.verify(cloud, T_map_lidar, widen, picture)
+        return nowhere("outside the map") if here is None else here.verify(cloud, T_map_lidar, picture)
 
     def _at(self, tiles: Collection[Tile]) -> Relocalizer | None:
         self._here = self._make(self._tiles.read(tiles)) if tiles else None

@@ -37,9 +37,7 @@ class Places:
         x = self._found.pop(0)
         return nowhere("nothing fits") if np.isnan(x) else Registration(at(x), FIRM, 0.95, 0.05, "relocalisation")
 
-    def verify(
-        self, cloud: Points, T_map_lidar: Array, widen: float = 1.0, picture: Image | None = None
-    ) -> Registration:
+    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
         return (
             Registration(T_map_lidar, FIRM, 0.95, 0.05, "relocalisation") if self._confirms else nowhere("nothing fits")
         )
