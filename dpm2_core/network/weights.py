@@ -113,8 +113,7 @@ def load_fitting(model: DeepPointMap2, path: Path) -> list[str]:
     fitting = {name: value for name, value in state.items() if name in own and own[name].shape == value.shape}
     if not fitting:
         raise UsageError(f"{path}: nothing in it fits this network")
-    if bad := [name for name, value in fitting.items() if not bool(value.isfinite().all())]:
-        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
+    _check_finite(path, fitting)
     model.load_state_dict(fitting, strict=False)
     return sorted(own.keys() - fitting.keys())
 
@@ -123,10 +122,18 @@ def _fill(model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], m
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
         raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
-    _check_shapes(model, state, f"{path}: does not fit preset {stored}")
-    if bad := [name for name, value in state.items() if not bool(value.isfinite().all())]:
-        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
-    model.load_state_dict(state)
+    load_strictly(model, state, path, f"preset {stored}")
+
+
+def load_strictly(module: nn.Module, state: Mapping[str, torch.Tensor], path: Path, what: str) -> None:
+    """Put the tensors of a file into a module; `what` it was made for.
+
+    Raises:
+        UsageError: names or shapes differ, or a value is not finite.
+    """
+    _check_shapes(module, state, f"{path}: does not fit {what}")
+    _check_finite(path, state)
+    module.load_state_dict(state)
 
 
 def network_settings(path: Path) -> NetworkSettings:
@@ -204,6 +211,11 @@ def _check_shapes(model: nn.Module, state: Mapping[str, torch.Tensor], what: str
     wrong += [name for name in own.keys() & state.keys() if own[name].shape != state[name].shape]
     if wrong:
         raise UsageError(f"{what}: {len(wrong)} tensors differ, such as {min(wrong)}")
+
+
+def _check_finite(path: Path, state: Mapping[str, torch.Tensor]) -> None:
+    if bad := [name for name, value in state.items() if not bool(value.isfinite().all())]:
+        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
 
 
 def _check_numbers(path: Path, value: Any, name: str = "network") -> None:

@@ -16,7 +16,8 @@ from dpm2_core.diffslam.windows import ContiguousWindows
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
-from dpm2_core.network.perception.task_weights import load_strictly, read_weights, write_weights
+from dpm2_core.network.perception.task_weights import read_weights, write_weights
+from dpm2_core.network.weights import load_strictly
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskTraining, task_type
 
@@ -111,7 +112,7 @@ def load_task(name: str, path: Path) -> Task:
     network_type = type(kind.training_type().network)
     state, network = read_weights(path, name, network_type)
     task = kind(kind.training_type(network=network))
-    load_strictly(task, state, path)
+    load_strictly(task, state, path, "its settings")
     return task.eval().requires_grad_(False)
 
 

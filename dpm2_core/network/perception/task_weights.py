@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.network.weights import check_fit, described, read_tensors, write_tensors
+from dpm2_core.network.weights import check_fit, described, load_strictly, read_tensors, write_tensors
 
 T = TypeVar("T", bound=Settings)
 M = TypeVar("M", bound=nn.Module)
@@ -49,21 +49,5 @@ def load_network(path: Path, name: str, part: str, kind: type[T], make: Callable
     state, settings = read_weights(path, name, kind)
     check_fit(path, state, lambda: nn.ModuleDict({part: make(settings)}))
     network = make(settings)
-    load_strictly(nn.ModuleDict({part: network}), state, path)
+    load_strictly(nn.ModuleDict({part: network}), state, path, "its settings")
     return network.eval().requires_grad_(False)
-
-
-def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
-    """Put tensors read from `path` into a module.
-
-    Raises:
-        UsageError: names or shapes differ, or a value is not finite.
-    """
-    own = module.state_dict()
-    wrong = sorted(own.keys() ^ state.keys())
-    wrong += sorted(n for n in own.keys() & state.keys() if own[n].shape != state[n].shape)
-    if wrong:
-        raise UsageError(f"{path}: does not fit its settings: {len(wrong)} tensors differ, such as {wrong[0]}")
-    if bad := [n for n, value in state.items() if not bool(value.isfinite().all())]:
-        raise UsageError(f"{path}: {bad[0]} holds values that are not finite")
-    module.load_state_dict(state)
