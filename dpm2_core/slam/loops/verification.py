@@ -102,8 +102,6 @@ class Verifier:
         """`room`: another one for clouds that show a room; None: this one."""
         self._settings = settings
         self._room = room
-        self._noise = registration.noise
-        self._gate = registration.final_gate
         self._registration = GeometricRegistration(registration)
 
     def suited_to(self, cloud: Points) -> Verifier:
@@ -152,8 +150,7 @@ class Verifier:
 
     def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
         """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand."""
-        residual, _, spread = around.match(source @ T[:3, :3].T + T[:3, 3], self._gate)
-        fits = residual**2 < 9 * (self._noise**2 + spread)  # False for NaN
+        fits = self._registration.fits(source, around, T)
         return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
 
     def _misfit(self, result: Registration, share: float, structure: float, points: int) -> str:

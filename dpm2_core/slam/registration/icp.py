@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
@@ -79,9 +80,7 @@ class GeometricRegistration:
     """Iteratively reweighted Gauss-Newton; a coarse pass over every fourth point brings the full one close."""
 
     def __init__(self, settings: GeometricSettings) -> None:
-        self._settings = settings
-        self.min_points = settings.min_points
-        self.min_inliers_expected = settings.min_inliers_expected
+        self.settings = settings
 
     def register(
         self, source: Array, target: LocalMap, T_guess: Array, widen: float = 1.0, prior: Array | None = None
@@ -96,7 +95,7 @@ class GeometricRegistration:
             prior: (6, 6) information [rad, m] of the prediction. Along a tunnel nothing else says how far the car went;
                 anywhere else the points outweigh it. It is no part of the covariance of the result.
         """
-        s = self._settings
+        s = self.settings
         if len(source) < s.min_points or len(target) < s.min_points:
             reason = f"{len(source)} points against a map of {len(target)}; {s.min_points} needed"
             return Registration.failed("geometric", reason, T_guess)
@@ -108,7 +107,8 @@ class GeometricRegistration:
         prior = 1e-6 * np.eye(6) if prior is None else CORRELATED * prior
         for _ in range(s.iterations):
             points = np.ascontiguousarray(source[::4]) if coarse else source
-            H, gradient, inliers, rmse = self._linearize(points, target, T, gate)
+            matched = self._matched(points, target, T, gate)
+            H, gradient, inliers, rmse = linearize(points, np.ascontiguousarray(T[:3, :3]), *matched)
             if inliers < s.min_points / 4:
                 return Registration.failed("geometric", f"{inliers} of {len(points)} points near the map", T_guess)
             pull = prior @ se3.log(se3.inverse(T_guess) @ T)
@@ -132,9 +132,9 @@ class GeometricRegistration:
     def swept(self, scan: Scan, target: LocalMap, T: Array, beginning: Beginning) -> Swept | None:
         """Pose and motion of the sweep of a scan, which was found at T (4, 4) as if it were rigid; None if its points
         have no times."""
-        if not len(scan.times) or len(target) < self._settings.min_points:
+        if not len(scan.times) or len(target) < self.settings.min_points:
             return None
-        gate = 2 * self._settings.final_gate  # the ends of the sweep are farther off than its middle
+        gate = 2 * self.settings.final_gate  # the ends of the sweep are farther off than its middle
         return register_sweep(scan, lambda points, T: self._matched(points, target, T, gate), T, beginning, CORRELATED)
 
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
@@ -165,18 +165,19 @@ class GeometricRegistration:
 
     def log_density(self, source: Array, target: LocalMap, T: Array) -> Array:
         """Of each of the (N, 3) points (N,), see `likelihood`; 0 where none of the map's surfaces explains it."""
-        residual, _, variance = self._matched(source, target, T, self._settings.final_gate)
+        residual, _, variance = self._matched(source, target, T, self.settings.final_gate)
         return np.fmax(-0.5 * np.log(variance) - np.log1p(residual * residual / variance), 0)
 
-    def _linearize(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, int, float]:
-        """Hessian (6, 6) and gradient (6,) for a step on the right of T, number of inliers, their rmse in m."""
-        return linearize(source, np.ascontiguousarray(T[:3, :3]), *self._matched(source, target, T, gate))
+    def fits(self, source: Array, target: LocalMap, T: Array) -> NDArray[np.bool_]:
+        """Which of the (N, 3) points lie on a surface of the map (N,), to three standard deviations."""
+        residual, _, variance = self._matched(source, target, T, self.settings.final_gate)
+        return residual * residual < 9 * variance  # False for NaN
 
     def _matched(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, Array]:
         """Of each point (N, 3) its distance (N,) m from the surface within the gate, its normal (N, 3) and variance
         (N,) m2; NaN where there is none."""
         residual, normals, spread = target.match(source @ T[:3, :3].T + T[:3, 3], gate)
-        return residual, normals, self._settings.noise**2 + spread
+        return residual, normals, self.settings.noise**2 + spread
 
 
 class GeometricScanRegistration:
@@ -206,7 +207,7 @@ class GeometricScanRegistration:
         return self._preprocessor.prepare(frame, motion)
 
     def rejection(self, scan: Scan) -> str:
-        least = self._registration.min_points
+        least = self._registration.settings.min_points
         return "" if len(scan.source) >= least else f"{len(scan.source)} points; a map needs {least}"
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
@@ -285,7 +286,7 @@ class GeometricScanRegistration:
         order = np.argsort(fit)[::-1]
         rival = next((found[i] for i in order if not near(found[i], found[order[0]], _NEAR)), None)
         result, likelihood = self._fitted(source, found[order[0]])
-        if result.confidence < self._registration.min_inliers_expected:
+        if result.confidence < self._registration.settings.min_inliers_expected:
             return replace(result, ok=False)
         if rival is not None:
             other, its_likelihood = self._fitted(source, rival)
