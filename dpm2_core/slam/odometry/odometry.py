@@ -18,7 +18,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import period_by_motion
 from dpm2_core.geometry.scale import is_enclosed
 from dpm2_core.geometry.sweep import Sweep
-from dpm2_core.slam.bridge import Bridge, Limits
+from dpm2_core.slam.odometry.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
 from dpm2_core.slam.odometry.motion_state import MotionState

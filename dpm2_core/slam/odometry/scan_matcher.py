@@ -16,7 +16,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.deskew import measured_turn, way
 from dpm2_core.geometry.motion import OPEN, predicted
-from dpm2_core.slam.bridge import Bridge
+from dpm2_core.slam.odometry.bridge import Bridge
 from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.odometry.starts import starts_from_rest, turned_starts

@@ -13,7 +13,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.planes import fit_planes
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.registration.occupancy import Occupancy
+from dpm2_core.slam.registration.occupied_voxels import OccupiedVoxels
 from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
@@ -45,7 +45,7 @@ class LocalMap:
         self._inserted = 0
         self._T_last: Array | None = None
         self._taken = np.zeros((0, 4, 4))
-        self._occupancy: Occupancy | None = None  # made when it is needed
+        self._voxels: OccupiedVoxels | None = None  # made when it is needed
 
     def fresh(self) -> LocalMap:
         """Another one, empty."""
@@ -90,7 +90,7 @@ class LocalMap:
         self._grid = PointGrid(joined[first], _CELL * self._settings.voxel)
         self.points, self._entered = self._grid.points, entered[first][self._grid.order]
         self._inserted += 1
-        self._T_last, self._occupancy = T_odom_lidar, None
+        self._T_last, self._voxels = T_odom_lidar, None
         self._normals = np.empty((len(self.points), 3))
         self._variances = np.full(len(self.points), np.nan)
 
@@ -106,11 +106,11 @@ class LocalMap:
         return distances(queries, index, self.points, self._normals, self._variances)
 
     def fit(self, source: Array, poses: Array) -> Array:
-        """How well a scan (N, 3) fits at each of the poses (P, 4, 4), roughly; see `Occupancy`."""
-        if self._occupancy is None:
+        """How well a scan (N, 3) fits at each of the poses (P, 4, 4), roughly; see `OccupiedVoxels`."""
+        if self._voxels is None:
             assert self._T_last is not None
-            self._occupancy = Occupancy(self.points, self._T_last[:3, 3])
-        return self._occupancy.fit(source, poses)
+            self._voxels = OccupiedVoxels(self.points, self._T_last[:3, 3])
+        return self._voxels.fit(source, poses)
 
     def _fit_planes(self, index: NDArray[np.int32]) -> None:
         """Where there are none yet."""

@@ -15,7 +15,7 @@ _RANGE, _HEIGHT = 60.0, 15.0  # m from the center: what lies farther says little
 _INSIDE, _BESIDE = 2, 1  # what a point counts in a voxel that is occupied, and in one next to it
 
 
-class Occupancy:
+class OccupiedVoxels:
     """The voxels around a center that hold map points."""
 
     def __init__(self, points: Array, center: Array) -> None:
