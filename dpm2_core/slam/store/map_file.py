@@ -34,7 +34,7 @@ def move_map(source: Path, target: Path) -> None:
     if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
         raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
     try:
-        remove_log(target)
+        _remove_log(target)
         source.replace(target)
     except OSError as error:
         raise not_written(target, error) from error
@@ -43,10 +43,10 @@ def move_map(source: Path, target: Path) -> None:
 def remove_map(path: Path) -> None:
     """Remove a map file, if it is there, with what SQLite keeps beside it."""
     path.unlink(missing_ok=True)
-    remove_log(path)
+    _remove_log(path)
 
 
-def remove_log(path: Path) -> None:
+def _remove_log(path: Path) -> None:
     """Remove what SQLite keeps beside a map file: another map of that name would be read with it, and be damaged."""
     for suffix in ("-wal", "-shm", "-journal"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)

@@ -24,7 +24,7 @@ from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_connection import MapConnection, create_map, explained, open_map
-from dpm2_core.slam.store.map_file import remove_log, remove_map
+from dpm2_core.slam.store.map_file import move_map, remove_map
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
     Session,
@@ -237,8 +237,7 @@ class MapStore:
             try:
                 with closing(sqlite3.connect(part)) as copy:
                     self._connection.backup(copy)
-                remove_log(path)
-                part.replace(path)
+                move_map(part, path)
             finally:
                 remove_map(part)
 

@@ -32,7 +32,6 @@ class MapWriter:
         self.problem = ""
         self._store, self._clouds = store, clouds
         self._written = poses
-        self._georeference: Georeference | None = None
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
@@ -54,27 +53,29 @@ class MapWriter:
         """The cloud store has a mask for that node."""
         self._moving.add(node)
 
-    def sync(self, poses: Array, georeference: Georeference | None = None) -> None:
+    def sync(self, poses: Array, georeference: Georeference | None) -> None:
         """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`."""
-        self._georeference = georeference
         try:
             while len(self._keyframes) > _BATCH:
-                self._write(poses, self._keyframes[:_BATCH], last=False)
-            self._write(poses, self._keyframes, last=True)
+                self._write(self._keyframes[:_BATCH], poses, georeference)
+            self._write(self._keyframes, poses, georeference)
             self._rewrite()
             self.problem = "" if self._store.in_place else f"{self._store.path}: removed or moved since it was opened"
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
 
-    def _write(self, poses: Array, keyframes: list[tuple[int, Keyframe, bytes | None]], last: bool) -> None:
-        change, ends = Change(), keyframes[-1][0] + 1 if keyframes else len(self._written)
+    def _write(
+        self, keyframes: list[tuple[int, Keyframe, bytes | None]], poses: Array, georeference: Georeference | None
+    ) -> None:
+        """The first of the keyframes that are new, with all that is new of them and of those before."""
+        ends = keyframes[-1][0] + 1 if keyframes else len(self._written)
+        change, poses = Change(georeference=georeference), poses[:ends]
         for node, keyframe, thumbnail in keyframes:
             cloud = self._clouds.loan(node) or self._clouds.packed(node)
             change.keyframes.append((node, keyframe, cloud, thumbnail))
         change.edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) < ends]
-        change.poses = self._moved(poses[:ends] if not last else poses)
+        change.poses = self._moved(poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
-        change.georeference = self._georeference if last else None
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
         self._store.write(change)
         for node, *_ in keyframes:
@@ -82,7 +83,7 @@ class MapWriter:
         self._keyframes = self._keyframes[len(keyframes) :]
         self._edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) >= ends]
         self._moving -= masks.keys()
-        written = np.array(poses[:ends] if not last else poses)
+        written = poses.copy()
         still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
         written[still] = self._written[still]  # small moves add up until they are worth writing
         self._written = written
