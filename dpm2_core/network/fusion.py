@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
@@ -22,7 +24,7 @@ from dpm2_core.network.spatial import (
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.views import Views
 
-SAMPLED = {"roi_pooling": 3}  # side of the window that replaces the image attention
+_WINDOW = 3  # side of the square of samples that roi_pooling has in the place of the image attention
 
 
 class ReferencePoints(nn.Module):
@@ -64,6 +66,18 @@ class ReferencePoints(nn.Module):
         return Tokens(xyz, self.embed(torch.cat([part.to(dtype) for part in parts], -1)), axis, mask)
 
 
+class Branch(NamedTuple):
+    """Tokens (B, T, C) of one modality, their spatial bias (B, h, N, T) or None, and mask (B, 1, N or 1, T).
+
+    rows: (N,) indices of the reference points that read them, if others need not be asked; None: all.
+    """
+
+    tokens: Tensor
+    bias: Tensor | None
+    mask: Tensor
+    rows: Tensor | None = None
+
+
 class FusionLayer(nn.Module):
     """Self-attention of reference points, one attention a modality, and an MLP over the three."""
 
@@ -72,7 +86,7 @@ class FusionLayer(nn.Module):
         width, fusion = settings.channels, settings.fusion
         learnable = fusion.kind != "without_learnable"
         camera = settings.image.backbone != "none"
-        sampled = fusion.kind in SAMPLED
+        sampled = fusion.kind == "roi_pooling"
         self.self_attention = Attention(width, fusion.heads)
         self.lidar = Attention(width, fusion.heads, learnable)
         attends = camera and not sampled and fusion.kind != "point_painting"
@@ -116,16 +130,6 @@ class FusionLayer(nn.Module):
         out = torch.zeros_like(x)
         out[:, image.rows] = self.image(x[:, image.rows], image.tokens, bias, image.mask).to(x.dtype)
         return out
-
-
-class Branch:
-    """Tokens (B, T, C) of one modality, their spatial bias (B, h, N, T) or None, and mask (B, 1, N or 1, T).
-
-    rows: (N,) indices of the reference points that read them, if others need not be asked; None: all.
-    """
-
-    def __init__(self, tokens: Tensor, bias: Tensor | None, mask: Tensor, rows: Tensor | None = None) -> None:
-        self.tokens, self.bias, self.mask, self.rows = tokens, bias, mask, rows
 
 
 class Fusion(nn.Module):
@@ -198,7 +202,7 @@ class Fusion(nn.Module):
         if (
             torch.is_inference_mode_enabled()
             and batch == 1
-            and kind not in SAMPLED
+            and kind != "roi_pooling"
             and self.settings.image_mask == "view"
         ):
             visible = torch.stack([seen_from(xyz, views, view) for view in range(count)]).any(0)[0]
@@ -207,9 +211,9 @@ class Fusion(nn.Module):
                 return None
             xyz = xyz[:, rows]
         bias, seen = ray_bias(xyz, views, uv, self.settings.alpha_image)
-        if kind in SAMPLED:
+        if kind == "roi_pooling":
             finest = maps[0].features.unflatten(0, (batch, count))[:, 0]
-            sampled = sample_at_points(refs.xyz, views, finest, SAMPLED[kind])
+            sampled = sample_at_points(refs.xyz, views, finest, _WINDOW)
             return Branch(self.image_norm(self.image_in(sampled)), None, seen[:, None, :, :1])
         flat = torch.cat([m.features.flatten(2).transpose(1, 2) for m in maps], 1)
         tokens = self.image_norm(self.image_in(flat)).unflatten(0, (batch, count)).flatten(1, 2)

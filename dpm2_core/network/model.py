@@ -55,7 +55,7 @@ class DeepPointMap2(nn.Module):
 
         What is done for each set alone is kept for the next calls with the same object, such as the map of an odometry.
         """
-        with mixed_precision(next(self.parameters()).device):
+        with mixed_precision(self._device):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
             correlated = self.decoder.correlate(prepared_source, prepared_target)
             return _of_sets(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
@@ -64,7 +64,7 @@ class DeepPointMap2(nn.Module):
         """A set for the decoder, made or kept."""
         entry = next((kept for kept in self._prepared if kept[0] is descriptors), None)
         if entry is None:
-            tokens = to_tokens([descriptors.as_encoded()], self.decoder.view_aligned, next(self.parameters()).device)
+            tokens = self._tokens([descriptors])
             entry = descriptors, tokens, self.decoder.prepare(tokens)
         others = tuple(kept for kept in self._prepared if kept[0] is not descriptors)
         self._prepared = (entry, *others)[:_KEPT]  # a new tuple: the SLAM's threads have shallow copies of the network
@@ -73,10 +73,8 @@ class DeepPointMap2(nn.Module):
     @torch.inference_mode()
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
         """`register` for a batch of pairs; nothing is kept."""
-        device = next(self.parameters()).device
-        source = to_tokens([s.as_encoded() for s in sources], self.decoder.view_aligned, device)
-        target = to_tokens([t.as_encoded() for t in targets], self.decoder.view_aligned, device)
-        with mixed_precision(device):
+        source, target = self._tokens(sources), self._tokens(targets)
+        with mixed_precision(self._device):
             correlated = self.decoder(source, target)
             found = register_batch(self.decoder, source, target, correlated, self.solver)
         return [_of_sets(*row) for row in zip(found, sources, targets, strict=True)]
@@ -84,16 +82,13 @@ class DeepPointMap2(nn.Module):
     @torch.inference_mode()
     def agreement(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[float]:
         """0..1, how far a set and each of the others agree on a motion as they are: see `pose_solver.agreement`."""
-        s, found = self.settings.decoder, list[float]()
-        device, view_aligned = next(self.parameters()).device, self.decoder.view_aligned
-        x = to_tokens([source.as_encoded()], view_aligned, device)
-        for target in targets:
-            if target.scale != source.scale:
-                found.append(0.0)
-                continue
-            y = to_tokens([target.as_encoded()], view_aligned, device)
-            found.append(float(agreement(x, y, s.temperature, s.pair_ratio)))
-        return found
+        s, x = self.settings.decoder, self._tokens([source])
+        return [
+            float(agreement(x, self._tokens([target]), s.temperature, s.pair_ratio))
+            if target.scale == source.scale
+            else 0.0
+            for target in targets
+        ]
 
     def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
         """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""
@@ -102,9 +97,8 @@ class DeepPointMap2(nn.Module):
     @torch.inference_mode()
     def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:
         """The descriptors that `register` pairs: positions (K, 3) in each frame, m, and confidence (K,) 0..1."""
-        device = next(self.parameters()).device
-        x, y = (to_tokens([d.as_encoded()], self.decoder.view_aligned, device) for d in (source, target))
-        with mixed_precision(device):
+        x, y = self._tokens([source]), self._tokens([target])
+        with mixed_precision(self._device):
             correlated = self.decoder(x, y)
             pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
@@ -112,6 +106,14 @@ class DeepPointMap2(nn.Module):
         at_target = pairs.target[0, :half].double().cpu().numpy() / target.scale
         weight = pairs.weight[0, :half].double().cpu().numpy()
         return at_source @ source.R_level_set, at_target @ target.R_level_set, weight
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def _tokens(self, sets: Sequence[Descriptors]) -> Tokens:
+        """A batch of sets as the network saw them."""
+        return to_tokens([s.as_encoded() for s in sets], self.decoder.view_aligned, self._device)
 
 
 def _of_sets(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
