@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid motions, rays and point sampling; imports nothing of the rest of the package."""
+"""Rigid motions, rays, point sampling, and what the shape of a scan shows; knows nothing else but frames."""

@@ -10,9 +10,9 @@ import numpy as np
 from numba import float32, float64
 from numpy.typing import ArrayLike, NDArray
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import READ_F4, READ_F8, compiled
-from dpm2_core.geometry.se3 import Array
 
 _STEPS = 32  # along a sweep, between which its points are moved in a straight line: 0.03 mm at 3 rad/s, 20 m away
 _FITTED = 11  # times

@@ -10,17 +10,17 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Frame, Image
+from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.turning import turned
 
-Turn = Callable[[se3.Array], se3.Array | None]
+Turn = Callable[[Array], Array | None]
 
 
 def deskew(
     points: NDArray[np.float32],
     time_offset: NDArray[np.float32],
-    motion: NDArray[np.float64],
+    motion: Array,
     turn: Turn | None = None,
 ) -> NDArray[np.float32]:
     """(N, 4) points as if all had been taken at the stamp; `time_offset` (N,) s.
@@ -33,7 +33,7 @@ def deskew(
     return curve.moved(points, time_offset, partial(way, motion=motion, turn=turn))
 
 
-def way(times: se3.Array, motion: NDArray[np.float64], turn: Turn | None) -> se3.Array:
+def way(times: Array, motion: Array, turn: Turn | None) -> Array:
     """Poses (M, 4, 4) at increasing times (M,) s of a sensor that moves so, as `deskew` takes it."""
     R = None if turn is None or motion.ndim == 2 else turn(times)
     return curve.poses(times, motion) if R is None else _along(times, R, motion[3:])
@@ -45,7 +45,7 @@ def measured_turn(frame: Frame) -> Turn | None:
     return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)
 
 
-def placed(image: Image, seconds: float, twist: NDArray[np.float64]) -> Image:
+def placed(image: Image, seconds: float, twist: Array) -> Image:
     """The image, with its camera where that was so many seconds later, in the LiDAR frame of before.
 
     `twist` (6,) [rad/s, m/s] is the motion of the LiDAR.
@@ -54,7 +54,7 @@ def placed(image: Image, seconds: float, twist: NDArray[np.float64]) -> Image:
     return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 
-def _along(times: se3.Array, R: se3.Array, velocity: se3.Array) -> se3.Array:
+def _along(times: Array, R: Array, velocity: Array) -> Array:
     """Poses (M, 4, 4) at times (M,) s of a sensor that turns by R (M, 3, 3), at a constant velocity (3,) of its own."""
     ways = R @ velocity
     way = np.concatenate([np.zeros((1, 3)), np.cumsum((ways[1:] + ways[:-1]) / 2 * np.diff(times)[:, None], 0)])

@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.point_grid import PointGrid
-from dpm2_core.geometry.sampling import Index, Points, neighbours
+from dpm2_core.geometry.sampling import Index, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 
 SPACING = 0.9  # m between two edges: those of one pole are HEIGHT apart
@@ -58,7 +59,7 @@ def _at_multiples_of_height(mean: Points, centered: NDArray[np.floating]) -> Poi
     return np.hstack([mean[:, :2] + per_height * (z - mean[:, 2:]), z]).astype(np.float32)
 
 
-def verticality(centered: NDArray[np.floating]) -> NDArray[np.float64]:
+def verticality(centered: NDArray[np.floating]) -> Array:
     """(N,) 0..1 of (N, k, 3) neighborhoods about their means: 1 is a vertical line, 0 a patch without a direction.
 
     (sqrt l1 - sqrt l2) / sqrt l1 with the largest eigenvalues of the covariance, times the vertical part of the axis.
@@ -88,7 +89,7 @@ def spaced(points: Points, spacing: float, most: int) -> Index:
 
 
 @compiled("i8[::1](f8[:, ::1], f8, i8)")
-def _spaced(points: NDArray[np.float64], squared: float, most: int) -> Index:
+def _spaced(points: Array, squared: float, most: int) -> Index:
     """Each is compared with those that stay, which are few."""
     stays, count = np.empty(min(most, len(points)), np.int64), 0
     for i in range(len(points)):

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.se3 import Array
 
 _A = 6378137.0  # m, equatorial radius
 _F = 1 / 298.257223563  # flattening

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_opening, minimum_filter
 
+from dpm2_core.frame import Array
+
 _OPENING = 7  # cells
 _FARTHEST = 500  # cells from the origin on each side: memory that one stray point cannot make larger
 _BESIDE = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
@@ -35,7 +37,7 @@ def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: 
     return z - around.reshape(-1)[at]
 
 
-def ground_below(points: NDArray[np.float64], cell: float = 1.0) -> NDArray[np.float64]:
+def ground_below(points: Array, cell: float = 1.0) -> Array:
     """(M,) height of the ground under (M, 3) points, m: the lowest around, which a roof alone cannot raise."""
     at = np.floor(points[:, :2] / cell).astype(np.int64)
     at -= at.min(0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.se3 import Array
 
 OPEN = 0.9
 """Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""

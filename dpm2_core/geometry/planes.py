@@ -6,11 +6,9 @@ from __future__ import annotations
 from math import acos, cos, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
-
-Array = NDArray[np.float64]
 
 
 @compiled("Tuple((f8[:, ::1], f8[::1]))(f8[:, :, ::1])")

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 _Grid = tuple[Array, Array, Index, Index]
 _GRID = "Tuple((f8[:, ::1], f8[::1], i4[:, :, ::1], i4[::1]))"

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Points
 from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.point_grid import PointGrid
 
-Points = NDArray[np.float32]
 Index = NDArray[np.int64]
 
 _CHUNK = 128  # points that are updated together: 64 and 256 are slower for scans

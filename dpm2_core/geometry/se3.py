@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.frame import Array
 from dpm2_core.frame import is_rigid as is_rigid
 from dpm2_core.geometry.compiled import compiled
-
-Array = NDArray[np.float64]
 
 _F = TypeVar("_F", bound=np.floating)
 

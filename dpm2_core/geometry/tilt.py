@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry.voxel import voxel_first
 
 _STEEPEST = 40.0  # degrees: a wall beside a sensor that is tilted by no more than this is steeper
@@ -43,7 +44,7 @@ def up_of(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
     return normal.astype(np.float32) if _is_ground(xyz, normal, height) else None
 
 
-def _planes(xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _planes(xyz: Array) -> tuple[Array, Array]:
     """Unit normals (K, 3) and heights (K,) of the sensor above planes through three points that may be the ground."""
     noise = np.random.default_rng(0)  # the same scan has the same ground
     low = xyz[xyz[:, 2] <= np.median(xyz[:, 2])] if len(xyz) > 256 else xyz
@@ -58,7 +59,7 @@ def _planes(xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     return normals[possible], heights[possible]
 
 
-def _is_ground(xyz: NDArray[np.float64], normal: NDArray[np.float64], height: float) -> bool:
+def _is_ground(xyz: Array, normal: Array, height: float) -> bool:
     above = xyz @ normal + height
     on = np.abs(above) < _NEAR
     if not np.cos(np.radians(_STEEPEST)) < normal[2] or not _HEIGHT[0] < height < _HEIGHT[1]:

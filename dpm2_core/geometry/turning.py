@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.se3 import Array
 
 _LONGEST = 0.1  # s between two samples, across which the rate is taken to change evenly
 _BEYOND = 0.05  # s before the first sample or after the last, for which its rate is taken to go on

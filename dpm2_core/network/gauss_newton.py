@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.se3_torch import exp, hat
 from dpm2_core.network.matching import Correspondences
 
-Array = NDArray[np.float64]
 ROUNDS = 8  # steps
 SOFT = 3.0  # squared residual from which the weights fall
 _DAMPING = 1e-6

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import between, combined, covariance, period_by_motion, predicted
-from dpm2_core.geometry.se3 import Array
 
 TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
 OF_VELOCITY = np.diag([0.2, 0.2, 0.2]) ** 2
