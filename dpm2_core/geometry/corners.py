@@ -14,6 +14,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.contrast import local_contrast
 from dpm2_core.geometry.edges import spaced
 from dpm2_core.geometry.point_grid import PointGrid
+from dpm2_core.geometry.sampling import neighbours
 
 SIDE = 8  # samples along a patch
 TEXTURE = SIDE * SIDE
@@ -101,7 +102,7 @@ def _depth(uv: Array, in_camera: NDArray[np.floating], K: Array, shape: tuple[in
         return np.zeros(len(uv)), np.zeros(len(uv))
     at[:, 2] = 0
     grid = PointGrid(at, _WITHIN / 2)
-    index = grid.order[grid.neighbors(np.pad(uv, ((0, 0), (0, 1))), _NEIGHBORS, _WITHIN)]
+    index = neighbours(grid, np.pad(uv, ((0, 0), (0, 1))), _NEIGHBORS, _WITHIN)
     away = at[index, :2] - uv[:, None]
     squared = (away * away).sum(-1)
     bell = np.exp(-squared / (2 * _BELL**2)) * (squared <= _WITHIN**2)

@@ -9,7 +9,7 @@ from scipy.ndimage import grey_opening, minimum_filter
 
 from dpm2_core.frame import Array
 
-_OPENING = 7  # cells
+_CELL, _OPENING = 1.0, 7  # m, and cells, in which the ground below is looked for
 _FARTHEST = 500  # cells from the origin on each side: memory that one stray point cannot make larger
 _BESIDE = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
@@ -37,9 +37,9 @@ def height_above_ground(points: NDArray[np.floating], cell: float = 1.0, reach: 
     return z - around.reshape(-1)[at]
 
 
-def ground_below(points: Array, cell: float = 1.0) -> Array:
+def ground_below(points: Array) -> Array:
     """(M,) height of the ground under (M, 3) points, m: the lowest around, which a roof alone cannot raise."""
-    at = np.floor(points[:, :2] / cell).astype(np.int64)
+    at = np.floor(points[:, :2] / _CELL).astype(np.int64)
     at -= at.min(0)
     lowest = np.full(at.max(0) + 1, np.inf)
     np.minimum.at(lowest, (at[:, 0], at[:, 1]), points[:, 2])

@@ -16,20 +16,20 @@ _CHUNK = 128  # points that are updated together: 64 and 256 are slower for scan
 _HALVINGS = 5  # of the cloud, to where the sampling starts
 
 
-def farthest_points(points: Points, count: int, grid: PointGrid | None = None) -> Index:
+def farthest_points(points: Points, count: int, grid: PointGrid) -> Index:
     """Farthest point sampling of (N, 3) points: min(N, count) indices, in sampling order.
 
     The same cloud is sampled alike. A prefix of the result is the farthest point sampling of that length: one call
     serves all levels of a pyramid.
 
     Args:
-        grid: of these points, if there is one already.
+        grid: of these points; any cell.
     """
     count = min(count, len(points))
     if count <= 1:
         return np.arange(count)
-    order = (grid or PointGrid(points.astype(np.float64), 1.5)).order
     start = _in_the_corner(points.copy(), np.arange(len(points)))
+    order = grid.order
     return order[_farthest(points[order], int(np.flatnonzero(order == start)[0]), count)].astype(np.int64)
 
 
@@ -128,7 +128,7 @@ def interleaved(points: Points, special: Points, first: int) -> Points:
     return out
 
 
-def neighbours(grid: PointGrid, queries: Points, k: int, radius: float) -> Index:
+def neighbours(grid: PointGrid, queries: NDArray[np.floating], k: int, radius: float) -> Index:
     """(M, k) indices of the neighbors of each query, nearest first; those beyond `radius` m repeat the nearest.
 
     The hybrid of a ball query and k nearest neighbors, in the cloud that the grid was made of.

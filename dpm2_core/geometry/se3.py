@@ -15,6 +15,7 @@ from dpm2_core.frame import is_rigid as is_rigid
 from dpm2_core.geometry.compiled import compiled
 
 _F = TypeVar("_F", bound=np.floating)
+_SMALLEST_VARIANCE = 1e-18
 
 
 def make(R: ArrayLike, t: ArrayLike) -> Array:
@@ -166,12 +167,12 @@ def quaternion(T: Array) -> Array:
     return q if q[3] >= 0 else -q
 
 
-def is_covariance(covariance: Array, smallest: float = 1e-18, largest: float = 1e15) -> bool:
+def is_covariance(covariance: Array, largest: float = 1e15) -> bool:
     """Whether (N, N) is finite, symmetric, positive definite, with variances that a solver can invert."""
     if covariance.ndim != 2 or not np.isfinite(covariance).all():
         return False
     variances = np.diag(covariance)
-    if variances.min() < smallest or variances.max() > largest:
+    if variances.min() < _SMALLEST_VARIANCE or variances.max() > largest:
         return False
     sigma = np.sqrt(variances)
     correlation = covariance / np.outer(sigma, sigma)  # so that rad and m, however different, are treated alike

@@ -145,7 +145,7 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
 
 
 def _verifier(s: SlamSettings) -> Verifier:
-    i = s.indoors() if s.preset == "auto" else s
+    i = s.indoors()
     return Verifier(s.relocalise.verification, s.geometric, Verifier(i.relocalise.verification, i.geometric))
 
 

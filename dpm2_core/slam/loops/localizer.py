@@ -52,16 +52,7 @@ class Localizer:
         self._relocalizer = relocalizer
         self._max_failures = max_failures
         self._hint: Array | None = None
-        self._failures = 0
-        self._distrust = 0.0  # m, path since the map last confirmed the odometry
-        self._T_last: Array | None = None
-        self._far: Array | None = None  # T_map_odom by the last result that was far off, while tracking
-        self._stamp: int | None = None
-        self._last = -1  # id of the last keyframe
-        self.found: int | None = None
-        self.T_map_odom: Array = np.eye(4)
-        self._state = State.RELOCALIZING
-        self._broken = 0  # id of the first keyframe after the odometry was lost
+        self.restart()
 
     @property
     def state(self) -> State:
@@ -83,10 +74,16 @@ class Localizer:
 
     def restart(self) -> None:
         """The odometry has begun anew: one may be anywhere."""
-        self.T_map_odom, self._state = np.eye(4), State.RELOCALIZING
-        self._failures, self._distrust, self._far = 0, 0.0, None
-        self._T_last, self._stamp, self.found = None, None, None
-        self._last, self._broken = -1, 0
+        self.T_map_odom: Array = np.eye(4)
+        self._state = State.RELOCALIZING
+        self._failures = 0
+        self._distrust = 0.0  # m, path since the map last confirmed the odometry
+        self._T_last: Array | None = None
+        self._far: Array | None = None  # T_map_odom by the last result that was far off, while tracking
+        self._stamp: int | None = None
+        self._last = -1  # id of the last keyframe
+        self.found: int | None = None
+        self._broken = 0  # id of the first keyframe after the odometry was lost
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""

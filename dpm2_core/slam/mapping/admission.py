@@ -30,7 +30,7 @@ class RejectedError(UsageError):
         self.reason = reason
 
 
-def check_keyframe(keyframe: Keyframe, channels: int | None = None) -> None:
+def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
     """Reject a keyframe that could do harm.
 
     Args:
@@ -73,7 +73,7 @@ def check_cloud(cloud: Points) -> None:
         raise RejectedError("cloud", f"its cloud reaches farther than {_REACH / 1000:.0f} km")
 
 
-def check_descriptors(d: Descriptors, channels: int | None = None) -> None:
+def check_descriptors(d: Descriptors, channels: int | None) -> None:
     """Raises RejectedError unless they can be compared with those of a network of so many `channels`."""
     count, width = d.features.shape
     if channels is not None and width != channels:

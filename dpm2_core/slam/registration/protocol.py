@@ -83,18 +83,13 @@ class Prediction:
         xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT)
 
-    @property
-    def convincing(self) -> float:
-        """Confidence of points from which their pose is not doubted, if it leaves no direction open.
+    def convinced(self, points: Registration) -> bool:
+        """Whether a result of points fits well enough not to be doubted, if it leaves no direction open.
 
         Where the motion is not known more must fit: of 54 poses between the two values 3 were wrong, of 1,047 above 4
         (vehicles up to 0.9 s after the last scan, one at walking pace up to 2.5 s).
         """
-        return 0.7 if self.known else 0.75
-
-    def convinced(self, points: Registration) -> bool:
-        """Whether a result of points fits well enough not to be doubted; see `convincing`."""
-        return points.ok and points.confidence >= self.convincing
+        return points.ok and points.confidence >= (0.7 if self.known else 0.75)
 
     def strays(self, points: Registration) -> bool:
         """Whether a result of points lies beside where the motion leads, and not nearly all of them fit.

@@ -168,4 +168,5 @@ def test_edges_of_real_scans_meet_again(kitti_root: Path) -> None:
 
     edges = met(edges_of(one), edges_of(other))
     assert edges > 0.4
-    assert edges > 8 * met(one[farthest_points(one, 256)], other[farthest_points(other, 256)])
+    farthest = [cloud[farthest_points(cloud, 256, PointGrid(cloud.astype(float), 1.5))] for cloud in (one, other)]
+    assert edges > 8 * met(*farthest)

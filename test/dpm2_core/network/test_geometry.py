@@ -23,13 +23,14 @@ from dpm2_core.network.spatial import point_bias
 def test_farthest_points_are_greedy(noise: np.random.Generator, n: int) -> None:
     """Each point is the farthest from those before; a shorter sampling is a prefix; no index repeats."""
     points = noise.uniform(-30, 30, (n, 3)).astype(np.float32)
-    order = farthest_points(points, 40)
+    grid = PointGrid(points.astype(float), 1.5)
+    order = farthest_points(points, 40, grid)
     assert len(order) == len(set(order)) == min(n, 40)
     nearest = np.full(n, np.inf)
     for before, chosen in pairwise(order):
         nearest = np.minimum(nearest, np.linalg.norm(points - points[before], axis=1))
         assert nearest[chosen] == pytest.approx(nearest.max(), rel=1e-5)  # float32 ties
-    assert (farthest_points(points, 20) == order[:20]).all()
+    assert (farthest_points(points, 20, grid) == order[:20]).all()
     assert (farthest_points(points, 40, PointGrid(points.astype(float), 9.0)) == order).all()
 
 
@@ -41,7 +42,7 @@ def test_the_sampling_starts_where_that_of_the_training_did(noise: np.random.Gen
         axis = np.ptp(cell, axis=0).argmax()
         low = cell[:, axis] < cell[:, axis].mean()
         cell = cell[low]
-    assert points[farthest_points(points, 2)[0]] in cell
+    assert points[farthest_points(points, 2, PointGrid(points.astype(float), 1.5))[0]] in cell
 
 
 def test_neighbors_beyond_the_radius_repeat_the_nearest(noise: np.random.Generator) -> None:
