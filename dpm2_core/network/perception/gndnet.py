@@ -88,8 +88,8 @@ class GroundNet(nn.Module):
         keep = inside & (above.abs() < s.height_range)
         scan, cell, above = scan[keep], cell[keep], above[keep]
         xyz = torch.cat([scan[:, :2], above[:, None]], 1)
-        count = xyz.new_zeros(s.cells**2).index_add_(0, cell, xyz.new_ones(len(cell))).clamp(min=1)
-        mean = xyz.new_zeros(s.cells**2, 3).index_add_(0, cell, xyz) / count[:, None]
+        count, total = _sums(cell, xyz, s)
+        mean = total / count.clamp(min=1)[:, None]
         grid = torch.stack([cell // s.cells, cell % s.cells], 1)
         center = (grid + 0.5 - s.cells / 2) * s.cell
         own = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - center], 1)
@@ -112,6 +112,12 @@ def cell_of(points: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
     return grid[:, 0] * settings.cells + grid[:, 1], inside
 
 
+def _sums(cell: Tensor, values: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
+    """How many points are in each cell (cells^2,), and the sum (cells^2, ...) of their values (N, ...)."""
+    count = values.new_zeros(settings.cells**2).index_add_(0, cell, values.new_ones(len(cell)))
+    return count, values.new_zeros(settings.cells**2, *values.shape[1:]).index_add_(0, cell, values)
+
+
 def elevation_labels(points: Tensor, ground: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
     """Mean height (cells, cells), m, of the ground points of a scan, and where there are any (cells, cells) bool.
 
@@ -127,8 +133,7 @@ def elevation_labels(points: Tensor, ground: Tensor, settings: GroundSettings) -
         raise UsageError(f"ground labels: {len(ground)} for {len(points)} points")
     cell, inside = cell_of(points, settings)
     keep = inside & ground
-    count = points.new_zeros(settings.cells**2).index_add_(0, cell[keep], points.new_ones(int(keep.sum())))
-    total = points.new_zeros(settings.cells**2).index_add_(0, cell[keep], points[keep, 2])
+    count, total = _sums(cell[keep], points[keep, 2], settings)
     shape = (settings.cells, settings.cells)
     return (total / count.clamp(min=1)).view(shape), (count > 0).view(shape)
 
@@ -212,9 +217,7 @@ def _ratio(part: float, whole: float) -> float:
 def _mse_authors(points: Tensor, elevation: Tensor, settings: GroundSettings) -> float:
     """The authors' mean squared error, m2, of ground points (N, 3+): heights above the level that the car stands on."""
     cell, inside = cell_of(points, settings)
-    cell, height = cell[inside], points[inside, 2] + settings.sensor_height
-    count = points.new_zeros(settings.cells**2).index_add_(0, cell, torch.ones_like(height))
-    total = points.new_zeros(settings.cells**2).index_add_(0, cell, height)
+    count, total = _sums(cell[inside], points[inside, 2] + settings.sensor_height, settings)
     error = (elevation.flatten() + settings.sensor_height - total / (count + 1))[count > 0]
     return float(error.square().mean()) if len(error) else math.nan
 
