@@ -147,6 +147,12 @@ def magnitude(T: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T[:3, 3])), float(np.degrees(angle(T)))
 
 
+def squared_sigmas(T: Array, T_other: Array, covariance: Array) -> float:
+    """Squared distance of two poses (4, 4), in standard deviations of a covariance (6, 6) on the right of the first."""
+    xi = log(inverse(T) @ T_other)
+    return float(xi @ np.linalg.solve(covariance, xi))
+
+
 def orthonormalized(T: Array) -> Array:
     """The nearest rigid transform (projects the rotation, guards against a reflection)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])

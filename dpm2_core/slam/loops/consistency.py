@@ -108,8 +108,8 @@ class OdometryChain:
         a, b = sorted((loop.from_node, loop.to_node))
         back = se3.adjoint(se3.inverse(self._T_odom_kf[loop.to_node]))
         covariance = back @ (self._covariances[b] - self._covariances[a]) @ back.T + loop.covariance
-        error = se3.log(se3.inverse(loop.T_from_to) @ self.T(loop.from_node, loop.to_node))
-        return float(np.sqrt(error @ np.linalg.solve(covariance, error)))
+        T_odometry = self.T(loop.from_node, loop.to_node)
+        return float(np.sqrt(se3.squared_sigmas(loop.T_from_to, T_odometry, covariance)))
 
 
 def margin(since: Array | float, settings: ConsistencySettings) -> Array | float:

@@ -99,8 +99,8 @@ class OtherMotion:
         covariance = _spread(T) + grown
         lost, unsteady = self._before is not self._last, self._is_unsteady(guess, seconds)
         if twist is not None:
-            off = se3.log(se3.inverse(predicted(np.eye(4), twist, seconds)) @ T)
-            impossible = bool(off @ np.linalg.solve(covariance + of_prediction, off) > _POSSIBLE)
+            T_predicted = predicted(np.eye(4), twist, seconds)
+            impossible = se3.squared_sigmas(T_predicted, T, covariance + of_prediction) > _POSSIBLE
             same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
             self._jumped = impossible or (lost and unsteady) or (self._jumped and (lost or same))
             if self._jumped or self._doubt > _CREDIBLE:
@@ -118,14 +118,13 @@ class OtherMotion:
         self._before, self._seconds, self._twist = guess, seconds, se3.log(T) / period
         covariance = _spread(T) + _spread(T_steady) + _grown(before, guess)
         covariance += (self._steadiness * period**2) ** 2 * np.eye(6)
-        off = se3.log(se3.inverse(T_steady) @ T)
-        return bool(off @ np.linalg.solve(covariance, off) > _POSSIBLE)
+        return se3.squared_sigmas(T_steady, T, covariance) > _POSSIBLE
 
     def agrees(self, T_before: Array, result: Registration) -> bool:
         """Whether a scan that was registered from the step's end (the last one at T_before (4, 4)) confirms it."""
         assert self.step is not None
-        off = se3.log(se3.inverse(T_before @ self.step.T) @ result.T_target_source)
-        return bool(off @ np.linalg.solve(result.of_scene + self.step.covariance + MAP_NOISE, off) <= _POSSIBLE)
+        covariance = result.of_scene + self.step.covariance + MAP_NOISE
+        return se3.squared_sigmas(T_before @ self.step.T, result.T_target_source, covariance) <= _POSSIBLE
 
     def compare(self, T_scans: Array, of_scene: Array, seconds: float, used: bool) -> None:
         """With the step (4, 4) that the scans show, to a covariance (6, 6), since the last registered frame."""
@@ -135,8 +134,8 @@ class OtherMotion:
         step = _Way(self._raw, T_scans, of_scene, seconds)
         way = self._way = step if self._way is None else self._way.and_then(step)
         if way.is_judged:
-            off = se3.log(se3.inverse(way.T_other) @ way.T_scans)
-            squared = float(off @ np.linalg.solve(way.of_scans + _spread(way.T_other) + MAP_NOISE, off)) / _USUAL
+            covariance = way.of_scans + _spread(way.T_other) + MAP_NOISE
+            squared = se3.squared_sigmas(way.T_other, way.T_scans, covariance) / _USUAL
             self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
             self._way = None
         self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5, self._unsure)

@@ -32,8 +32,8 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
 
     Errors of calibration are the same in both.
     """
-    xi = se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
-    return bool(xi @ np.linalg.solve(a.of_scene + b.of_scene + MAP_NOISE, xi) <= most)
+    covariance = a.of_scene + b.of_scene + MAP_NOISE
+    return se3.squared_sigmas(a.T_target_source, b.T_target_source, covariance) <= most
 
 
 def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> bool:
