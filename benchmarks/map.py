@@ -225,7 +225,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
 
 
 def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
-    own = sum(not mapper.borrows(node) for node in range(len(mapper.keyframes)))
+    own = sum(mapper.clouds.loan(node) is None for node in range(len(mapper.keyframes)))
     size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
     accepted = sum(loop.ok for loop in mapper.loops)
     return {"lap": lap + 1, "keyframes": len(mapper.keyframes), "with_own_cloud": own, "bytes": size, "loops": accepted}

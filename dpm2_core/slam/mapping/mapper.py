@@ -134,10 +134,6 @@ class Mapper:
         """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
         return self._clouds
 
-    def borrows(self, node: int) -> bool:
-        """Whether a keyframe came back to an older one, and shows that one's cloud and descriptors as its own."""
-        return self._clouds.loan(node) is not None
-
     @property
     def store_problem(self) -> str:
         """Why the map file is behind, in words; empty when it is not, or when there is none."""

@@ -134,7 +134,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
             mapper = make(store)
             for keyframe in laps(count):
                 mapper.add(keyframe)
-            own = sum(not mapper.borrows(node) for node in range(len(mapper.keyframes)))
+            own = sum(mapper.clouds.loan(node) is None for node in range(len(mapper.keyframes)))
         sizes.append((own, path.stat().st_size))
     (own_1, _), (own_4, _) = sizes
     assert own_1 == LAP
@@ -143,7 +143,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     off = make(redundancy={"distance": 0})
     for keyframe in laps(2):
         off.add(keyframe)
-    assert not any(off.borrows(node) for node in range(40))
+    assert all(off.clouds.loan(node) is None for node in range(40))
 
 
 def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
     far = make(redundancy={"distance": 1e-3})
     for keyframe in keyframes:
         far.add(keyframe)
-    assert not far.borrows(25)  # 2 mm apart
+    assert far.clouds.loan(25) is None  # 2 mm apart
 
 
 def test_a_second_session_counts_on(tmp_path: Path) -> None:
