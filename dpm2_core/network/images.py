@@ -29,15 +29,8 @@ def small_image(image: Image, settings: ImageSettings) -> Image:
         return image
     if camera.distortion:
         pixels = np.asarray(cv2.undistort(pixels, camera.K, np.array(camera.distortion)), np.uint8)
-    small, K = resize(pixels, camera.K, settings.size)
-    return Image(np.ascontiguousarray(small.transpose(1, 2, 0)), replace(camera, K=K, size=size, distortion=()))
-
-
-def resize(pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Resize (H, W, 3) to (3, *size) and scale the intrinsics, pixel centers being at integers."""
-    height, width = pixels.shape[:2]
-    out = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA)
-    scale = np.diag([size[1] / width, size[0] / height, 1.0])
-    shift = np.eye(3)
-    shift[:2, 2] = 0.5
-    return out.transpose(2, 0, 1), np.linalg.inv(shift) @ scale @ shift @ K
+    scale, shift = np.diag([size[0] / pixels.shape[1], size[1] / pixels.shape[0], 1.0]), np.eye(3)
+    shift[:2, 2] = 0.5  # the center of the first pixel is (0, 0)
+    K = np.linalg.inv(shift) @ scale @ shift @ camera.K
+    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return Image(small, replace(camera, K=K, size=size, distortion=()))

@@ -14,7 +14,6 @@ from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.encoder import Encoder
-from dpm2_core.network.images import resize
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import argmax_neighbor
 from dpm2_core.network.pretrained import weights_path
@@ -230,17 +229,6 @@ def test_a_painted_cloud_carries_the_color_of_its_pixel(noise: np.random.Generat
         painted = model.encoder(points, views).tokens.features
         torch.testing.assert_close(model.encoder(points).tokens.features, plain)
     assert not torch.allclose(painted, plain, atol=1e-3)
-
-
-def test_resize_moves_the_intrinsics_with_the_pixels() -> None:
-    """A bright pixel's ray is the same before and after halving: centers of pixels are at integers."""
-    pixels = np.zeros((64, 128, 3), np.uint8)
-    pixels[20:22, 40:42] = 255  # center (40.5, 20.5)
-    K = np.array([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]])
-    small, K_small = resize(pixels, K, (32, 64))
-    v, u = np.unravel_index(small[0].argmax(), small[0].shape)
-    before = np.linalg.solve(K, [40.5, 20.5, 1])
-    np.testing.assert_allclose(np.linalg.solve(K_small, [u, v, 1]), before, atol=1e-9)
 
 
 def test_argmax_neighbor() -> None:

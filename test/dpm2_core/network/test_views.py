@@ -36,6 +36,18 @@ def test_a_distorted_image_shows_a_point_where_the_camera_says() -> None:
     assert np.abs(middle - (small.camera.K @ point)[:2]).max() < 0.5
 
 
+def test_the_intrinsics_move_with_the_pixels() -> None:
+    """A bright pixel's ray is the same before and after halving: centers of pixels are at integers."""
+    pixels = np.zeros((64, 128, 3), np.uint8)
+    pixels[20:22, 40:42] = 255  # center (40.5, 20.5)
+    K = np.array([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]])
+    small = small_image(Image(pixels, Camera(K, np.eye(4), (128, 64))), ImageSettings(size=(32, 64)))
+    bright = small.pixels[..., 0]
+    v, u = np.unravel_index(bright.argmax(), bright.shape)
+    before = np.linalg.solve(K, [40.5, 20.5, 1])
+    np.testing.assert_allclose(np.linalg.solve(small.camera.K, [u, v, 1]), before, atol=1e-9)
+
+
 def test_a_small_image_is_read_as_the_image_itself(noise: np.random.Generator) -> None:
     image = make_image(noise, (320, 240))
     image = replace(image, camera=replace(image.camera, distortion=BARREL))
