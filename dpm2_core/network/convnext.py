@@ -80,8 +80,8 @@ class ImagePyramid(nn.Module):
         if missing:
             raise ValueError(f"image strides {sorted(missing)}: the backbone has {strides}")
         self.first = strides.index(min(settings.strides))
-        self.strides = settings.strides
-        self.all_strides = strides
+        self.strides = sorted(settings.strides)
+        self.chosen = [strides.index(stride) - self.first for stride in self.strides]
         self.backbone = backbone
         width = settings.pyramid
         self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels[self.first :])
@@ -99,8 +99,7 @@ class ImagePyramid(nn.Module):
         for i in range(len(levels) - 2, -1, -1):
             up = nn.functional.interpolate(levels[i + 1], levels[i].shape[-2:], mode="nearest")
             levels[i] = levels[i] + up
-        chosen = [levels[self.all_strides.index(stride) - self.first] for stride in sorted(self.strides)]
         return [
-            FeatureMap(smooth(level), stride)
-            for smooth, level, stride in zip(self.smooth, chosen, sorted(self.strides), strict=True)
+            FeatureMap(smooth(levels[i]), stride)
+            for smooth, i, stride in zip(self.smooth, self.chosen, self.strides, strict=True)
         ]

@@ -161,7 +161,7 @@ class Dslr(nn.Module):
 
 
 def load(path: Path) -> Dslr:
-    """A trained translator, ready for inference on the CPU; raises as `weights.load_network`."""
+    """A trained translator, ready for inference on the CPU; raises as `task_weights.load_network`."""
     return load_network(path, "dslr", "network", DslrSettings, Dslr)
 
 

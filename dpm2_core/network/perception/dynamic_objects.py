@@ -114,5 +114,5 @@ def _block(inputs: int, middle: int, outputs: int, stride: int = 1) -> nn.Sequen
 
 
 def load(path: Path) -> DynamicObjectNet:
-    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
+    """A trained network on the CPU, ready for inference; raises as `task_weights.load_network`."""
     return load_network(path, "movers", "net", DynamicObjectNetSettings, DynamicObjectNet)

@@ -100,7 +100,7 @@ class GroundNet(nn.Module):
 
 
 def load(path: Path) -> GroundNet:
-    """A trained network on the CPU, ready for inference; raises as `weights.load_network`."""
+    """A trained network on the CPU, ready for inference; raises as `task_weights.load_network`."""
     return load_network(path, "gndnet", "net", GroundSettings, GroundNet)
 
 

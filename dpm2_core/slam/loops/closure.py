@@ -93,6 +93,11 @@ class LoopCloser:
         """Width of the features that the network makes; None without a network."""
         return None if self._places is None else self._places.channels
 
+    @property
+    def _by_head(self) -> bool:
+        """Whether the overlap head alone decides, as in the paper: then it is asked of every candidate."""
+        return self._settings.decided_by == "overlap"
+
     def described(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with descriptors, of its cloud where its registration made none; as it is if that has none."""
         if keyframe.descriptors is not None or self._places is None:
@@ -127,7 +132,7 @@ class LoopCloser:
         self._consistency.update(poses, parts)
         since = self._path.since(node)
         tried, proposals = self._proposals(node, since, keyframes, poses)
-        if self._settings.decided_by == "overlap":
+        if self._by_head:
             return tried + proposals[:1]
         most, failed = self._settings.verified, list[Edge]()
         for number, proposal in enumerate(proposals[:most]):
@@ -150,22 +155,21 @@ class LoopCloser:
         """Candidates that the network rejected, and those for the points to verify, the most likely first."""
         s, descriptors = self._settings, keyframes[node].descriptors
         distance = np.linalg.norm(poses[:, :3, 3] - poses[node, :3, 3], axis=1)
-        by_points = s.decided_by == "points"
-        nearest = self._nearest(since, distance) if by_points else None
+        nearest = None if self._by_head else self._nearest(since, distance)
         rejections: list[Edge] = []
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
             allowed = since > s.gap
-            if by_points:  # what the odometry would reject in any case is not asked for
+            if not self._by_head:  # what the odometry would reject in any case is not asked for
                 allowed &= distance <= _SEEN / descriptors.scale + margin(since, s.consistency)
             similar = self._places.similar(descriptors, allowed, s.candidates)
             found = self._registered(node, similar, keyframes)
-            rank = "overlap" if s.decided_by == "overlap" else "confidence"
+            rank = "overlap" if self._by_head else "confidence"
             for loop in sorted(found, key=lambda loop: -getattr(loop.registration, rank)):
                 r = loop.registration
                 if not r.ok:
                     rejections.append(loop)
-                elif s.decided_by == "overlap" and np.isnan(r.overlap):
+                elif self._by_head and np.isnan(r.overlap):
                     rejections.append(loop.rejected("the overlap head of these weights is not trained"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing
                     rejections.append(loop.rejected(f"the places overlap with a probability of only {r.overlap:.2f}"))
@@ -184,8 +188,7 @@ class LoopCloser:
         targets = [keyframes[c].descriptors for c in candidates]
         assert source is not None
         known = [t for t in targets if t is not None]
-        by_head = self._settings.decided_by == "overlap"  # whose opinion of each is asked for, as in the paper
-        results = self._places.register(source, known, 0.0 if by_head else AGREEING)
+        results = self._places.register(source, known, 0.0 if self._by_head else AGREEING)
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, distance: Array) -> int | None:

@@ -16,7 +16,7 @@ from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Image, Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.loops.verification import Along, Verifier, meters_apart, second_best
+from dpm2_core.slam.loops.verification import Along, Verifier, second_best
 from dpm2_core.slam.registration.texture import (
     Reference,
     Texture,
@@ -117,7 +117,7 @@ class PicturedPlaces:
         if not places:
             return None
         best = max(places, key=lambda place: place.confidence)
-        others = [place for place in places if meters_apart(place, best) > _APART]
+        others = [p for p in places if np.linalg.norm((p.T_target_source - best.T_target_source)[:3, 3]) > _APART]
         return replace(best, ok=not (why := _objection(best, others)), reason=why)
 
     def _seen(self, node: int, view: _View, closely: bool = False) -> list[Registration]:

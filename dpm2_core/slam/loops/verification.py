@@ -88,11 +88,6 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
     return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
 
 
-def meters_apart(a: Registration, b: Registration) -> float:
-    """Between the positions of two results in one map."""
-    return float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))
-
-
 class Verifier:
     """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
 
