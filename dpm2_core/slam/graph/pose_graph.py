@@ -170,7 +170,7 @@ class PoseGraph:
         return self._trajectories.part(node, self._loops)
 
     @property
-    def parts(self) -> NDArray[np.intp]:
+    def parts(self) -> NDArray[np.int32]:
         """(N,) the part of each node."""
         return self._trajectories.parts(self._loops)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.estimates import Edge
+from dpm2_core.slam.graph.graph_data import components
 
 
 class Trajectories:
@@ -21,7 +22,7 @@ class Trajectories:
     def __init__(self) -> None:
         self.of: list[int] = []
         self._ends: list[int] = []  # last node of each
-        self._parts: list[int] | None = None  # until loops or trajectories change
+        self._parts: NDArray[np.int32] | None = None  # of each, until loops or trajectories change
 
     def begin(self) -> None:
         """The next node is the start of another one."""
@@ -46,22 +47,19 @@ class Trajectories:
         self._parts = None
 
     def part(self, node: int, loops: Sequence[Edge]) -> int:
-        """The oldest trajectory that accepted loops tie a node's to: nodes of two parts have nothing in common."""
-        return self._tied(loops)[self.of[node]]
+        """The part of the graph, from 0 and the oldest first, that a node is in by the accepted loops: nodes of two
+        parts have nothing in common."""
+        return int(self._tied(loops)[self.of[node]])
 
-    def parts(self, loops: Sequence[Edge]) -> NDArray[np.intp]:
+    def parts(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
         """(N,) the part of each node."""
-        return np.array(self._tied(loops), np.intp)[self.of]
+        return self._tied(loops)[self.of]
 
-    def _tied(self, loops: Sequence[Edge]) -> list[int]:
+    def _tied(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
         """The part of each trajectory."""
         if self._parts is None:
-            parts = list(range(len(self._ends)))
-            for loop in loops:
-                one, other = sorted(parts[self.of[end]] for end in (loop.from_node, loop.to_node))
-                if loop.ok and one != other:
-                    parts = [one if part == other else part for part in parts]
-            self._parts = parts
+            ends = [(self.of[loop.from_node], self.of[loop.to_node]) for loop in loops if loop.ok]
+            self._parts = components(len(self._ends), np.array(ends, np.intp).reshape(-1, 2))
         return self._parts
 
     def order(self, count: int | None = None) -> NDArray[np.intp]:
