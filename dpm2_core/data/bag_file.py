@@ -173,12 +173,16 @@ def _read_parts(parts: list[Bag], topics: Collection[str]) -> Iterator[RawMessag
 
 
 def _open_file(file: Path) -> Bag:
-    if file.suffix == ".bag" and file.is_file():
-        return _open_ros1(file)
     try:
         return _open_indexed(file)
     except Exception as error:  # rosbags raises ReaderError, TypeError, apsw.Error... by the kind of damage
+        if _is_ros1(file):
+            raise UsageError(f"{file}: cannot be read as a ROS 1 bag: {one_line(error)}") from None
         return _open_scanned(file, one_line(error))
+
+
+def _is_ros1(file: Path) -> bool:
+    return file.suffix == ".bag" and file.is_file()
 
 
 @cache
@@ -187,17 +191,17 @@ def _jazzy() -> Typestore:
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Reader]:
+def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
     if file.suffix == ".db3":
         check_plain(file)
-    with Reader(file) as reader:
+    with Ros1Reader(file) if _is_ros1(file) else Reader(file) as reader:
         yield reader
 
 
 def _open_indexed(file: Path) -> Bag:
     with _opened(file) as reader:
         _check_index(reader)
-        connections, start = list(reader.connections), reader.start_time
+        connections, start = list(reader.connections), reader.start_time  # closing forgets them
     types = {connection.topic: connection.msgtype for connection in connections}
     counts = Counter(dict.fromkeys(types, 0))
     for connection in connections:
@@ -205,13 +209,13 @@ def _open_indexed(file: Path) -> Bag:
     return Bag(file, types, counts, partial(_read_indexed, file), start=start)
 
 
-def _check_index(reader: Reader) -> None:
+def _check_index(reader: Reader | Ros1Reader) -> None:
     """Without an index rosbags ends at a message that was written late; what an index lacks it leaves out.
 
     Raises:
         ReaderError: the index of an MCAP file does not lead to every message, or not to the types of all.
     """
-    if not isinstance(reader.storage, McapReader):
+    if isinstance(reader, Ros1Reader) or not isinstance(reader.storage, McapReader):
         return
     chunks, known = reader.storage.chunks, {c.id for c in reader.connections if c.msgtype != _NO_SCHEMA}
     indexed = sum(count for chunk in chunks for key, count in chunk.channel_count.items() if key in known)
@@ -220,30 +224,11 @@ def _check_index(reader: Reader) -> None:
 
 
 def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
+    ros1 = _is_ros1(file)
     with _opened(file) as reader:
         requested = [connection for connection in reader.connections if connection.topic in topics]
         for connection, time, data in reader.messages(connections=requested):
-            yield connection.topic, time, data
-
-
-def _open_ros1(path: Path) -> Bag:
-    try:
-        with Ros1Reader(path) as reader:
-            connections, start = list(reader.connections), reader.start_time  # closing forgets them
-    except Exception as error:  # damaged files raise anything from ReaderError to struct.error
-        raise UsageError(f"{path}: cannot be read as a ROS 1 bag: {one_line(error)}") from None
-    counts: Counter[str] = Counter()
-    for connection in connections:
-        counts[connection.topic] += connection.msgcount
-    types = {connection.topic: connection.msgtype for connection in connections}
-    return Bag(path, types, dict(counts), partial(_read_ros1, path), start=start)
-
-
-def _read_ros1(path: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-    with Ros1Reader(path) as reader:
-        requested = [connection for connection in reader.connections if connection.topic in topics]
-        for connection, time, data in reader.messages(connections=requested):
-            yield connection.topic, time, _as_ros2(data, connection.msgtype)
+            yield connection.topic, time, _as_ros2(data, connection.msgtype) if ros1 else data
 
 
 def _as_ros2(data: bytes, kind: str) -> bytes:
