@@ -38,15 +38,13 @@ class Job:
     """A call in another process.
 
     Attributes:
-        key: its name. function: of a module, with `arguments`; where `tells`, also with a keyword `advance`, to be told
-            of the progress.
+        key: its name. function: of a module, called with `arguments`, and with `advance` to be told of the progress.
         cores, memory: processors and bytes that it takes at most.
     """
 
     key: str
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
-    tells: bool = False
     cores: int = 1
     memory: int = 0
 
@@ -255,7 +253,7 @@ def _attempt(job: Job, board: Any, version: str) -> Ended:
     try:
         if version != __version__:
             raise Dpm2Error(f"{socket.gethostname()} has dpm2 {__version__}, the caller {version}")
-        return Ended(job.key, job.function(*job.arguments, **({"advance": advance} if job.tells else {})))
+        return Ended(job.key, job.function(*job.arguments, advance=advance))
     except Dpm2Error as error:
         return Ended(job.key, None, str(error))
     except Exception as error:  # a bug ends its job, not the hours of the others

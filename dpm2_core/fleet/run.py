@@ -66,7 +66,8 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     missing = [part for part in parts if part.name not in kept]
     view.begun([part.name for part in missing])
     try:
-        for name, figures, reason in cluster.run([_job(part, out) for part in missing], view.running):
+        jobs = [Job(part.name, do_part, (part, out), cores=part.cores, memory=MEMORY) for part in missing]
+        for name, figures, reason in cluster.run(jobs, view.running):
             outcomes[name] = Outcome(name, "failed" if reason else "done", figures, reason)
             view.ended(outcomes[name])
     except KeyboardInterrupt:
@@ -75,10 +76,6 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
         for part in missing:
             remove_attempts(part, out)
     return [outcomes.get(part.name, Outcome(part.name, "stopped")) for part in parts]
-
-
-def _job(part: Part, out: Path) -> Job:
-    return Job(part.name, do_part, (part, out), tells=True, cores=part.cores, memory=MEMORY)
 
 
 def summary_table(title: str, outcomes: Sequence[Outcome]) -> FigureTable:

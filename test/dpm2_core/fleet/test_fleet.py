@@ -52,7 +52,7 @@ def killed_once(folder, advance, **arguments):
             os.kill(os.getpid(), signal.SIGKILL)
     return drives.run_drive(folder, dying, **arguments)
 
-def divide(value):
+def divide(value, advance):
     if value < 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return 10 // value
