@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge
 from dpm2_core.fleet.joins import ENOUGH
-from dpm2_core.fleet.regions import Join
+from dpm2_core.fleet.regions import Join, first_nodes, owners, sizes_of
 from dpm2_core.fleet.search import affirmed, component
 from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
@@ -39,8 +39,7 @@ _TOGETHER = 200  # nodes that are asked for at once
 
 def spans_of(sizes: Mapping[str, int]) -> dict[str, range]:
     """The nodes of each drive in a file that has so many keyframes of each, one drive after the other."""
-    ends = np.cumsum([0, *sizes.values()]).tolist()
-    return {name: range(a, b) for name, a, b in zip(sizes, ends, ends[1:], strict=False)}
+    return {name: range(first, first + sizes[name]) for name, first in first_nodes(sizes).items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +70,7 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
     """
     for name, data in growth.maps.items():
         append_map(store, _renamed(name, data))
-    spans = spans_of({**inside, **{name: len(data) for name, data in growth.maps.items()}})
-    first = {name: span.start for name, span in spans.items()}
+    first = first_nodes({**inside, **sizes_of(growth.maps)})
     loops = [join.loop_at(first) for join in (*growth.joins, *refused) if {join.one, join.other} <= first.keys()]
     known = None
     if next(store.rows("georeference"), None) is None:
@@ -82,13 +80,12 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
 
 def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
     """Loops of a file as joins of the drives in it; those within a drive, too."""
-    spans = spans_of(inside)
-    ones, others = (_owners([getattr(loop, end) for loop in loops], spans) for end in ("from_node", "to_node"))
+    first = first_nodes(inside)
+    ones, others = (owners([getattr(loop, end) for loop in loops], first) for end in ("from_node", "to_node"))
     return [
-        Join(one, other, replace(loop, from_node=loop.from_node - spans[one].start,
-                                 to_node=loop.to_node - spans[other].start))
+        Join(one, other, loop.between(loop.from_node - first[one], loop.to_node - first[other]))
         for one, other, loop in zip(ones, others, loops, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _georeference(data: MapData) -> Georeference | None:
@@ -157,7 +154,7 @@ def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -
             return None
         joins, contradicted = affirmed(part.joins)
         refused += contradicted
-        sizes = {**there.sizes, **{name: len(data) for name, data in maps.items()}}
+        sizes = {**there.sizes, **sizes_of(maps)}
         together = component(sizes, joins, there.sizes)
         if not set(there.sizes) <= set(together):
             return None
@@ -180,12 +177,12 @@ def _nearest_first(inside: Collection[str], maps: Mapping[str, MapData], joins: 
 
 def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
     """Solve for new drives and for what they touch, and for more of the map as long as its borders are strained."""
-    sizes, spans = there.sizes, spans_of(there.sizes)
+    sizes, spans, first = there.sizes, spans_of(there.sizes), first_nodes(there.sizes)
     active = there.between({end for join in joins for end in (join.one, join.other) if end in sizes})
     while sum(map(len, maps.values())) + sum(sizes[name] for name in active) <= there.largest:
         region = _Region(there.store, [spans[name] for name in sizes if name in active], there.settings)
-        growth = region.with_drives(maps, joins, {name: spans[name].start for name in active})
-        further = region.strained(spans)
+        growth = region.with_drives(maps, joins, {name: first[name] for name in active})
+        further = region.strained(first)
         if any(join.loop.ok for join in affirmed(growth.joins)[1]) and len(active) < len(sizes):
             further = set(sizes)  # it may be the held ones that are wrong
         if not further:
@@ -260,15 +257,15 @@ class _Region:
         return {number: replace(loop, registration=now.registration)
                 for (number, loop), now in zip(self._loops.items(), self._graph.loops, strict=False)}  # fmt: skip
 
-    def strained(self, spans: Mapping[str, range]) -> set[str]:
-        """The drives beside the region whose loops to it the new poses pull at, all of a drive together."""
+    def strained(self, first: Mapping[str, int]) -> set[str]:
+        """The drives beside the region whose loops to it the new poses pull at; `first` is of all drives here."""
         outer = set(self._outer)
         border = [loop for loop in self._loops.values() if {loop.from_node, loop.to_node} & outer]
         if not border:
             return set()
         before, after = (self._errors(border, moved) for moved in (False, True))
         chi2 = mahalanobis(after - before, np.array([loop.covariance for loop in border]))
-        beside = _owners([end for loop in border for end in {loop.from_node, loop.to_node} & outer], spans)
+        beside = owners([end for loop in border for end in {loop.from_node, loop.to_node} & outer], first)
         return {name for name in beside if chi2[np.array(beside) == name].sum() > _STRAINED**2}
 
     def _errors(self, loops: Sequence[Edge], moved: bool) -> Array:
@@ -284,12 +281,6 @@ class _Region:
         for join in joins_of(self._judged().values(), inside):
             left[join.one, join.other] |= {join.loop.to_node} if join.loop.ok else set()
         return all(len(nodes) >= ENOUGH for (one, other), nodes in left.items() if one != other)
-
-
-def _owners(nodes: Sequence[int], spans: Mapping[str, range]) -> list[str]:
-    """The drive of each node."""
-    names, begins = list(spans), [span.start for span in spans.values()]
-    return [names[number] for number in np.searchsorted(begins, nodes, side="right") - 1]
 
 
 def _within(spans: Sequence[range], *columns: str) -> str:

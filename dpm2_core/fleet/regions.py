@@ -79,7 +79,7 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSe
     Raises:
         Dpm2Error: a graph cannot be solved.
     """
-    regions = regions_of({name: len(data) for name, data in maps.items()}, joins, largest)
+    regions = regions_of(sizes_of(maps), joins, largest)
     owner = {name: number for number, names in enumerate(regions) for name in names}
     inner, outer = defaultdict(list), []
     for join in joins:
@@ -98,16 +98,27 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSe
 
 def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
     """The drives in one map, each with the poses that it has, and their joins as loops; its frame that of the first."""
-    first = first_nodes(maps)
+    first = first_nodes(sizes_of(maps))
     loops = [join.loop_at(first) for join in joins]
     drives = list(maps.values())
     both = _halved(drives)
     return replace(both, edges=[*both.edges, *loops], georeference=drives[0].georeference)
 
 
-def first_nodes(maps: Mapping[str, MapData]) -> dict[str, int]:
-    """The node with which each drive begins where they are side by side."""
-    return dict(zip(maps, np.cumsum([0, *map(len, maps.values())]).tolist(), strict=False))
+def sizes_of(maps: Mapping[str, MapData]) -> dict[str, int]:
+    """Keyframes of each drive."""
+    return {name: len(data) for name, data in maps.items()}
+
+
+def first_nodes(sizes: Mapping[str, int]) -> dict[str, int]:
+    """The node with which each drive begins where one is after the other."""
+    return dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+
+
+def owners(nodes: Sequence[int], first: Mapping[str, int]) -> list[str]:
+    """The drive of each node; `first`: with which they begin."""
+    names = list(first)
+    return [names[number] for number in np.searchsorted(list(first.values()), nodes, side="right") - 1]
 
 
 def _halved(maps: Sequence[MapData]) -> MapData:
@@ -121,7 +132,7 @@ def _halved(maps: Sequence[MapData]) -> MapData:
 def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
             held: Mapping[tuple[str, int], Array] | None = None) -> Region:  # fmt: skip
     """Solve drives and their joins; `held`: (4, 4) of nodes that stay there."""
-    data, first = side_by_side(maps, joins), first_nodes(maps)
+    data, first = side_by_side(maps, joins), first_nodes(sizes_of(maps))
     graph = PoseGraph(settings)
     restore(graph, data)
     for (name, node), T in (held or {}).items():
@@ -140,7 +151,8 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
     graph, where = PoseGraph(settings), dict[tuple[str, int], int]()
     for region in solved:
         own = {name: maps[name] for name in region.poses}
-        data, first = side_by_side(own, [join for join in region.joins if join.loop.ok]), first_nodes(own)
+        data = side_by_side(own, [join for join in region.joins if join.loop.ok])
+        first = first_nodes(sizes_of(own))
         data = replace(data, poses=np.concatenate([region.poses[name] for name in own]))
         within = PoseGraph(settings)
         restore(within, data)

@@ -21,7 +21,7 @@ from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, edge_from, join_part, stretches
 from dpm2_core.fleet.part import Figures, Part, is_whole
 from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
-from dpm2_core.fleet.regions import Join
+from dpm2_core.fleet.regions import Join, first_nodes, owners
 from dpm2_core.fleet.run import Outcome, View, do_parts
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.loops.retrieval import Vector
@@ -148,12 +148,12 @@ class Search:
 
 def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:
     """Of each drive in the index: node of it and node of the new drive, where they look alike."""
-    begins = np.cumsum([0, *(count for *_, count in index.drives)])
+    first = first_nodes({name: count for name, _, count in index.drives})
     out: dict[str, list[list[int]]] = defaultdict(list)
     for node, found in enumerate(index.similar(vectors, _CANDIDATES)):
-        for place in found[found >= 0].tolist():
-            number = int(np.searchsorted(begins, place, side="right")) - 1
-            out[index.drives[number][0]].append([int(place - begins[number]), node])
+        places = found[found >= 0].tolist()
+        for place, name in zip(places, owners(places, first), strict=True):
+            out[name].append([place - first[name], node])
     return out
 
 
