@@ -44,7 +44,7 @@ class Listener:
         self.harness, self._domain, self._log = harness, domain, log
         self.clouds = harness.hear(PointCloud2, topics.POINTS)
         self.images = harness.hear(Image, topics.IMAGE)
-        self.infos = harness.hear(CameraInfo, topics.CAMERA_INFO)
+        self.infos = harness.hear(CameraInfo, f"{topics.KITTI.camera}/camera_info")
         self.clock = harness.hear(Clock, "/clock", 1000)
         latched = QoSProfile(depth=LATCHED_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.static = harness.hear(TFMessage, topics.TF_STATIC, latched)

@@ -62,7 +62,7 @@ def with_shots(bag: Path, folder: Path, shots: Shots, later: int) -> Path:
     out: list[tuple[int, str, bytes]] = []
     for topic, log_time, data in source.messages(list(source.types)):
         if topic != topics.IMAGE:
-            out.append((log_time + later * (topic == topics.CAMERA_INFO), topic, data))
+            out.append((log_time + later * (topic == f"{topics.KITTI.camera}/camera_info"), topic, data))
     image = source.first(topics.IMAGE)
     assert image is not None
     for stamp, log_time in shots:

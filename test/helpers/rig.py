@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import CAMERA_INFO, IMAGE, POINTS
+from dpm2_core.data.topics import IMAGE, KITTI, POINTS
 from dpm2_ros.conversions import stamp_to_msg, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf import TFMessage
@@ -79,7 +79,9 @@ class Rig:
 class Camera:
     """A camera of black images, 8 by 6 pixels."""
 
-    def __init__(self, r: Rig, image: str = IMAGE, info: str = CAMERA_INFO, frame: str = "camera") -> None:
+    def __init__(
+        self, r: Rig, image: str = IMAGE, info: str = f"{KITTI.camera}/camera_info", frame: str = "camera"
+    ) -> None:
         self._rig, self._frame = r, frame
         self._image, self._info = r.harness.publisher(Image, image), r.harness.publisher(CameraInfo, info)
         r.wait(

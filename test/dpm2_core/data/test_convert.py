@@ -96,7 +96,7 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
         "/kitti/ground_truth/path": "nav_msgs/msg/Path",
         "/kitti/vertical_angle_correction_deg": "std_msgs/msg/Float64",
     }
-    latched = {topics.TF_STATIC, topics.PATH, topics.VERTICAL_ANGLE_CORRECTION}
+    latched = {topics.TF_STATIC, f"{topics.KITTI.truth}/path", topics.VERTICAL_ANGLE_CORRECTION}
     assert bag.counts == {t: 1 if t in latched else 5 for t in bag.types}
     cloud = bag.first("/kitti/velo/pointcloud")
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
@@ -115,7 +115,8 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
         durability = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
     assert {topic for topic, name in durability.items() if name == "TRANSIENT_LOCAL"} == latched
     order = [topic for topic, _, _ in bag.messages(list(bag.types))][2:6]
-    assert order == [topics.CAMERA_INFO, topics.IMAGE, topics.ODOMETRY, topics.POINTS]  # the image is there before
+    camera, truth = topics.KITTI.camera, topics.KITTI.truth
+    assert order == [f"{camera}/camera_info", topics.IMAGE, f"{truth}/odom", topics.POINTS]  # the image is there before
 
 
 def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path) -> None:
