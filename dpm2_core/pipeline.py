@@ -155,11 +155,7 @@ def span_of(source: Source, frames: Span) -> tuple[int, int]:
         UsageError: it has no frames there.
     """
     start, stop = frames[0], len(source) if frames[1] is None else min(frames[1], len(source))
-    _check_span(source, start, stop, frames)
-    return start, stop
-
-
-def _check_span(source: Source, start: int, stop: int, frames: Span) -> None:
     if start >= stop:
         asked = f"{frames[0]}:{'' if frames[1] is None else frames[1]}"
         raise UsageError(f"--frames {asked}: {source.name} has {len(source)} frames")
+    return start, stop

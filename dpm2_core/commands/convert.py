@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, Overrides, parse_range, progress_bar
+from dpm2_core.commands.options import ConfigFile, Overrides, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.source import Source, Span
+from dpm2_core.data.source import Source, Span, parse_range
 from dpm2_core.slam.settings import Config
 
 app = typer.Typer(no_args_is_help=True, help="Convert a recording to a rosbag2 (MCAP) folder.")

@@ -13,7 +13,6 @@ from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.console import Console
-from dpm2_core.data.source import parse_range as parse_range
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.files import atomic_write, json_text

@@ -10,11 +10,11 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.localise import parse_hint, run_localized
-from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, parse_range, progress_bar, show
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, progress_bar, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.live_view import LiveView
 from dpm2_core.evaluation.report import metrics_table

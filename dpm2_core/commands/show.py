@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, frame_at
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame
 
@@ -68,7 +67,7 @@ def _two(text: str) -> tuple[int, int]:
 def _frame(source: Source, src: Path, position: int) -> Frame:
     if position >= len(source):
         raise UsageError(f"--frames {position}: {src} has {len(source)} frames")
-    frame = next(islice(source.frames(position, position + 1), 1))
+    frame = frame_at(source, position)
     if frame.problem:
         raise UsageError(f"frame {position} of {src}: {frame.problem}")
     return frame
