@@ -196,7 +196,7 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         keyframe,
         fix=fix,
         T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
-        cloud=se3.transform(T_base_lidar, keyframe.cloud).astype(np.float32),
+        cloud=se3.transform(T_base_lidar, keyframe.cloud),
         edge=edge,
         descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
     )

@@ -19,7 +19,6 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, Registration
-from dpm2_core.frame import Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
 from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
@@ -148,7 +147,7 @@ class Feed:
         if stream.wants(id, "pose"):
             with _noted(stream, id):
                 check_frame(message.header.frame_id)
-                keyframe_from(message, NO_POINTS, "", id, None)
+                keyframe_from(message, "", id, None)
             self._put(stream, id, "pose", message)
 
     def _on_cloud(self, message: UInt8MultiArray) -> None:
@@ -157,8 +156,7 @@ class Feed:
         stream, id = self._hear(message.layout.dim[0].label)
         if stream.wants(id, "cloud"):
             with _noted(stream, id):
-                if len(message.data) > BUDGET:
-                    raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
+                _check_budget(message, id)
                 payload = payload_from_msg(message)
                 try:
                     unpack_cloud(payload.cloud)
@@ -170,8 +168,7 @@ class Feed:
         stream, id = self._hear(message.header.frame_id)
         if stream.wants(id, "seen"):
             with _noted(stream, id):
-                if len(message.data) > BUDGET:
-                    raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
+                _check_budget(message, id)
                 descriptors, weights = descriptors_from_msg(message)
             self._put(stream, id, "seen", True, self._usable(id, descriptors, weights))
 
@@ -252,7 +249,7 @@ class Feed:
 
     def _add(self, stream: Stream, id: int, parts: Parts) -> None:
         assert stream.robot is not None
-        keyframe = keyframe_from(parts.pose, NO_POINTS, stream.robot, id, stream.last, parts.descriptors)
+        keyframe = keyframe_from(parts.pose, stream.robot, id, stream.last, parts.descriptors)
         stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
         stream.taken += 1
         assert parts.cloud is not None
@@ -279,10 +276,15 @@ def _noted(stream: Stream, id: int) -> Iterator[None]:
         raise
 
 
+def _check_budget(message: Any, id: int) -> None:
+    if len(message.data) > BUDGET:
+        raise RejectedError("size", f"keyframe {id}: {len(message.data)} bytes; at most {BUDGET} are sent")
+
+
 def keyframe_from(
-    pose: Odometry, points: Points, robot: str, id: int, before: Keyframe | None, descriptors: Descriptors | None = None
+    pose: Odometry, robot: str, id: int, before: Keyframe | None, descriptors: Descriptors | None = None
 ) -> Keyframe:
-    """A keyframe from its messages; its edge leads to the last one that arrived (the mapper expects gaps).
+    """A keyframe without its cloud; its edge leads to the last one that arrived (the mapper expects gaps).
 
     A covariance of zeros says that the odometry began anew: there is no edge.
 
@@ -299,5 +301,5 @@ def keyframe_from(
         check_covariance(covariance)
         if before is not None and id > before.id:
             T_before_this = se3.inverse(before.T_odom_kf) @ T_odom_kf
-            edge = Registration(T_before_this, covariance, confidence=1.0, rmse=0.0, method="odometry")
-    return Keyframe(id, stamp_ns(pose.header), id, T_odom_kf, points, edge, robot, descriptors)
+            edge = Registration(T_before_this, covariance, method="odometry")
+    return Keyframe(id, stamp_ns(pose.header), id, T_odom_kf, NO_POINTS, edge, robot, descriptors)

@@ -175,7 +175,7 @@ def test_the_edge_leads_to_the_last_keyframe_that_arrived() -> None:
     before = Keyframe(3, 0, 0, se3.exp([0, 0, 0, 5, 0, 0]), np.zeros((0, 4), np.float32))
     T, covariance = se3.exp([0, 0, 0.5, 12, 1, 0]), np.diag([1.0, 2, 3, 4, 5, 6])
     pose = edge_to_msg(T, covariance, 9, "odom", "kf_5")
-    keyframe = keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, before)
+    keyframe = keyframe_from(pose, "", 5, before)
     assert keyframe.edge is not None
     np.testing.assert_allclose(before.T_odom_kf @ keyframe.edge.T_target_source, T, atol=1e-9)
     np.testing.assert_allclose(keyframe.edge.covariance, covariance, atol=1e-9)
@@ -185,4 +185,4 @@ def test_the_edge_leads_to_the_last_keyframe_that_arrived() -> None:
 def test_the_first_keyframe_and_one_that_goes_back_have_no_edge(before: int | None) -> None:
     last = None if before is None else Keyframe(before, 0, 0, np.eye(4), np.zeros((0, 4), np.float32))
     pose = edge_to_msg(np.eye(4), np.eye(6), 9, "odom", "kf_5")
-    assert keyframe_from(pose, np.zeros((0, 4), np.float32), "", 5, last).edge is None
+    assert keyframe_from(pose, "", 5, last).edge is None
