@@ -19,19 +19,16 @@ _RECENT = 10.0  # s
 _LONGEST = 1000  # characters of a text, some of which quote messages
 
 
-class DiagnosticsPublisher:
-    """Asks for the statuses every `PERIOD`, and sends them."""
+def publish_diagnostics(node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
+    """Ask for the statuses every `PERIOD` from now on, and send them."""
+    publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
-    def __init__(self, node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
-        self._node, self._statuses = node, statuses
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(PERIOD, self.publish, clock=STEADY)
+    def publish() -> None:
+        message = DiagnosticArray(status=statuses())
+        message.header.stamp = node.get_clock().now().to_msg()
+        publisher.publish(message)
 
-    def publish(self) -> None:
-        """Send them now."""
-        message = DiagnosticArray(status=self._statuses())
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message)
+    node.create_timer(PERIOD, publish, clock=STEADY)
 
 
 def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.system import Slam
-from dpm2_ros.diagnostics import OK, WARN, DiagnosticsPublisher, mapper_status, message_status, status
+from dpm2_ros.diagnostics import OK, WARN, mapper_status, message_status, publish_diagnostics, status
 from dpm2_ros.feed import ODOM, Feed
 from dpm2_ros.guard import respond, slow_service
 from dpm2_ros.keyframe_sender import weights_identity
@@ -44,7 +44,7 @@ class MapperNode(ManagedNode):
         self._open_map(back)
         self._feeds: dict[str, Feed] = {}
         slow_service(self, Trigger, "~/reset", self._on_reset)
-        self._diagnostics = DiagnosticsPublisher(self, self._statuses)
+        publish_diagnostics(self, self._statuses)
 
     def activate(self, back: ExitStack) -> None:
         """Listen from now on, in the same map. What was sent meanwhile was not acknowledged, and is sent again."""

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.estimates import OdometryResult, State
-from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, DiagnosticsPublisher, mapper_status, message_status, status
+from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, mapper_status, message_status, publish_diagnostics, status
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Health
 from dpm2_ros.keyframe_sender import KeyframeSender
@@ -56,11 +56,7 @@ class Diagnostics:
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
         self._lost_before = self._dropped_before = 0
-        self._publisher = DiagnosticsPublisher(node, self._statuses)
-
-    def publish(self) -> None:
-        """Send it now."""
-        self._publisher.publish()
+        publish_diagnostics(node, self._statuses)
 
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
