@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,24 +22,12 @@ _MANAGED = "--lifecycle"
 
 def slam_node(arguments: Sequence[str] | None = None) -> int:
     """Odometry and, by default, the map; with `--lifecycle` a node that waits to be configured and activated."""
-
-    def kind() -> Callable[[bool], Any]:
-        from dpm2_ros.slam_node import SlamNode
-
-        return SlamNode
-
-    return _run(partial(_spin, "slam_node", kind), arguments)
+    return _run(partial(_spin, "slam_node", "SlamNode"), arguments)
 
 
 def mapper_node(arguments: Sequence[str] | None = None) -> int:
     """The map apart; `--lifecycle` likewise."""
-
-    def kind() -> Callable[[bool], Any]:
-        from dpm2_ros.mapper_node import MapperNode
-
-        return MapperNode
-
-    return _run(partial(_spin, "mapper_node", kind), arguments)
+    return _run(partial(_spin, "mapper_node", "MapperNode"), arguments)
 
 
 def bag_player(arguments: Sequence[str] | None = None) -> int:
@@ -52,8 +41,8 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
     return _run(work, arguments)
 
 
-def _spin(name: str, kind: Callable[[], Callable[[bool], Any]], arguments: Sequence[str]) -> int:
-    """`kind` imports the class of the node."""
+def _spin(name: str, kind: str, arguments: Sequence[str]) -> int:
+    """A node of the class `kind`, in the module of its name."""
     if "--help" in arguments:
         print(f"usage: {name} [{_MANAGED}] [--ros-args -p NAME:=VALUE ...]; docs/parameters.md lists the parameters")
         return 0
@@ -64,7 +53,7 @@ def _spin(name: str, kind: Callable[[], Callable[[bool], Any]], arguments: Seque
 
         if unknown := remove_ros_args(["", *of_ros])[1:]:
             raise UsageError(f"unknown argument {unknown[0]}; those of ROS, such as -p, come after --ros-args")
-        return partial(kind(), len(of_ros) < len(arguments))
+        return partial(getattr(import_module(f"dpm2_ros.{name}"), kind), len(of_ros) < len(arguments))
 
     return spin_node(load, of_ros)
 
