@@ -7,7 +7,8 @@ import functools
 import threading
 import time
 import traceback
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from typing import Any
 
@@ -129,14 +130,13 @@ async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
 async def until(condition: Callable[[], bool]) -> None:
     """In a callback: let the executor go on with others until the condition holds."""
     while not condition():
-        await _OtherCallbacks()
+        await _other_callbacks()
 
 
-class _OtherCallbacks:
+@types.coroutine
+def _other_callbacks() -> Generator[None, None, None]:
     """Awaited in a callback: the executor goes on with others, and comes back."""
-
-    def __await__(self) -> Any:
-        yield
+    yield
 
 
 def one_line(text: str, length: int = _LENGTH) -> str:
