@@ -14,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.system import Slam
 from dpm2_ros.diagnostics import OK, WARN, mapper_status, message_status, publish_diagnostics, status
 from dpm2_ros.feed import ODOM, Feed
-from dpm2_ros.guard import respond, slow_service
+from dpm2_ros.guard import slow_service
 from dpm2_ros.keyframe_sender import weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.mapping import MapperThread
@@ -99,14 +99,11 @@ class MapperNode(ManagedNode):
             feed.tick()
 
     async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self, self._map.keep(), response)
+        await self._map.before_reset(response, "the map begins again empty")
         if response.success:
             self._map.reset()
             for feed in self._feeds.values():
                 feed.forget()
-            response.message = "; ".join(filter(None, (response.message, "the map begins again empty")))
-        else:
-            response.message = f"no reset: {response.message}"
         return response
 
     def _shared_frames(self) -> list[str]:

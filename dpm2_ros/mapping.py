@@ -188,9 +188,13 @@ class MapperThread:
         """A robot's odometry has started again: the map stays, the robot's place in it is no longer known."""
         self._restarted[robot] = self._submit(lambda: self._active.restart(robot))
 
-    def keep(self) -> Future[str]:
-        """Save the map before a `reset`; returns a message, empty where there is nothing to save."""
-        return self._thread.submit(self._active.keep)
+    async def before_reset(self, response: Trigger.Response, begins: str) -> None:
+        """Save the map, and answer the service that asks for a reset: with what begins, or why there is no reset."""
+        await respond(self._node, self._thread.submit(self._active.keep), response)
+        if response.success:
+            response.message = "; ".join(filter(None, (response.message, begins)))
+        else:
+            response.message = f"no reset: {response.message}"
 
     def reset(self) -> None:
         """The odometry starts again, and with it an empty map."""

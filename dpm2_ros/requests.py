@@ -36,16 +36,13 @@ class Requests:
         node.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_initial_pose, 10)
 
     async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        begins = "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
-        response.success, response.message = True, ""
         if self._mapper is not None:
-            begins = "odometry and map start again with the next cloud"
-            await respond(self._node, self._mapper.keep(), response)
+            await self._mapper.before_reset(response, "odometry and map start again with the next cloud")
+        else:
+            begins = "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
+            response.success, response.message = True, begins
         if response.success:
             self.reset.set()
-            response.message = "; ".join(filter(None, (response.message, begins)))
-        else:
-            response.message = f"no reset: {response.message}"
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
