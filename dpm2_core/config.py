@@ -84,7 +84,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
         key = key.strip()
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
-        _put(kind, tree, key.split("."), _value(text))
+        put(kind, tree, key.split("."), _value(text))
         origin.pop(key, None)  # the last one is to blame
         origin[key] = f"--set {setting}"
     return settings_from(kind, tree, origin, str(path) if path else "configuration")
@@ -187,8 +187,8 @@ def _merge(tree: dict[str, Any], more: dict[str, Any]) -> None:
             tree[key] = value
 
 
-def _put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    """Set what lies at a path of keys; `kind` is None below a field whose keys are free."""
+def put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set what lies at a path of keys in a tree of that kind; None below a field whose keys are free."""
     key, *rest = path
     found = kind.model_fields[key].annotation if kind is not None and key in kind.model_fields else None
     part = None if get_origin(found) is dict else next(_settings_in(found), None)
@@ -198,7 +198,7 @@ def _put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str],
     # A copy: two keys may share one mapping through a YAML anchor, and each is its own.
     branch = tree[key] = dict(tree[key]) if isinstance(tree.get(key), dict) else {}
     for keys, more in [(rest, value)] if rest else [([name], inner) for name, inner in value.items()]:
-        _put(part, branch, keys, more)
+        put(part, branch, keys, more)
 
 
 def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:

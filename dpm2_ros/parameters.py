@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import annotated_types
 from pydantic.fields import FieldInfo
 
-from dpm2_core.config import Settings, flat_fields, load_settings, read_settings, settings_from
+from dpm2_core.config import Settings, flat_fields, load_settings, put, read_settings, settings_from
 from dpm2_core.errors import UsageError
 from dpm2_core.files import expanded
 from dpm2_ros.settings import CHANGEABLE
@@ -60,7 +60,7 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     path = Path(expanded(file)) if file else None
     load_settings(kind, path)  # its mistakes are its own
     # Only what is given: a preset may change the rest.
-    tree = _with({} if path is None else read_settings(kind, path), given)
+    tree = _with(kind, {} if path is None else read_settings(kind, path), given)
     config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)
@@ -90,7 +90,7 @@ def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
         nonlocal current
         given = {parameter.name: parameter.value for parameter in parameters if parameter.name in CHANGEABLE}
         try:
-            tree = _with(current.model_dump(), given)
+            tree = _with(type(config), current.model_dump(), given)
             current = settings_from(type(config), tree, dict.fromkeys(given, "ROS parameter"))
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -101,14 +101,10 @@ def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
     node.add_on_set_parameters_callback(on_set)
 
 
-def _with(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The same tree, with values by dotted names put in."""
+def _with(kind: type[Settings], tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The same tree, with parameters put in; those that are lists come as arrays."""
     for name, value in given.items():
-        branch = tree
-        *path, leaf = name.split(".")
-        for part in path:
-            branch = branch.setdefault(part, {})
-        branch[leaf] = value.tolist() if hasattr(value, "tolist") else value
+        put(kind, tree, name.split("."), value.tolist() if hasattr(value, "tolist") else value)
     return tree
 
 
