@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, one_line
 
 T = TypeVar("T", bound="Settings")
 
@@ -122,7 +122,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except _NOT_YAML as error:
-        raise UsageError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        raise UsageError(f"{path}: not valid YAML: {one_line(error)}") from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from dpm2_ros.guard import GuardedNode, one_line
+from dpm2_ros.guard import GuardedNode, excerpt
 from dpm2_ros.mapping import BEHIND, MapperThread
 from dpm2_ros.subscriptions import STEADY
 
@@ -33,9 +33,9 @@ def publish_diagnostics(node: Node, statuses: Callable[[], list[DiagnosticStatus
 
 def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
     """Of a part of a node."""
-    values = [KeyValue(key=key, value=one_line(str(value), _LONGEST)) for key, value in figures.items()]
+    values = [KeyValue(key=key, value=excerpt(str(value), _LONGEST)) for key, value in figures.items()]
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
-    return DiagnosticStatus(level=level, name=name, message=one_line(text, _LONGEST), hardware_id="", values=values)
+    return DiagnosticStatus(level=level, name=name, message=excerpt(text, _LONGEST), hardware_id="", values=values)
 
 
 def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:

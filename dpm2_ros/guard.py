@@ -78,7 +78,7 @@ class GuardedNode(Node):
             if not quiet:
                 self._said[kind] = now
         if not quiet:
-            self.get_logger().warning(f"{where}: rejected: {one_line(text)}")
+            self.get_logger().warning(f"{where}: rejected: {excerpt(text)}")
 
     def fail(self, where: str, error: BaseException) -> None:
         """Count an exception that is a bug; any thread may call."""
@@ -139,6 +139,6 @@ def _other_callbacks() -> Generator[None, None, None]:
     yield
 
 
-def one_line(text: str, length: int = _LENGTH) -> str:
+def excerpt(text: str, length: int = _LENGTH) -> str:
     """A text of unknown origin for a terminal: what does not print is escaped, what is too long is cut."""
     return printable(text if len(text) <= length else f"{text[:length]}...")

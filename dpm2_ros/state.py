@@ -10,7 +10,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from dpm2_core.estimates import OdometryResult, State
-from dpm2_ros.guard import one_line
+from dpm2_ros.guard import excerpt
 from dpm2_ros.subscriptions import LAST_ONE, STEADY
 
 SILENT = 2.0
@@ -33,7 +33,7 @@ class StatePublisher:
     def send(self, tracked: OdometryResult) -> None:
         """That of a pose which is published now; what is lost with it is logged, too."""
         self._last = time.monotonic()
-        reason = one_line(tracked.registration.reason)
+        reason = excerpt(tracked.registration.reason)
         if tracked.breaks > self._breaks:
             self._log.warning(f"the odometry broke, how far it has come meanwhile is not known: {reason}")
         elif tracked.state is State.LOST and self._said != str(State.LOST):

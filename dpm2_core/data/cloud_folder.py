@@ -19,7 +19,7 @@ from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.messages import point_cloud
 from dpm2_core.data.ply import read_vertices
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, one_line
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 
@@ -109,8 +109,7 @@ def _read_pcd(path: Path) -> Mapping[str, NDArray[Any]]:
         cloud = PointCloud.from_path(path)
         return {name: np.ascontiguousarray(cloud.pc_data[name]) for name in cloud.fields}
     except Exception as error:  # damaged headers and data raise anything from ValueError to lzf's own errors
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise UsageError(f"{path}: cannot be read as PCD: {reason}") from None
+        raise UsageError(f"{path}: cannot be read as PCD: {one_line(error)[:200]}") from None
 
 
 def _pcd_types() -> tuple[Any, Any]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dpm2_core._version import __version__
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error, UsageError, one_line
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.extras import needs
 
@@ -112,7 +112,7 @@ class Cluster:
             except Exception as error:  # Ray raises that very class where it does not start in time
                 self.__exit__()
                 where = "Ray" if self._address is None else f"--ray {self._address}"
-                raise UsageError(f"{where}: {' '.join(str(error).split())}") from None
+                raise UsageError(f"{where}: {one_line(error)}") from None
         self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
 
     def _connect(self, ray: Any) -> None:

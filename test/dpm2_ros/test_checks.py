@@ -16,7 +16,7 @@ from dpm2_core.data.transforms import TransformTree
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
 from dpm2_ros.conversions import cloud_to_msg
-from dpm2_ros.guard import one_line
+from dpm2_ros.guard import excerpt
 
 
 def transform(parent: str, child: str, x: float = 1.0, w: float = 1.0) -> TransformStamped:
@@ -83,5 +83,5 @@ def test_layouts_that_cannot_be_read() -> None:
 
 
 def test_texts_of_others_are_one_line() -> None:
-    assert one_line("a\n\x1b[31mb\u202e") == r"a\n\x1b[31mb\u202e"
-    assert len(one_line("x" * 10**6)) < 400
+    assert excerpt("a\n\x1b[31mb\u202e") == r"a\n\x1b[31mb\u202e"
+    assert len(excerpt("x" * 10**6)) < 400
