@@ -126,13 +126,17 @@ def _turned(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.flo
 
 
 class LazyDescriptors:
-    """Descriptors of a scan, made when they are first needed: that takes the network as long as all else together."""
+    """Descriptors of a scan, made when they are first needed: that takes the network as long as all else together.
+
+    Attributes:
+        problem: why there are none; empty if there are some, or if they were not needed yet.
+    """
 
     def __init__(self, make: Callable[[], Descriptors]) -> None:
         """`make`: raises Dpm2Error for a scan that has none, such as one of too few points."""
         self._make: Callable[[], Descriptors] | None = make
         self._value: Descriptors | None = None
-        self._problem = ""
+        self.problem = ""
 
     @property
     def made(self) -> bool:
@@ -145,14 +149,9 @@ class LazyDescriptors:
             try:
                 self._value = self._make()
             except Dpm2Error as error:
-                self._problem = str(error)
+                self.problem = str(error)
             self._make = None  # which held the scan's points
         return self._value
-
-    @property
-    def problem(self) -> str:
-        """Why there are none; empty if there are some, or if they were not needed yet."""
-        return self._problem
 
 
 def merge(sets: Sequence[Descriptors]) -> Descriptors:

@@ -170,7 +170,9 @@ class ActiveMap:
             self.localizer.restart()
         else:
             self.close()
-            self._begin()
+            self._store = self._new_file()
+            self.slam.use(*make_map(self._config.slam, self._store, background=True))
+            self._T_map_odom = None
 
     @property
     def saves(self) -> bool:
@@ -234,12 +236,6 @@ class ActiveMap:
         self.finish()
         if self.mapper.store_problem:
             raise Dpm2Error(f"the map goes on: {self.mapper.store_problem}")
-
-    def _begin(self) -> None:
-        """An empty map."""
-        self._store = self._new_file()
-        self.slam.use(*make_map(self._config.slam, self._store, background=True))
-        self._T_map_odom = None
 
     def _first_file(self) -> MapStore | None:
         """A map file; a warning where that which was asked for exists, as after a crash: it does not go on."""
