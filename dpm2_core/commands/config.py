@@ -12,11 +12,6 @@ from dpm2_core.slam.settings import Config
 app = typer.Typer(help="Look at the configuration.")
 
 
-@app.callback()
-def group() -> None:
-    """Look at the configuration."""
-
-
 @app.command()
 def dump(config: ConfigFile = None, settings: Overrides = None) -> None:
     """Print every key with its description and value, as YAML that --config takes."""

@@ -35,11 +35,6 @@ Address = Annotated[
 Workers = Annotated[int | None, typer.Option(min=1, help="Drives at a time [as many as there are processors for].")]
 
 
-@app.callback()
-def _fleet() -> None:
-    """A group, however many commands it has."""
-
-
 @app.command()
 def run(
     drives: Drives,
