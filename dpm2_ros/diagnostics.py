@@ -49,8 +49,8 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
         problems.append(f"no map file, the map is only in memory: {mapper.file_problem}")
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
-    if mapper.graph_problem:
-        problems.append(f"poses not optimized: {mapper.graph_problem}")
+    if graph_problem := mapper.slam.mapper.graph_problem:
+        problems.append(f"poses not optimized: {graph_problem}")
     if missing := list(mapper.missing.values()):
         problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")
     text = "; ".join([f"{mapper.keyframes} keyframes, {accepted} loops", *problems])

@@ -174,13 +174,14 @@ class Feed:
 
     def _usable(self, id: int, descriptors: Descriptors | None, weights: str) -> Descriptors | None:
         """Descriptors that the mapper's network can compare; without, it makes its own of the keyframe's cloud."""
-        if descriptors is None or self._mapper.channels is None:
+        channels = self._mapper.slam.mapper.channels
+        if descriptors is None or channels is None:
             return None
         try:
             if weights != self._weights:
                 text = f"weights {weights or 'unnamed'}, the mapper's are {self._weights}"
                 raise RejectedError("descriptors of other weights", text)
-            check_descriptors(descriptors, self._mapper.channels)
+            check_descriptors(descriptors, channels)
         except RejectedError as error:
             text = f"keyframe {id}: {error}; it is used, described anew by its cloud"
             self._node.reject(self._seen_topic, error.reason, text)

@@ -109,16 +109,6 @@ class MapperThread:
         return self._missing
 
     @property
-    def channels(self) -> int | None:
-        """Width of the features that the map's network makes; None without a network."""
-        return self._active.mapper.channels
-
-    @property
-    def graph_problem(self) -> str:
-        """Why the poses are not optimized, in words; empty since they were."""
-        return self._active.mapper.graph_problem
-
-    @property
     def store_problem(self) -> str:
         """Why the map file is behind, in words; empty when it is not, or when there is none."""
         return self._active.mapper.store_problem
