@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import replace
@@ -29,6 +30,7 @@ from dpm2_ros.display import Projection
 from dpm2_ros.health import Health
 from dpm2_ros.keyframe_sender import KeyframeSender, weights_identity
 from dpm2_ros.lifecycle import ManagedNode
+from dpm2_ros.mapping import MapperThread
 from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.requests import Requests
 from dpm2_ros.runtime import lower_priority
@@ -143,7 +145,7 @@ class SlamNode(ManagedNode):
             bundle = self._inputs.take(timeout=0.1)
             if self._requests.reset.is_set():
                 self._requests.reset.clear()
-                self._restart()
+                self._end_drive(MapperThread.reset)
             if bundle is None:
                 continue
             try:
@@ -152,15 +154,15 @@ class SlamNode(ManagedNode):
                 self._health.errors += 1
                 self.get_logger().error(f"cloud at {bundle.stamp} ns: {traceback.format_exc()}")
 
-    def _restart(self) -> None:
-        self._begin()
-        self._end_drive()
-        if self._mapper is not None:
-            self._mapper.reset()
+    def _end_drive(self, of_map: Callable[[MapperThread], None]) -> None:
+        """The next cloud begins another drive; `of_map`: what becomes of the map, where it is here.
 
-    def _end_drive(self) -> None:
-        """A mapper elsewhere is told, before it hears the next odometry, that the drive is over."""
+        A mapper elsewhere is told before it hears the next odometry.
+        """
+        self._begin()
         wait([self._line.submit(self._sender.restart)])
+        if self._mapper is not None:
+            of_map(self._mapper)
 
     def _begin_again(self, why: str) -> None:
         """Another drive in the same map, if there has been one."""
@@ -169,10 +171,7 @@ class SlamNode(ManagedNode):
         self.get_logger().warning(
             f"{why}: the odometry starts again, its place in the map is unknown before a loop is found"
         )
-        self._begin()
-        self._end_drive()
-        if self._mapper is not None:
-            self._mapper.restart(self._robot)
+        self._end_drive(lambda mapper: mapper.restart(self._robot))
 
     def _process(self, bundle: Bundle) -> None:
         """One frame, from messages to messages."""
