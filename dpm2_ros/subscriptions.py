@@ -21,7 +21,7 @@ from std_msgs.msg import Float64
 from dpm2_core.data import topics
 from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.gnss import FixBuffer
-from dpm2_core.data.image_messages import decode_camera, info_of
+from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import stamp_ns
@@ -295,12 +295,7 @@ def _usable(info: Any) -> bool:
 
 def _camera_info_beside(node: Node, image_topic: str) -> str:
     """The camera_info beside the images where they really come from, unless it has a remapping of its own."""
-    usual = _beside(image_topic)
+    usual = info_topic_beside(image_topic)
     if node.resolve_topic_name(usual) != node.resolve_topic_name(usual, only_expand=True):
         return usual
-    return _beside(node.resolve_topic_name(image_topic))
-
-
-def _beside(image_topic: str) -> str:
-    folder = image_topic.removesuffix("/compressed").rpartition("/")[0]
-    return f"{folder}/camera_info".removeprefix("" if folder or image_topic.startswith("/") else "/")
+    return info_topic_beside(node.resolve_topic_name(image_topic))

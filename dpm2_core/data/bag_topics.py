@@ -11,7 +11,7 @@ import numpy as np
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag
 from dpm2_core.data.frames import CameraTopic
-from dpm2_core.data.image_messages import decode_camera, info_of, is_depth
+from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside, is_depth
 from dpm2_core.data.livox import LIVOX
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.settings import InputSettings
@@ -89,7 +89,7 @@ class TopicChoice:
     def camera(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
         """The camera of an image topic with its first CameraInfo of use; None without, which is an error where it is
         asked for."""
-        info_topic = info_topic or f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        info_topic = info_topic or info_topic_beside(topic)
         problem = f"no CameraInfo on {info_topic}"
         for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
             info = info_of(topic, message)

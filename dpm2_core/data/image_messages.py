@@ -170,6 +170,12 @@ def info_of(topic: str, info: Any) -> Any:
                            d=[] if is_rectified else info.d, distortion_model=info.distortion_model)  # fmt: skip
 
 
+def info_topic_beside(image_topic: str) -> str:
+    """The topic of the CameraInfo beside images; relative for a relative one."""
+    folder = image_topic.removesuffix("/compressed").rpartition("/")[0]
+    return f"{folder}/camera_info".removeprefix("" if folder or image_topic.startswith("/") else "/")
+
+
 def is_fisheye(info: Any) -> bool:
     """Whether images of a CameraInfo that `decode_camera` takes are to be `rectified`."""
     return info.distortion_model in _FISHEYE and len(info.d) == _FISHEYE_COUNT
