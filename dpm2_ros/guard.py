@@ -73,25 +73,27 @@ class GuardedNode(Node):
             if kind not in self._rejections and len(self._rejections) >= _MOST_KINDS:
                 kind = "others"
             self._rejections[kind] = self._rejections.get(kind, 0) + 1
-            self._last_rejection = now = time.monotonic()
-            quiet = now - self._said.get(kind, -float("inf")) < _QUIET
-            if not quiet:
-                self._said[kind] = now
-        if not quiet:
+            self._last_rejection = time.monotonic()
+            said = self._may_say(kind)
+        if said:
             self.get_logger().warning(f"{where}: rejected: {excerpt(text)}")
 
     def fail(self, where: str, error: BaseException) -> None:
         """Count an exception that is a bug; any thread may call."""
         with self._guard_lock:
             self.errors += 1
-            kind = f"{where} {type(error).__name__}"
-            now = time.monotonic()
-            quiet = now - self._said.get(kind, -float("inf")) < _QUIET or len(self._said) > 2 * _MOST_KINDS
-            if not quiet:
-                self._said[kind] = now
-        if not quiet:
+            said = len(self._said) <= 2 * _MOST_KINDS and self._may_say(f"{where} {type(error).__name__}")
+        if said:
             lines = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {lines[-3000:]}")
+
+    def _may_say(self, kind: str) -> bool:
+        """Whether the log has had no line of that kind of late; if so, it has one now. With the lock."""
+        now = time.monotonic()
+        if now - self._said.get(kind, -float("inf")) < _QUIET:
+            return False
+        self._said[kind] = now
+        return True
 
     def _guarded(self, callback: Callable[..., Any], where: str) -> Callable[..., Any]:
         @functools.wraps(callback)  # rclpy asks for its signature
@@ -111,6 +113,16 @@ class GuardedNode(Node):
 def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]) -> None:
     """A service whose callback awaits: in a group of its own, for the others of a group wait until it ends."""
     node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
+
+
+def take_waiting(subscription: Any) -> None:
+    """Call back, in this thread, with all that has arrived for it; an executor would take one of each topic in turn."""
+    handle = subscription.handle
+    with handle:  # not to be destroyed meanwhile
+        for _ in range(subscription.qos_profile.depth):
+            if (taken := handle.take_message(subscription.msg_type, subscription.raw)) is None:
+                return
+            subscription.callback(taken[0])
 
 
 async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:

@@ -29,6 +29,7 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.deliveries import Delivery
+from dpm2_ros.guard import take_waiting
 from dpm2_ros.keyframe_messages import WIRE, of_earlier_drive, payload_to_msgs
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import STEADY
@@ -121,7 +122,7 @@ class KeyframeSender:
             if time.monotonic() > end:
                 break
             time.sleep(_TICK)
-            self._take_received()
+            take_waiting(self._received)  # nobody calls back any more
             self._repeat()
         with self._lock:
             for drive in self._drives:
@@ -139,12 +140,6 @@ class KeyframeSender:
     def _late(drive: Delivery) -> int:
         """Keyframes that are not in the mapper's file."""
         return len(drive.file) - drive.delivered
-
-    def _take_received(self) -> None:
-        """Acknowledgments that have come, where nobody calls back any more."""
-        with self._received.handle:  # not to be destroyed meanwhile
-            while (taken := self._received.handle.take_message(UInt32MultiArray, False)) is not None:
-                self._received.callback(taken[0])
 
     def _file(self, session: str) -> KeyframeFile:
         """Of a new drive, on the disk if that can be."""

@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
 from dpm2_core.data.livox import LIVOX
+from dpm2_ros.guard import take_waiting
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
 
@@ -38,17 +39,12 @@ class MatchedSubscription:
         self.reliability = ReliabilityPolicy.RELIABLE
         self._durability = DurabilityPolicy.VOLATILE
         self._subscription: Any = None
-        self._raw, self.problem = False, ""
+        self.problem = ""
         self.refresh()
 
     def take(self) -> None:
-        """Call back, in the executor's thread, with all that has arrived; it would take one of each topic in turn."""
-        handle = self._subscription.handle
-        with handle:  # not to be destroyed meanwhile
-            for _ in range(self._depth):
-                if (taken := handle.take_message(self._kind, self._raw)) is None:
-                    return
-                self._subscription.callback(taken[0])
+        """Call back, in the executor's thread, with all that has arrived."""
+        take_waiting(self._subscription)
 
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
@@ -70,12 +66,12 @@ class MatchedSubscription:
             return
         before, other_type = self._subscription, kind is not self._kind
         self.reliability, self._durability = requested, durability
-        self._kind, self._raw = kind, self._wanted is PointCloud2 and kind is not PointCloud2
+        self._kind, raw = kind, self._wanted is PointCloud2 and kind is not PointCloud2
         if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)
         keep = HistoryPolicy.KEEP_LAST
         qos = QoSProfile(depth=self._depth, history=keep, reliability=requested, durability=durability)
-        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=self._raw)
+        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=raw)
         if before is not None:
             if not other_type:
                 self._node.destroy_subscription(before)
