@@ -15,13 +15,12 @@ _SEGMENT = re.compile(r"fastrtps_[0-9a-f]{16}")  # not the ports, which Fast DDS
 _YOUNG = 60.0  # s; Fast DDS makes a lock file first, and locks it then
 
 
-def free_shared_memory(folder: Path = Path("/dev/shm")) -> int:
-    """Remove the segments of Fast DDS whose process is gone, as `fastdds shm clean` does; returns their bytes.
+def free_shared_memory(folder: Path = Path("/dev/shm")) -> None:
+    """Remove the segments of Fast DDS whose process is gone, as `fastdds shm clean` does.
 
     A process holds the lock on the file `NAME_el` beside its segment as long as it lives. What may not be opened,
     such as files of other users, stays.
     """
-    freed = 0
     for lock in folder.glob("fastrtps_*_el"):
         segment = lock.with_name(lock.name.removesuffix("_el"))
         if not _SEGMENT.fullmatch(segment.name):
@@ -31,10 +30,7 @@ def free_shared_memory(folder: Path = Path("/dev/shm")) -> int:
                 continue
             with lock.open("r+b") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                size = segment.stat().st_size if segment.exists() else 0
                 segment.unlink(missing_ok=True)
                 lock.unlink(missing_ok=True)
-                freed += size
         except OSError:
             continue  # held, or another's
-    return freed

@@ -87,7 +87,7 @@ def test_other_files_and_what_cannot_be_removed_stay(tmp_path: Path, monkeypatch
         unlink(path, missing_ok)
 
     monkeypatch.setattr(Path, "unlink", refused)
-    assert free_shared_memory(tmp_path) == 5
+    free_shared_memory(tmp_path)
     left = sorted(path.name for path in tmp_path.iterdir() if not path.name.endswith("_el"))
     assert left == sorted(set(names) - {names[2]})
-    assert free_shared_memory(tmp_path / "nowhere") == 0
+    free_shared_memory(tmp_path / "nowhere")
