@@ -44,8 +44,12 @@ def endpoints(node: Any) -> Iterator[Endpoint]:
             yield Endpoint(service.srv_name, _type(service.srv_type), "serves", "")
 
 
-def describe(makers: dict[str, Callable[[], Any]]) -> dict[str, list[Endpoint]]:
-    """The endpoints of each node, made one after the other and closed; ROS must be initialized."""
+def describe() -> dict[str, list[Endpoint]]:
+    """The endpoints of slam_node and mapper_node, made one after the other and closed; ROS must be initialized."""
+    from dpm2_ros.mapper_node import MapperNode
+    from dpm2_ros.slam_node import SlamNode
+
+    makers: dict[str, Callable[[], Any]] = {"slam_node": SlamNode, "mapper_node": MapperNode}
     found = {}
     for name, make in makers.items():
         node = make()
@@ -66,14 +70,6 @@ def page(nodes: dict[str, list[Endpoint]]) -> str:
     return "\n".join(parts)
 
 
-def node_makers() -> dict[str, Callable[[], Any]]:
-    """slam_node and mapper_node by name."""
-    from dpm2_ros.mapper_node import MapperNode
-    from dpm2_ros.slam_node import SlamNode
-
-    return {"slam_node": SlamNode, "mapper_node": MapperNode}
-
-
 def main() -> int:
     """Print the page."""
 
@@ -81,7 +77,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             ros_context(["--ros-args", "-p", f"ros.map_directory:={folder}"])
             try:
-                sys.stdout.write(page(describe(node_makers())))
+                sys.stdout.write(page(describe()))
             finally:
                 end_ros()
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from dpm2_ros.topics import describe, node_makers, page
+from dpm2_ros.topics import describe, page
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "topics.md"
 
@@ -18,7 +18,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "topics.md"
 def test_the_page_is_that_of_the_nodes(ros: Callable[..., Any]) -> None:
     """`make topics` writes it. Without the network, which adds no topic."""
     ros("slam.registration:=geometric", "slam.loops.descriptors:=false", namespace="")
-    found = describe(node_makers())
+    found = describe()
     assert page(found) == PAGE.read_text()
     for endpoints in found.values():
         assert len({(e.name, e.role) for e in endpoints}) == len(endpoints)
