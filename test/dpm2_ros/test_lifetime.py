@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,22 @@ GEOMETRIC = [part for name, value in QUICK.items() for part in ("-p", f"{name}:=
 SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
 
 
+@contextmanager
+def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Iterator[subprocess.Popen[bytes]]:
+    """slam_node in a process of its own, from when it listens: its map in `folder`/map, its log, which has no trace of
+    a bug, in `folder`/log."""
+    given = [part for parameter in (f"ros.map_directory:={folder / 'map'}", *parameters) for part in ("-p", parameter)]
+    environment = ros_environment(harness.node.context.get_domain_id())
+    process = start("slam_node", ["--ros-args", *given, *GEOMETRIC], environment, folder / "log")
+    try:
+        harness.wait(lidar.get_subscription_count, "slam_node")
+        harness.find("slam_node")
+        yield process
+    finally:
+        process.kill()
+    assert "Traceback" not in (folder / "log").read_text()
+
+
 @pytest.mark.parametrize(("name", "times"), [("SIGINT", 2), ("SIGTERM", 1)])
 def test_slam_node_saves_its_map_when_stopped(
     ros: Callable[..., Any], drive: Any, tmp_path: Path, name: str, times: int
@@ -47,12 +63,7 @@ def test_slam_node_saves_its_map_when_stopped(
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     lidar = harness.publisher(PointCloud2, topics.POINTS)
-    parameters = ["-p", f"ros.map_directory:={tmp_path / 'map'}", *GEOMETRIC]
-    environment = ros_environment(harness.node.context.get_domain_id())
-    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
-    try:
-        harness.wait(lidar.get_subscription_count, "slam_node")
-        harness.find("slam_node")
+    with running(harness, lidar, tmp_path) as process:
         for n in range(8):
             lidar.publish(drive.cloud(n))
         harness.wait(lambda: odometry, "odometry")
@@ -60,11 +71,7 @@ def test_slam_node_saves_its_map_when_stopped(
             process.send_signal(getattr(signal, name))
             time.sleep(0.02)
         assert process.wait(180) == 0
-    finally:
-        process.kill()
-    output = (tmp_path / "log").read_text()
-    assert "Traceback" not in output
-    assert f"saved in {tmp_path / 'map' / 'drive'}" in output
+    assert f"saved in {tmp_path / 'map' / 'drive'}" in (tmp_path / "log").read_text()
     assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["drive", "drive.dpm2map"]
     assert sorted(path.name for path in (tmp_path / "map" / "drive").iterdir()) == SAVED
 
@@ -182,21 +189,12 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
     odometry = harness.hear(Odometry, "/dpm2/odom")
     lidar = harness.publisher(PointCloud2, topics.POINTS)
     (tmp_path / "map").write_text("in the way")
-    parameters = ["-p", f"ros.map_directory:={tmp_path / 'map'}", *GEOMETRIC]
-    environment = ros_environment(harness.node.context.get_domain_id())
-    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
-    try:
-        harness.wait(lidar.get_subscription_count, "slam_node")
-        harness.find("slam_node")
+    with running(harness, lidar, tmp_path) as process:
         lidar.publish(drive.cloud(0))
         harness.wait(lambda: odometry, "odometry")
         process.send_signal(signal.SIGINT)
         assert process.wait(180) == 1
-    finally:
-        process.kill()
-    output = (tmp_path / "log").read_text()
-    assert "Traceback" not in output
-    assert f"error: {tmp_path / 'map'}" in output
+    assert f"error: {tmp_path / 'map'}" in (tmp_path / "log").read_text()
     assert (tmp_path / "map").read_text() == "in the way"
 
 
@@ -208,22 +206,16 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     (tmp_path / "map").write_text("in the way")
     keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
     lidar = harness.publisher(PointCloud2, topics.POINTS)
-    parameters = ["-p", f"ros.map_file:={path}", "-p", f"ros.map_directory:={tmp_path / 'map'}", *GEOMETRIC]
-    environment = ros_environment(harness.node.context.get_domain_id())
-    process = start("slam_node", ["--ros-args", *parameters], environment, tmp_path / "log")
-    try:
-        harness.wait(lidar.get_subscription_count, "slam_node")
-        harness.find("slam_node")
-        with closing(sqlite3.connect(path, isolation_level=None)) as other:
-            other.execute("BEGIN IMMEDIATE")
-            lidar.publish(drive.cloud(0))
-            harness.wait(lambda: keyframes, "a keyframe")
-            process.send_signal(signal.SIGINT)
-            assert process.wait(180) == 1
-    finally:
-        process.kill()
+    with (
+        running(harness, lidar, tmp_path, f"ros.map_file:={path}") as process,
+        closing(sqlite3.connect(path, isolation_level=None)) as other,
+    ):
+        other.execute("BEGIN IMMEDIATE")
+        lidar.publish(drive.cloud(0))
+        harness.wait(lambda: keyframes, "a keyframe")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(180) == 1
     output = (tmp_path / "log").read_text()
-    assert "Traceback" not in output
     problem = rf"map file incomplete: {path}: .*locked; 1 keyframes are in memory only"
     assert len(re.findall(problem, output)) == 2  # at once, and at the end
     assert re.search(rf"^error: {problem}$", output, re.MULTILINE)
