@@ -168,13 +168,19 @@ def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], m
     r.harness.node.destroy_subscription(late)
 
 
-def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
-    """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
+def mapped_elsewhere(rig: Callable[..., Rig]) -> tuple[Rig, Any, list[Odometry]]:
+    """A node without a mapper of its own; what acknowledges its keyframes, and their poses as they come."""
     r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
     r.wait(received.get_subscription_count, "the node")
     poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
     r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
+    return r, received, poses
+
+
+def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
+    """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
+    r, received, poses = mapped_elsewhere(rig)
     r.send_and_wait(*range(drive.frames))
     none = r.status("mapper", saying(f"0 of {drive.frames} keyframes"))
     assert none.level == DiagnosticStatus.WARN
@@ -200,11 +206,7 @@ def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..
 
 def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Rig]) -> None:
     """Else it goes on to place the odometry of the next one by the one before."""
-    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
-    received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
-    r.wait(received.get_subscription_count, "the node")
-    poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
-    r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
+    r, received, poses = mapped_elsewhere(rig)
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
     last = max(pose.child_frame_id for pose in poses)
