@@ -139,11 +139,6 @@ def make_folder(path: Path) -> None:
         raise UsageError(f"{path}: no folder can be made there: {error.strerror or error}") from error
 
 
-def expanded(path: str) -> str:
-    """A path whose `~` is the home folder, as a shell has it: none reads what stands in a ROS parameter."""
-    return os.path.expanduser(path)
-
-
 def file_digest(path: Path) -> str:
     """SHA-256 of what a file holds.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +22,6 @@ from pydantic.fields import FieldInfo
 
 from dpm2_core.config import Settings, flat_fields, load_settings, put, read_settings, settings_from
 from dpm2_core.errors import UsageError
-from dpm2_core.files import expanded
 from dpm2_ros.settings import CHANGEABLE
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def load_parameters(node: Node, kind: type[T]) -> T:
         raise UsageError("qos_overrides is not supported; ros.reliability and ros.queue_depth are the inputs' QoS")
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
-    path = Path(expanded(file)) if file else None
+    path = Path(os.path.expanduser(file)) if file else None
     load_settings(kind, path)  # its mistakes are its own
     # Only what is given: a preset may change the rest.
     tree = _with(kind, {} if path is None else read_settings(kind, path), given)

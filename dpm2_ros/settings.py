@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from dpm2_core.config import Settings
-from dpm2_core.files import expanded
 from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 from dpm2_core.slam.settings import Config
 
@@ -108,7 +108,7 @@ class RosSettings(Settings):
     @field_validator("map_directory", "map_file")
     @classmethod
     def _expanded(cls, path: str) -> str:
-        return expanded(path)
+        return os.path.expanduser(path)  # as a shell does: none reads what stands in a ROS parameter
 
     @model_validator(mode="after")
     def _different(self) -> RosSettings:

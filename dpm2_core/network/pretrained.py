@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from safetensors import SafetensorError, deserialize, safe_open
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import expanded
 from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -46,7 +46,7 @@ def weights_path(weights: str) -> Path:
     """
     if weights in pretrained_names():
         return PRETRAINED_DIR / f"{weights}.safetensors"
-    path = Path(expanded(weights))
+    path = Path(os.path.expanduser(weights))
     if not path.is_file():
         names = ", ".join(pretrained_names()) or "none"
         raise UsageError(f"slam.neural.weights {weights}: no such file; weights that come with dpm2: {names}")

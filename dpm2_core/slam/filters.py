@@ -7,6 +7,7 @@ points, and the map.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,6 @@ from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.files import expanded
 from dpm2_core.frame import Points
 from dpm2_core.network.pretrained import DYNAMIC, PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
@@ -86,7 +86,7 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     if settings.kind == "none":
         return None
     shipped = PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
-    path = Path(expanded(str(settings.weights or shipped)))
+    path = Path(os.path.expanduser(str(settings.weights or shipped)))
     if not path.is_file():
         why = "no such file" if settings.weights else "none come with this dpm2"
         raise UsageError(
