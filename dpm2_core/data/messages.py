@@ -56,14 +56,14 @@ def _stamp_format(data: bytes) -> str:
     return "<iI" if data[1] & 1 else ">iI"
 
 
-def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.void]:
+def cloud_view(msg: Any, names: Collection[str]) -> NDArray[np.void]:
     """The points of a sensor_msgs/PointCloud2 as an (N,) structured array, N = height * width.
 
     A view of the message's data unless rows are padded. A field with count > 1 becomes a sub-array.
 
     Args:
         msg: any byte order, field order, padding.
-        names: the fields wanted; all when None. Unknown ones are left out.
+        names: the fields wanted. Unknown ones are left out.
 
     Raises:
         MessageError: the data is shorter than declared, or the layout contradicts itself.
@@ -74,7 +74,7 @@ def cloud_view(msg: Any, names: Collection[str] | None = None) -> NDArray[np.voi
     order = ">" if msg.is_bigendian else "<"
     layout: dict[str, tuple[Any, int]] = {}
     for field in msg.fields:
-        if names is not None and field.name not in names:
+        if field.name not in names:
             continue
         if field.datatype not in _POINT_TYPES:
             raise MessageError(f"PointCloud2 field {field.name}: unknown datatype {field.datatype}")

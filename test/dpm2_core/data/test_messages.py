@@ -144,7 +144,7 @@ def test_written_columns_come_back(kind: str) -> None:
     """What `cloud_fields` writes, `cloud_view` reads: any type, and features of many values a point."""
     rng = np.random.default_rng(1)
     columns = {"x": rng.normal(size=7).astype("f4"), "feature": rng.integers(0, 100, (7, 16)).astype(kind)}
-    view = messages.cloud_view(SimpleNamespace(**messages.cloud_fields(columns, SimpleNamespace)))
+    view = messages.cloud_view(SimpleNamespace(**messages.cloud_fields(columns, SimpleNamespace)), columns)
     for name, column in columns.items():
         np.testing.assert_array_equal(view[name], column)
 
