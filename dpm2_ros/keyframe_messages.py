@@ -21,7 +21,7 @@ from dpm2_core.frame import Fix
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_ros.conversions import EARLIER, bytes_to_array, header
+from dpm2_ros.conversions import EARLIER, bytes_to_array, columns_to_msg
 
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
 """Of keyframes; what falls out of the queue is sent again."""
@@ -129,26 +129,15 @@ def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: st
     the cloud.
     """
     d = None if d is not None and (d.up is not None or d.scale != 1) else d
-    channels = 0 if d is None else d.features.shape[1]
-    dtype = _row(max(channels, 1))
-    rows = np.zeros(0 if d is None else min(len(d), BUDGET // 2 // dtype.itemsize), dtype)
+    values, features = np.zeros((0, 6), np.float32), np.zeros((0, 1), np.int8)
     if d is not None:
-        for column, part in (("xyz", d.xyz), ("axis", d.axes), ("step", d.step), ("feature", d.features)):
-            rows[column] = part[: len(rows)]
-    names = ("x", "y", "z", "axis_x", "axis_y", "step")
-    fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate(names)]
+        values, features = np.column_stack([d.xyz, d.axes, d.step]), d.features
+    most = BUDGET // 2 // _row(features.shape[1]).itemsize
+    columns = dict(zip(("x", "y", "z", "axis_x", "axis_y", "step"), values[:most].T, strict=True))
     feature = f"{_FEATURE}:{weights}" if weights else _FEATURE
-    fields.append(PointField(name=feature, offset=24, datatype=PointField.INT8, count=max(channels, 1)))
-    return PointCloud2(
-        header=header(stamp, name),
-        height=1,
-        width=len(rows),
-        fields=fields,
-        point_step=dtype.itemsize,
-        row_step=dtype.itemsize * len(rows),
-        data=bytes_to_array(rows.tobytes()),
-        is_dense=True,
-    )
+    message = columns_to_msg({**columns, feature: features[:most]}, stamp, name)
+    message.is_dense = True
+    return message
 
 
 def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]:
