@@ -132,9 +132,7 @@ def odometry_to_msg(
         covariance: (6, 6) of the pose since the start, as in `Registration`.
         seconds: length of the last step, which turns its covariance into that of the twist.
     """
-    message = Odometry(header=header(motion.stamp, odom_frame), child_frame_id=body_frame)
-    message.pose.pose = pose_to_msg(motion.T_odom_body)
-    message.pose.covariance = covariance_to_ros(covariance, motion.T_odom_body[:3, :3])
+    message = edge_to_msg(motion.T_odom_body, covariance, motion.stamp, odom_frame, body_frame)
     message.twist.twist = Twist(linear=vector(motion.twist[3:]), angular=vector(motion.twist[:3]))
     message.twist.covariance = covariance_to_ros(motion.covariance, np.eye(3)) / seconds**2
     return message
