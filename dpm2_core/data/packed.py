@@ -144,7 +144,8 @@ class PackedDrive:
     """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped.
 
     Attributes:
-        has_images: whether its frames have some. preset: of the synthetic city; empty where it is from elsewhere.
+        has_images: whether its frames have some. image_size: height and width of these, pixels; None without.
+        preset: of the synthetic city; empty where it is from elsewhere.
 
     Raises:
         UsageError: it is none, or is damaged.
@@ -170,6 +171,7 @@ class PackedDrive:
             raise UsageError(f"{folder}: poses, images and their calibration do not fit each other: pack it again")
         if not np.isfinite(self.poses).all():
             raise UsageError(f"{folder}: a pose is not finite: pack it again")
+        self.image_size: tuple[int, int] | None = views[0][2:4] if views else None
         self.folder = folder
         self.preset = str(self.about.get("preset", ""))
         self.name = folder.name

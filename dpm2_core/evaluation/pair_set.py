@@ -16,6 +16,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.packed_frames import check_images, cropped_anew, is_cropped_anew
 from dpm2_core.network.pyramid import build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import collate_views
@@ -39,13 +40,16 @@ class PairSet:
     """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m, two of four with the source turned at random.
 
     Raises:
-        UsageError: no two frames of a drive are so far apart.
+        UsageError: no two frames of a drive are so far apart, or the network wants more of them than was packed.
     """
 
     def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, farthest: float = FAR) -> None:
         noise = np.random.default_rng(0)
         self.drives = open_packed(root)
         self.network, self.images = network, images
+        self._cropped_anew = [is_cropped_anew(drive, network.points) for drive in self.drives]
+        for drive in self.drives if images else ():
+            check_images(drive, network)
         self.frames: dict[tuple[int, int, float], int] = {}
         self.pairs: list[tuple[int, int, np.ndarray, float]] = []
         self._scale: list[float] = []
@@ -84,7 +88,9 @@ class PairSet:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
                 images.append([_turned(image, turn) for image in sample.images] if self.images else [])
-                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network, images[-1]))
+                anew = self._cropped_anew[drive]
+                cloud = cropped_anew(sample.cloud, self.network.points) if anew else sample.cloud
+                pyramids.append(build_pyramid(se3.transform(turn, cloud), self.network, images[-1]))
             out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
         return out
 

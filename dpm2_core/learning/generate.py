@@ -21,6 +21,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
 from dpm2_core.network.images import in_encoded_axes, small_image
+from dpm2_core.network.packed_frames import crop_of
 from dpm2_core.network.pyramid import crop, tilt_of
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
@@ -106,6 +107,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
         "seed": seed,
         "scale": scale,
         "sensor": sensor,
+        "crop": crop_of(network.points),
         "settings": _asked(settings),
     }
     write_packed(folder, samples, about)
@@ -212,7 +214,8 @@ def pack(
         if before is None:
             raise UsageError(f"{source.name}: no readable frame with a pose")
         writer.add(_packed(*before, twist, network, scale))
-        writer.finish({"source": source.name, "scale": scale, "settings": dict(settings or {})})
+        about = {"source": source.name, "scale": scale, "crop": crop_of(network.points)}
+        writer.finish({**about, "settings": dict(settings or {})})
     return len(writer)
 
 

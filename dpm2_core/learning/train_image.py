@@ -28,6 +28,7 @@ from dpm2_core.learning.dataset import Mixture, PackedSettings, draw_group
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.packed_frames import check_images
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import image_features
 from dpm2_core.network.views import Views, collate_views
@@ -78,6 +79,8 @@ class ImageDataset:
     def __init__(self, settings: ImageDataSettings, network: NetworkSettings, seed: int) -> None:
         self._settings, self._network, self._seed = settings, network, seed
         self._drives = Mixture(settings)
+        for drive in self._drives.drives:
+            check_images(drive, network)
 
     def pairs(self, points: int, start: int = 0, rank: int = 0) -> Iterator[ImagePairs]:
         """Pairs of each step from `start` on, without an end, as deterministic as the batches of `GroupDataset`.

@@ -107,7 +107,8 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
     """And so is a file of another kind."""
     train_registration(settings, tmp_path / "out")
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        train_registration(settings.model_copy(update={"network": {}}), tmp_path / "out", resume=True)
+        other = {"image": {"size": tiny().image.size}}  # that of the packed images
+        train_registration(settings.model_copy(update={"network": other}), tmp_path / "out", resume=True)
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
         train_registration(settings, tmp_path / "out", resume=True)

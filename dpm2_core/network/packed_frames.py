@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of packed drives as a network sees its own: they were cropped, and their images made small, for another."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.packed import PackedDrive
+from dpm2_core.errors import UsageError
+from dpm2_core.network.pyramid import crop
+from dpm2_core.network.settings import NetworkSettings, PointsSettings
+
+_CROP = ("near", "far", "voxel")
+
+
+def crop_of(points: PointsSettings) -> dict[str, float]:
+    """What `crop` goes by, for the `about` of a packed drive."""
+    return {name: getattr(points, name) for name in _CROP}
+
+
+def is_cropped_anew(drive: PackedDrive, points: PointsSettings) -> bool:
+    """Whether the clouds of a drive have to be cropped anew, since a network wants less of them than was packed.
+
+    Raises:
+        UsageError: it wants more.
+    """
+    wanted = crop_of(points)
+    packed = drive.about.get("crop", crop_of(PointsSettings()))  # one that does not say is of the presets
+    for name in _CROP:
+        less = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
+        if less > 0:
+            raise UsageError(
+                f"{drive.folder}: packed with points.{name} {packed[name]:g}, the network has {wanted[name]:g}: its"
+                " clouds lack points"
+            )
+    return wanted != packed
+
+
+def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
+    """Raise UsageError where a drive has images that are smaller than those that the network reads."""
+    (height, width), packed = network.image.size, drive.image_size
+    if network.image.backbone != "none" and packed is not None and (packed[0] < height or packed[1] < width):
+        raise UsageError(
+            f"{drive.folder}: packed with images of {packed[0]} x {packed[1]}, the network has {height} x {width}"
+            " (image.size); pack it with the network's --preset"
+        )
+
+
+def cropped_anew(cloud: NDArray[np.float32], points: PointsSettings) -> NDArray[np.float32]:
+    """A packed cloud (N, 3) cropped for another network. Packed clouds are in the order of x: of the points of a voxel
+    the first would always be the one that lies behind."""
+    return crop(np.random.default_rng(0).permutation(cloud), points)
