@@ -12,11 +12,12 @@ import numpy as np
 from rich.console import Group
 
 from benchmarks.harness import Options, Report, earlier, requested, torch_threads, write_report
-from dpm2_core.config import load_settings
+from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
 from dpm2_core.evaluation.record import git_commit
+from dpm2_core.experiments.begun import begin_training
 from dpm2_core.files import file_digest
 from dpm2_core.learning.finetune import finetune
 from dpm2_core.learning.finetune_data import prepare
@@ -68,17 +69,17 @@ def bench_finetune(options: Options) -> Report:
         network, digest = load_model(weights), file_digest(weights)
         _prepare(folder, chosen, options)
         validations = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
-        same = {"settings": chosen.model_dump(mode="json"), "weights_sha256": digest}
+        same = {"settings": chosen.model_dump(mode="json"), "weights_sha256": digest, "pairs": options.pairs}
         before = earlier(path, "before", **same)
         before = before or {name: errors(pairs, network) for name, pairs in validations.items()}
-        results = {"before": before, "runs": earlier(path, "runs", **same)}
+        results: dict[str, Any] = {"pairs": options.pairs, "before": before, "runs": earlier(path, "runs", **same)}
         for variant, seed in wanted:
             runs = results["runs"].setdefault(variant, {})
             if str(seed) in runs:
                 continue
             overrides = [STEPS, *options.overrides, *VARIANTS[variant], f"optimiser.seed={seed}"]
             settings = load_settings(FinetuneSettings, None, overrides)
-            out = folder / f"{variant}_{seed}_{digest[:8]}"  # a stopped training goes on from its own weights alone
+            out = folder / f"{variant}_{seed}_{digest[:8]}"
             run = _run(settings, folder / "data", out, validations)
             runs[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
             write_report(path, "finetune", report(results, chosen, digest), options)
@@ -110,10 +111,10 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 
 def _run(settings: FinetuneSettings, data: Path, out: Path, validations: dict[str, PairSet]) -> dict[str, Any]:
-    """One training, what it cost, and the errors that are left."""
-    out.mkdir(parents=True, exist_ok=True)
+    """One training, what it cost, and the errors that are left; one that was stopped goes on with the same settings."""
+    resume = begin_training(out, dump_settings(settings), "weights.safetensors", [weights_path(settings.weights)])
     cpu = process_time()
-    weights = finetune(settings, out, resume=(out / "checkpoint.pt").is_file(), data=data)
+    weights = finetune(settings, out, resume=resume, data=data)
     seconds = process_time() - cpu
     model = load_model(weights)
     after = {name: errors(pairs, model) for name, pairs in validations.items()}
@@ -162,7 +163,7 @@ def report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> 
             table.add_row(variant, seed, name, *cells, f"{row['success']:.1%}")
     record = {
         "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
-        "settings": settings.model_dump(mode="json"), "weights_sha256": digest,
+        "settings": settings.model_dump(mode="json"), "weights_sha256": digest, "pairs": results.get("pairs"),
         "ratios": summary, "before": before, "runs": runs,
     }  # fmt: skip
     return Report(record, Group(table))

@@ -47,7 +47,8 @@ Part = Callable[[DeepPointMap2, Options], dict[str, Any]]
 
 
 def bench_neural(options: Options) -> Report:
-    """Part after part, each written to the JSON when it is there; a later run with the same weights adds the rest.
+    """Part after part, each written to the JSON when it is there; a later run with the same weights and options adds
+    the rest.
 
     Raises:
         UsageError: no weights, no drive, one without ground truth, or no such part.
@@ -57,7 +58,8 @@ def bench_neural(options: Options) -> Report:
     network = load_network(s.neural.weights, options.threads, s.neural.preset)
     weights = _weights(s.neural.weights)
     path = options.out / "neural.json"
-    parts = earlier(path, "parts", weights=weights)
+    same = {"weights": weights, "options": _options(options)}
+    parts = earlier(path, "parts", **same)
     chosen = [name for name in chosen if options.only or name not in parts]
     with processors(options.threads), Progress(transient=True) as progress:
         task = progress.add_task("neural", total=len(chosen))
@@ -67,14 +69,27 @@ def bench_neural(options: Options) -> Report:
             found = PARTS[name](network, options)
             parts[name] = {"commit": git_commit(), "seconds": round(perf_counter() - started, 1), **found}
             parts = {known: parts[known] for known in PARTS if known in parts}
-            report = Report({"weights": weights, "parts": parts}, view(parts))
+            report = Report({**same, "parts": parts}, view(parts))
             write_report(path, "neural", report, options)
             if name == "image":
                 title = "Highway and tunnel, pairs without a prior"
                 success_png(options.out / "neural_image.png", found["pairs"], title)
             progress.advance(task)
             progress.console.print(f"{name}: {parts[name]['seconds']} s")
-    return Report({"weights": weights, "parts": parts}, view(parts))
+    return Report({**same, "parts": parts}, view(parts))
+
+
+def _options(options: Options) -> dict[str, Any]:
+    """What all parts of a record have in common: those of other options are no rows of the same tables."""
+    return {
+        "sources": [str(path) for path in options.sources],
+        "kitti": None if options.kitti is None else str(options.kitti),
+        "unseen": None if options.unseen is None else str(options.unseen),
+        "overrides": list(options.overrides),
+        "repetitions": options.repetitions,
+        "threads": options.threads,
+        "pairs": options.pairs,
+    }
 
 
 def _weights(name: str) -> dict[str, Any]:

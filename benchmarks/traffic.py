@@ -18,7 +18,7 @@ from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import file_digest
 from dpm2_core.frame import Frame, Points
-from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR
+from dpm2_core.network.pretrained import PERCEPTION_WEIGHTS, PRETRAINED_DIR, weights_path
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
@@ -150,6 +150,8 @@ def _recipe(options: Options) -> dict[str, Any]:
         "first_seed": FIRST_SEED,
         "places": PLACES,
         "overrides": list(options.overrides),
+        "threads": options.threads,
+        "network_sha256": file_digest(weights_path(settings_of(options).neural.weights)),
         "weights_sha256": {path.stem: file_digest(path) for path in sorted(PRETRAINED_DIR.glob("*.safetensors"))},
     }
 

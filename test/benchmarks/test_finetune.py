@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -42,3 +44,34 @@ def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_p
     assert earlier(path, "runs", **{**same, "weights_sha256": "of other weights"}) == {}
     path.write_text("{")
     assert earlier(path, "runs", **same) == {}
+
+
+def test_a_training_of_other_settings_or_pairs_is_not_taken_for_this_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint that a training leaves was gone on with, whatever its settings: with none of its steps left the
+    weights of before were measured again, and stood there as those of the new settings."""
+    resumed: list[bool] = []
+
+    def train(settings: FinetuneSettings, out: Path, resume: bool, data: Path) -> Path:
+        resumed.append(resume)
+        (out / "checkpoint.pt").touch()
+        return out / "weights.safetensors"
+
+    network = SimpleNamespace(settings=SimpleNamespace(preset="small"))
+    for name in ("simulate", "open_source", "prepare", "generate"):
+        monkeypatch.setattr(finetune, name, lambda *given, **named: None)
+    monkeypatch.setattr(finetune, "PairSet", lambda root, pairs, *rest: pairs)
+    monkeypatch.setattr(finetune, "errors", lambda pairs, model: {**BEFORE, "pairs": pairs})
+    monkeypatch.setattr(finetune, "load_model", lambda path: network)
+    monkeypatch.setattr(finetune, "finetune", train)
+    options = Options(out=tmp_path, cache=tmp_path / "cache", repetitions=1, only="pairs", pairs=5)
+    finetune.bench_finetune(options)
+    finetune.bench_finetune(options)  # all is in the file
+    assert resumed == [False]
+    found = finetune.bench_finetune(replace(options, pairs=6)).results
+    assert resumed == [False, True]  # the same training, measured on other pairs
+    assert found["before"]["new"]["pairs"] == found["runs"]["pairs"]["0"]["after"]["new"]["pairs"] == 12
+    found = finetune.bench_finetune(replace(options, overrides=("radius=3",))).results
+    assert resumed == [False, True, False]
+    assert found["settings"]["radius"] == 3
