@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -50,6 +51,18 @@ class Source(Protocol):
 def frame_at(source: Source, position: int) -> Frame:
     """The frame at a position of a drive; of a bag that reads all before it."""
     return next(iter(source.frames(position, position + 1)))
+
+
+def digest_of(source: Source) -> str:
+    """What a drive holds, in 16 characters: how many frames, their true poses, the calibration, and the points and
+    images of the first: more frames that were downloaded since, or another truth, make another one."""
+    poses, T = (b"" if array is None else array.tobytes() for array in (source.poses, source.T_cam_lidar))
+    digest = hashlib.sha256(str(len(source)).encode() + poses + T)
+    for frame in source.frames(0, 1):
+        digest.update(frame.points.tobytes())
+        for image in frame.images:
+            digest.update(image.pixels.tobytes() + image.camera.K.tobytes() + image.camera.T_lidar_cam.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def parse_range(text: str) -> Span:

@@ -11,7 +11,7 @@ from typing import Any
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.experiments.request import Request
-from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, has_sequence
+from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, drive_content, has_sequence
 from dpm2_core.experiments.table import Cells
 from dpm2_core.fleet.part import Figures, Part
 
@@ -60,7 +60,8 @@ def own_part(name: str, sequence: str, request: Request, settings: Sequence[str]
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     asked = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
     files = [Path(setting.partition("=")[2]) for setting in asked if setting.endswith(".safetensors")]
-    return Part(f"{_folder(name)}/{sequence}", OWN, {"drive": _drive(request, asked), **more}, files)
+    arguments, content = {"drive": _drive(request, asked), **more}, drive_content(request.data, asked)
+    return Part(f"{_folder(name)}/{sequence}", OWN, arguments, files, content=content)
 
 
 def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[str]) -> list[Part]:
@@ -76,13 +77,13 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
             raise UsageError(f"--peer {text}: of {len(sequences)} sequences; put {{sequence}} where its name stands")
         for sequence in sequences:
             asked = [f"input.sequence='{sequence}'", *settings, *_input(request.overrides)]
-            drive = _drive(request, asked)
+            drive, content = _drive(request, asked), drive_content(request.data, asked)
             if equals:
                 path = Path(file.replace("{sequence}", sequence))
-                part = Part(f"{_folder(name)}/{sequence}", GIVEN, {"drive": drive, "file": str(path)}, [path])
+                work, more, files = GIVEN, {"file": str(path)}, [path]
             else:
-                part = Part(f"{_folder(name)}/{sequence}", PEER, {"drive": drive, "name": name})
-            parts.append(part)
+                work, more, files = PEER, {"name": name}, []
+            parts.append(Part(f"{_folder(name)}/{sequence}", work, {"drive": drive, **more}, files, content=content))
     return parts
 
 

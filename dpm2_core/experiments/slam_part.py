@@ -14,7 +14,7 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.source import Source, Span
+from dpm2_core.data.source import Source, Span, digest_of
 from dpm2_core.data.trajectory import Keys, Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
@@ -177,6 +177,11 @@ def _measured(
     metrics = metrics.model_copy(update={"truth": source.truth, "fps": fps})
     write_json(folder / METRICS, metrics.model_dump())
     return metrics.model_dump(exclude={"per_length", "per_speed"})
+
+
+def drive_content(data: Path, settings: Sequence[str]) -> str:
+    """What a drive holds, see `digest_of`, as the settings KEY=VALUE of `Config` have it read."""
+    return digest_of(open_source(data, load_settings(Config, None, settings).input))
 
 
 def has_sequence(data: Path, settings: Sequence[str]) -> str:

@@ -76,7 +76,8 @@ def train(
     # All arms are to see the same scans, so the one that needs most decides for all: it has no SLAM loss to learn from.
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
-    text = dump_settings(settings) + json.dumps({"training": training, "until": until}) + "\n"
+    asked = {"training": training, "until": until, "content": scans.digest()}
+    text = dump_settings(settings) + json.dumps(asked) + "\n"
     resume = begin_training(folder, text, start=None if start is None else Path(start))
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)

@@ -32,7 +32,7 @@ from dpm2_core.experiments.task_part import (
 )
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.learning.checkpoint import CHECKPOINT, WEIGHTS
-from dpm2_core.tasks.open import sequence_names
+from dpm2_core.tasks.open import open_scans, sequence_names
 
 SEEDS = 3
 ARMS: tuple[Arm, ...] = ("without", "with", "placebo")
@@ -74,30 +74,32 @@ class TaskTable:
         """First epochs that the arms of a seed share, the arms, and their measuring.
 
         Raises:
-            UsageError: the SLAM loss would never count.
+            UsageError: the SLAM loss would never count, or there are no such scans.
         """
         self._check_slam_loss(request)
+        learned, tested_on = (open_scans(request.data, (), words).digest() for words in self._sequences(request))
         shared: list[Part] = []
         arms: list[Part] = []
         measured: list[Part] = []
-        drive = [str(request.data), list(request.sequences or self.test)]
+        drive = [str(request.data), list(self._sequences(request)[1])]
         for seed in range(request.seeds or SEEDS):
             common = first_slam_epoch(settings_of(self._training(request, seed, "with")))
             start = None
             if common:
                 training = self._training(request, seed, "without")
                 shared.append(Part(self._name(seed, "shared"), TRAIN, {"training": training, "until": common},
-                                   request.config_files))  # fmt: skip
+                                   request.config_files, content=learned))  # fmt: skip
                 start = str(request.out / self._name(seed, "shared"))
             for arm in ARMS:
                 name = self._name(seed, arm)
                 training = self._training(request, seed, arm)
                 checkpoint = [] if start is None else [Path(start) / CHECKPOINT]
                 inputs = [*request.config_files, *checkpoint]
-                arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs))
+                arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs, content=learned))
                 weights = request.out / name / WEIGHTS
                 tested = {"task": self.task, "weights": str(weights), "drive": drive}
-                measured.append(Part(self._measured(seed, arm), self.measured, tested, [weights]))
+                part = Part(self._measured(seed, arm), self.measured, tested, [weights], content=tested_on)
+                measured.append(part)
         return [stage for stage in (shared, arms, measured) if stage]
 
     def _check_slam_loss(self, request: Request) -> None:
@@ -141,8 +143,7 @@ class TaskTable:
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
     ) -> list[str]:
-        words = (request.learn or self.learn, request.sequences or self.test)
-        notes = learned_note(*(sequence_names(request.data, chosen) for chosen in words))
+        notes = learned_note(*(sequence_names(request.data, chosen) for chosen in self._sequences(request)))
         settings = settings_of(self._training(request, 0, "with"))
         if settings.has_windows(settings.epochs - 1):
             notes.append(
@@ -168,10 +169,14 @@ class TaskTable:
     def _training(self, request: Request, seed: int, arm: Arm) -> Training:
         defaults = () if request.config is not None else self.defaults
         return Training(
-            task=self.task, data=str(request.data), learn=list(request.learn or self.learn),
+            task=self.task, data=str(request.data), learn=list(self._sequences(request)[0]),
             config=None if request.config is None else str(request.config),
             settings=[*defaults, *request.overrides], seed=seed, arm=arm,
         )  # fmt: skip
+
+    def _sequences(self, request: Request) -> tuple[Sequence[str], Sequence[str]]:
+        """Those to learn from, and those to be tested on."""
+        return request.learn or self.learn, request.sequences or self.test
 
     def _name(self, seed: int, arm: str) -> str:
         return f"{self.task}/seed_{seed}/{arm}"

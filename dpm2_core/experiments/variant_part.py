@@ -10,7 +10,7 @@ from typing import Any
 
 from dpm2_core.config import dump_settings, load_settings, merged
 from dpm2_core.data.open import open_source
-from dpm2_core.data.packed import PackedDrive
+from dpm2_core.data.packed import PackedDrive, packed_digest
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.checkpoint import LOG
@@ -74,7 +74,8 @@ def train(
         UsageError: no such weights, or no packed drive.
     """
     chosen = training_of(training["config"], training["settings"], training["start"], network, [*map(Path, packed)])
-    resume = begin_training(folder, dump_settings(chosen), [Path(chosen.start)])
+    text = dump_settings(chosen) + f"# {packed_digest(map(PackedDrive, map(Path, packed)))}\n"
+    resume = begin_training(folder, text, [Path(chosen.start)])
     weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps
     advance(steps, steps)

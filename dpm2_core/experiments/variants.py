@@ -16,6 +16,7 @@ from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import SHOWN, cells, learned_note, missing_note, own_part, present, run_folders
+from dpm2_core.experiments.slam_part import drive_content
 from dpm2_core.experiments.table import MEAN, ResultTable
 from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN
 from dpm2_core.fleet.part import Figures, Part
@@ -71,20 +72,22 @@ class VariantTable:
         """Packed drives, a training of each variant, and each on every sequence."""
         sequences = present(request, TESTED, ORIGINAL_POSES)
         start = request.weights or "small"
-        packs = [
-            Part(f"packed/{sequence}", PACK, {"data": str(request.data), "weights": start,
-                 "settings": [f"input.sequence='{sequence}'"]}, [weights_path(start)])
-            for sequence in _learned(request)
-        ]  # fmt: skip
+        packs = []
+        for sequence in _learned(request):
+            asked = [f"input.sequence='{sequence}'"]
+            of = {"data": str(request.data), "weights": start, "settings": asked}
+            content = drive_content(request.data, asked)
+            packs.append(Part(f"packed/{sequence}", PACK, of, [weights_path(start)], content=content))
         training = {
             "config": None if request.config is None else str(request.config),
             "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
             "start": start,
         }
         arguments = {"training": training, "packed": [str(request.out / pack.name / DRIVE) for pack in packs]}
+        content = " ".join(pack.content for pack in packs)
         inputs = [weights_path(start), *request.config_files]
         trained = [
-            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, inputs)
+            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, inputs, content=content)
             for name, change in self.variants.items()
         ]
         stages: list[list[Part]] = [packs, trained]

@@ -52,6 +52,8 @@ class Part:
         fresh: it begins with an empty folder, which takes its name when all is in it. Else the work finds what an
             attempt before has left, and goes on with that.
         cores: processors that it uses.
+        content: what else it reads holds, such as the digest of a drive; a part is done again when that changed, but
+            for one that ended and does not say what it had read.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Part:
     inputs: Sequence[Path] = field(default=())
     fresh: bool = False
     cores: int = 1
+    content: str = ""
 
 
 @dataclass(frozen=True)
@@ -145,8 +148,9 @@ def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) 
 def figures_of(part: Part, out: Path) -> Figures | None:
     """What a part that ended has found; None where it has not, was asked for something else, or is not whole."""
     try:
-        record = json.loads((out / part.name / DONE).read_text(encoding="utf-8"))
-        if {key: record[key] for key in ("arguments", "inputs")} != json.loads(json.dumps(_asked(part))):
+        asked = json.loads(json.dumps(_asked(part)))
+        record = {"content": part.content, **json.loads((out / part.name / DONE).read_text(encoding="utf-8"))}
+        if any(record[key] != asked[key] for key in asked):
             return None
         return _read(record) if is_whole(out / part.name) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -216,7 +220,8 @@ def _read(record: Mapping[str, Any]) -> Figures:
 
 
 def _asked(part: Part) -> dict[str, Any]:
-    return {"arguments": dict(part.arguments), "inputs": {str(path): _digest(path) for path in part.inputs}}
+    inputs = {str(path): _digest(path) for path in part.inputs}
+    return {"arguments": dict(part.arguments), "inputs": inputs, "content": part.content}
 
 
 def _digest(path: Path) -> str | None:

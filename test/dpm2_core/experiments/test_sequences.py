@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
+from dpm2_core.experiments.kitti import KITTI
+from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.slam_part import Drive, given
 from dpm2_core.geometry import se3
 
@@ -174,6 +176,27 @@ def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path
     found = given(tmp_path, lambda *_: None, drive, str(tmp_path / "peer.txt"))
     assert (found["frames"], found["failed_frames"]) == (4, 0)
     assert found["ape_rmse_m"] < 1e-9
+
+
+def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_path: Path) -> None:
+    """Of a sequence that was still being downloaded the figures of the first scans stood there as those of the whole,
+    also beside the row of a peer that had all of them."""
+    folder, request = tmp_path / "sequences" / "06", Request(tmp_path, tmp_path / "out", peers=("kiss-icp", "x=x.txt"))
+    (folder / "velodyne").mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    along = se3.make(np.eye(3), np.c_[np.arange(9.0), np.zeros((9, 2))])
+
+    def contents(scans: int, truth: np.ndarray, first: float = 5.0) -> list[str]:
+        write_kitti(tmp_path / "poses" / "06.txt", truth)
+        for n in range(scans):
+            np.array([first, 0, 0, 0], "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
+        return [part.content for stage in KITTI.parts(request) for part in stage]
+
+    found = [contents(4, along), contents(9, along), contents(9, along[::-1]), contents(9, along, first=6.0)]
+    assert len({content for row in found for content in row}) == len(found)
+    assert contents(9, along, first=6.0) == found[-1]
+    assert len(found[0]) == 3  # ours, a program and a file
 
 
 def test_the_list_has_every_experiment() -> None:

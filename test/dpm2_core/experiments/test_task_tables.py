@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.config import load_settings
+from dpm2_core.errors import UsageError
 from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.task_part import Training, train
@@ -113,6 +114,29 @@ def test_ae_lidar_says_that_its_last_epoch_has_the_slam_loss(tmp_path: Path) -> 
     missing = dpm2("experiment", "ae-lidar", data, "--out", out, "--learn", "7", "--sequences", "1")
     assert missing.returncode == 2
     assert "no sequence 7; there are 0, 1" in missing.stderr
+
+
+def test_arms_are_trained_and_measured_again_on_other_scans(tmp_path: Path) -> None:
+    """Only what has read them: with more scans to be tested on, nothing is trained."""
+    request = Request(tmp_path, tmp_path / "out", learn=("00",), sequences=("05",), seeds=1)
+
+    def contents() -> list[set[str]]:
+        """Of the shared epochs, the arms, and their measuring."""
+        return [{part.content for part in stage} for stage in GNDNET.parts(request)]
+
+    for name in ("00", "05"):
+        labelled_drive(tmp_path / "sequences" / name, range(3), points=300, seed=int(name))
+    before = contents()
+    assert before[0] == before[1] != before[2]
+    assert contents() == before
+    shutil.rmtree(tmp_path / "sequences" / "05")
+    labelled_drive(tmp_path / "sequences" / "05", range(5), points=300, seed=5)
+    after = contents()
+    assert after[:2] == before[:2]
+    assert after[2] != before[2]
+    shutil.rmtree(tmp_path / "sequences" / "05")
+    with pytest.raises(UsageError, match="no sequence 05"):  # it was said after the trainings
+        GNDNET.parts(request)
 
 
 def test_a_gain_by_hand() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,18 @@ def test_what_is_done_is_not_done_again_unless_its_input_changed(tmp_path: Path)
     assert [again[name]["times"] for name in again] == [1, 2, 1]
     changed = run_parts([Part("a/0", WORK, {"start": 7})], tmp_path)
     assert changed["a/0"]["value"] == 8
+
+
+def test_what_read_something_else_is_done_again(tmp_path: Path) -> None:
+    """Such as a drive of which there are more frames now; a record of before, which does not say, stays."""
+    assert run_parts([Part("a", WORK, {"start": 1}, content="half a drive")], tmp_path)["a"]["times"] == 1
+    whole = Part("a", WORK, {"start": 1}, content="the drive")
+    assert run_parts([whole], tmp_path)["a"]["times"] == 2
+    assert run_parts([whole], tmp_path)["a"]["times"] == 2
+    record = json.loads((tmp_path / "a" / DONE).read_text())
+    del record["content"]
+    (tmp_path / "a" / DONE).write_text(json.dumps(record))
+    assert run_parts([replace(whole, content="another")], tmp_path)["a"]["times"] == 2
 
 
 @pytest.mark.slow
