@@ -17,8 +17,8 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.experiments.begun import begin_training
 from dpm2_core.files import file_digest
+from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.finetune import finetune
 from dpm2_core.learning.finetune_data import prepare
 from dpm2_core.learning.finetune_settings import FinetuneSettings

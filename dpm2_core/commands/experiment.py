@@ -52,6 +52,7 @@ def experiment(
     from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
     from dpm2_core.experiments.request import Request
     from dpm2_core.fleet.part import Progress
+    from dpm2_core.learning.begun import check_one_process
 
     if listed:
         table = FigureTable("Experiments", names=["name", "of"], text=["what"])
@@ -61,6 +62,7 @@ def experiment(
         return
     if name is None or data is None or out is None:
         raise UsageError("dpm2 experiment: want NAME DATA --out DIR, or --list")
+    check_one_process("experiment")
     request = Request(
         data,
         out,

@@ -33,10 +33,11 @@ def finetune(
     from dpm2_core.data.packed import open_packed, packed_digest
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
-    from dpm2_core.learning.begun import begin_or_resume
+    from dpm2_core.learning.begun import begin_or_resume, check_one_process
     from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
     from dpm2_core.slam.settings import SlamSettings
 
+    check_one_process("finetune")
     chosen = load_settings(finetune_settings.FinetuneSettings, config, settings or [])
     start = weights_path(chosen.weights)
     data: dict[str, object] = {"SRC": [str(path.resolve()) for path in src]}

@@ -114,12 +114,13 @@ Scans = tuple[Path, Sequence[str]]
 
 def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tuple[Scans, Scans | None]) -> None:
     """Train a task on the first scans, measuring on the second."""
-    from dpm2_core.learning.begun import begin_or_resume
+    from dpm2_core.learning.begun import begin_or_resume, check_one_process
     from dpm2_core.learning.checkpoint import WEIGHTS
     from dpm2_core.tasks.open import open_scans  # torch is slow to import
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import new_task, train_task
 
+    check_one_process(f"train {name}")
     kind = task_type(name)
     (src, sequences), val = sets
     scans = open_scans(src, kind.learns_from(settings), sequences)

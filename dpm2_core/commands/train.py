@@ -180,7 +180,9 @@ def ablation(
     from dpm2_core.evaluation.record import write_record
     from dpm2_core.experiments.ablation import AblationSettings, ablation_tables, gains
     from dpm2_core.experiments.ablation import ablation as compare
+    from dpm2_core.learning.begun import check_one_process
 
+    check_one_process("train ablation")
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:
         raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")

@@ -66,7 +66,7 @@ def begin_or_resume(
     if resume and not there:
         raise UsageError(f"{folder}: no {CHECKPOINT} to resume")
     now = dict(_values(settings)) | {f"content of {path}": _content(path) for path in read} | (data or {})
-    now["processes"] = int(os.environ.get("WORLD_SIZE", "1"))
+    now["processes"] = _processes()
     now = json.loads(json_text(now))  # as it is read again
     if not resume or not asked.is_file():
         with atomic_write(asked) as file:
@@ -80,6 +80,16 @@ def begin_or_resume(
     if differing:
         name, old, new = _difference(differing[0], before[differing[0]], now[differing[0]])
         raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
+
+
+def check_one_process(command: str) -> None:
+    """Raise UsageError under torchrun, for a command whose processes would all do the same, in the same folder."""
+    if _processes() > 1:
+        raise UsageError(f"dpm2 {command}: works in one process; torchrun is for dpm2 train image, phase1 and phase2")
+
+
+def _processes() -> int:
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def _content(path: Path) -> str:

@@ -14,6 +14,8 @@ from dpm2_core.learning.begun import begin_or_resume, begin_training
 from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
 from dpm2_core.learning.trainer import OptimizerSettings
 
+from ...helpers.command import dpm2
+
 
 class Training(Settings):
     """Settings of a training."""
@@ -116,6 +118,29 @@ def test_weights_of_another_content_and_other_processes_are_something_else(
     read.write_text("others!")
     with pytest.raises(UsageError, match=rf"content of {read} \w+, not \w+"):
         begin_or_resume(out, True, Training(), [read])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", "gndnet", "DATA"),
+        ("train", "movers", "DATA"),
+        ("train", "ablation"),
+        ("finetune", "DATA"),
+        ("experiment", "kitti", "DATA", "--out", "OUT"),
+    ],
+    ids=" ".join,
+)
+def test_processes_that_would_all_do_the_same_are_refused(
+    tmp_path: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of them trained a task on the same scans, to the weights of one, and fine-tunings packed the same folders."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    places = {"DATA": str(tmp_path), "OUT": str(tmp_path / "out")}
+    done = dpm2(*(places.get(word, word) for word in command))
+    assert done.returncode == 2
+    assert "works in one process; torchrun is for dpm2 train image, phase1 and phase2" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_checkpoint_that_does_not_say_how_it_began_is_gone_on_with(tmp_path: Path) -> None:
