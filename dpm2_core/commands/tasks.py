@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, parse_names, progress_bar, show
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, train
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, say_learned, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
@@ -116,7 +116,7 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     """Train a task on the first scans, measuring on the second."""
     from dpm2_core.learning.begun import begin_or_resume, check_one_process
     from dpm2_core.learning.checkpoint import WEIGHTS
-    from dpm2_core.tasks.open import open_scans  # torch is slow to import
+    from dpm2_core.tasks.open import open_scans, sequence_places  # torch is slow to import
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import new_task, train_task
 
@@ -130,8 +130,9 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     measured = None
     if val is not None:
         measured = open_scans(val[0], kind.needs, val[1])
-        if measured.digest() == data["content"]:
-            typer.echo(f"note: --val {val[0]} is what the task learns from", err=True)
+        places = sequence_places(*val)
+        same = measured.digest() == data["content"]  # as of a copy
+        say_learned(f"--val {val[0]} is what the task", places, places if same else sequence_places(src, sequences))
     train_task(new_task(name, settings), scans, out, resume, measured)
     typer.echo(f"{out / WEIGHTS}: written", err=True)
 

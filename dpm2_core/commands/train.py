@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -206,3 +207,17 @@ def _begin(
     content = {folder: packed_digest(found) for folder, found in drives.items()}
     read = [Path(settings.start)] if settings.start else []
     begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
+    if validation := getattr(settings, "validation", ""):  # the training of the image branch has none
+        measured = {drive.folder.resolve(): drive.name for drive in open_packed(Path(validation))}
+        learned = {
+            d.folder.resolve() for folder, found in drives.items() if settings.data.packed[folder] for d in found
+        }
+        say_learned(f"validation {validation} is what the network", measured, learned)
+
+
+def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:
+    """Say which of what is measured on, names by folder, is learned from as well: its figures are no evidence."""
+    both = [name for folder, name in measured.items() if folder in learned]
+    if both:
+        which = "" if len(both) == len(measured) else f": {', '.join(both)}"
+        typer.echo(f"note: {what} learns from{which}", err=True)

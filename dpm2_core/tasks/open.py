@@ -62,6 +62,13 @@ def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
     return pairs + ["/".join(names_of(folder, path)) for folder in folders_of(path, sequences)]
 
 
+def sequence_places(path: Path, sequences: Sequence[str] = ()) -> dict[Path, str]:
+    """Name of each of these by its folder, or the file of its pair, however that was reached."""
+    pairs = [pair for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
+    folders = folders_of(path, sequences)
+    return {p.path.resolve(): p.name for p in pairs} | {f.resolve(): "/".join(names_of(f, path)) for f in folders}
+
+
 def names_of(folder: Path, path: Path) -> list[str]:
     """The names that a sequence folder below `path` can be chosen by: those of the folders on the way, its own last."""
     return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]

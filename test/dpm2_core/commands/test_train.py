@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `dpm2 train` says of scans that are both learned from and measured on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ...helpers.command import dpm2
+from ...helpers.networks import TINY
+from ..tasks.conftest import labelled_drive, write_pairs
+
+QUICK = ("epochs=1", "warmup=0", "window=2", "every=1", "batch=1")
+GROUND = ("network.cells=32", "network.cell=2", "network.channels=4")
+RANGE = (
+    "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 60}",
+    "network.channels=4",
+    "network.latent=8",
+)
+
+
+def sets(*settings: str) -> list[str]:
+    """`--set` before each."""
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+def notes(done: str) -> list[str]:
+    """What was said of scans that are learned from."""
+    return [line for line in done.splitlines() if line.startswith("note: ")]
+
+
+@pytest.mark.slow
+def test_sequences_that_a_task_is_measured_on_and_learns_from_are_named(tmp_path: Path) -> None:
+    """With `--val-sequences 02`, and `--sequences` forgotten, the task learned from 02 too: only where all that was
+    measured on was all that was learned from was it said."""
+    data = tmp_path / "data"
+    for name in ("00", "01", "02"):
+        labelled_drive(data / "sequences" / name, range(2), points=300, seed=int(name))
+    one = data / "sequences" / "02"
+
+    def said(number: int, *more: object) -> list[str]:
+        out = tmp_path / f"out{number}"
+        done = dpm2("train", "gndnet", data, "--out", out, *sets(*QUICK, *GROUND), *more)
+        assert done.returncode == 0, done.stderr
+        return notes(done.stderr)
+
+    assert said(0, "--val", data, "--val-sequences", "02") == [f"note: --val {data} is what the task learns from"]
+    both = ("--sequences", "00,02", "--val-sequences", "01,02")
+    assert said(1, "--val", data, *both) == [f"note: --val {data} is what the task learns from: 02"]
+    assert said(2, "--val", one) == [f"note: --val {one} is what the task learns from"]  # by another name
+    assert said(3, "--val", data, "--sequences", "00,01", "--val-sequences", "02") == []
+    copy = shutil.copytree(one, tmp_path / "copy")
+    assert said(4, "--sequences", "02", "--val", copy) == [f"note: --val {copy} is what the task learns from"]
+
+
+@pytest.mark.slow
+def test_pairs_that_are_measured_on_and_learned_from_are_named(tmp_path: Path) -> None:
+    data = write_pairs(tmp_path / "pairs", scans=2)
+    call = ("train", "ae_lidar", data, *sets(*QUICK, *RANGE), "--val", data)
+    done = dpm2(*call, "--out", tmp_path / "a", "--sequences", "1")
+    assert notes(done.stderr) == [f"note: --val {data} is what the task learns from: pairs/d1"]
+    done = dpm2(*call, "--out", tmp_path / "b", "--sequences", "1", "--val-sequences", "0")
+    assert (done.returncode, notes(done.stderr)) == (0, [])
+
+
+@pytest.mark.slow
+def test_packed_drives_of_a_validation_that_are_learned_from_are_named(packed: Path, tmp_path: Path) -> None:
+    """Not those of no weight."""
+    elsewhere = shutil.copytree(packed, tmp_path / "elsewhere")
+    tree = {
+        "network": TINY, "validation_pairs": 2, "pairs": 1, "data": {"groups": 1, "frames": 2, "workers": 0},
+        "optimiser": {"steps": 1, "compile": False, "warmup": 0},
+    }  # fmt: skip
+    (tmp_path / "asked.yaml").write_text(json.dumps(tree))
+    for number, (weight, validation, said) in enumerate([(1, packed, 1), (0, packed, 0), (1, elsewhere, 0)]):
+        drives = json.dumps({str(packed): weight, **({} if weight else {str(elsewhere): 1})})
+        call = ("train", "phase1", "--config", tmp_path / "asked.yaml", "--out", tmp_path / f"out{number}")
+        done = dpm2(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
+        assert done.returncode == 0, done.stderr
+        assert notes(done.stderr) == [f"note: validation {packed} is what the network learns from"] * said
