@@ -19,12 +19,15 @@ def report(
 
     Runs of one drive are drawn together. The page needs no network and no other file.
     """
+    from dpm2_core.evaluation.run_folder import TRAJECTORY
     from dpm2_core.evaluation.run_page import find_runs, runs_page  # scipy is slow to import
     from dpm2_core.experiments.registry import tables_in
     from dpm2_core.files import atomic_write
 
-    runs = find_runs(folders)
-    tables = [table for folder in folders for table in tables_in(folder)]
+    tables_of = {folder: tables_in(folder) for folder in folders}
+    # Experiments with the tasks alone, and those of trainings that were not driven, leave tables and no run.
+    runs = find_runs([folder for folder in folders if any(folder.rglob(TRAJECTORY)) or not tables_of[folder]])
+    tables = [table for found in tables_of.values() for table in found]
     text = runs_page(", ".join(folder.resolve().name for folder in folders), runs, tables)
     with atomic_write(out) as file:
         file.write(text)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -80,21 +80,28 @@ def load(name: str) -> Experiment:
 
 
 def tables_in(folder: Path) -> list[HtmlTable]:
-    """The tables of the experiments whose results are in a folder.
+    """The tables of the experiments whose results are in a folder or below it, these with the folder in their titles.
 
     Raises:
         UsageError: one is damaged.
     """
     tables = []
     for name in EXPERIMENTS:
-        path = folder / f"{name}.json"
-        if not path.is_file():
-            continue
-        try:
-            tables += [html_table(record) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{path}: no record of an experiment: {error}") from None
+        below = (page.with_suffix(".json") for page in sorted(folder.rglob(f"{name}.html")))  # `carry_out` leaves both
+        for path in dict.fromkeys([folder / f"{name}.json", *below]):
+            where = "" if path.parent == folder else f"{path.parent.relative_to(folder)}: "
+            tables += [replace(table, title=f"{where}{table.title}") for table in _tables_of(path)]
     return tables
+
+
+def _tables_of(path: Path) -> list[HtmlTable]:
+    """Those of an experiment's JSON; none where there is no such file."""
+    if not path.is_file():
+        return []
+    try:
+        return [html_table(record) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: no record of an experiment: {error}") from None
 
 
 def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome:

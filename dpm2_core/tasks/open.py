@@ -62,10 +62,9 @@ def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
     return pairs + ["/".join(names_of(folder, path)) for folder in folders_of(path, sequences)]
 
 
-def sequence_places(path: Path, sequences: Sequence[str] = ()) -> dict[Path, str]:
+def sequence_places(path: Path, sequences: Sequence[str]) -> dict[Path, str]:
     """Name of each of these by its folder, or the file of its pair, however that was reached."""
-    pairs = [pair for pair in open_pairs(path) if not sequences or is_among(pair.number, sequences)]
-    folders = folders_of(path, sequences)
+    pairs, folders = pairs_of(path, sequences), folders_of(path, sequences)
     return {p.path.resolve(): p.name for p in pairs} | {f.resolve(): "/".join(names_of(f, path)) for f in folders}
 
 
