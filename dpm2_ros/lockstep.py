@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording into the graph exactly: a cloud goes out when the one before has its odometry, and never ahead of its
-images, nor of the cloud of a second LiDAR. So nothing depends on how long anything takes, and slam_node sees what
-`dpm2 run` sees.
+images and IMU samples, nor of the cloud of a second LiDAR. So nothing depends on how long anything takes, and slam_node
+sees what `dpm2 run` sees.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
-from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD, IMAGES, IMU
+from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD, FIX, IMAGES, IMU
 from dpm2_core.data.messages import serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import RawMessage, clouds_after_others, passed
+from dpm2_core.data.pairing import SWEEP, RawMessage, clouds_after_others, passed
 from dpm2_core.errors import Dpm2Error
 from dpm2_ros.runtime import STOP
 
@@ -119,7 +119,8 @@ class Lockstep:
         subscriber.
         """
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        others = dict.fromkeys((t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._joining), 0)
+        beside = [t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._joining]
+        others = {topic: -SWEEP if self._bag.types[topic] == IMU else 0 for topic in beside}
         return clouds_after_others(messages, self._clouds, others)
 
     def turn(self, topic: str, data: bytes) -> None:
@@ -127,20 +128,22 @@ class Lockstep:
 
         What goes with it, images and the cloud that joins it, went out before the wait, and so has arrived when it
         ends. One that may be nearer to the cloud before than those that went out ahead of it came too late for it, and
-        waits as well.
+        waits as well; so does a fix, or a sample, that the cloud before would take if it were there.
 
         Raises:
             Dpm2Error: the node is gone.
         """
-        if self._bag.types[topic] in IMAGES or topic in self._joining:
-            before, stamp = self._beside.get(topic, 0), serialized_stamp(data, 0)
-            if self._awaited is not None and not (passed(before, self._awaited) and before <= stamp):
+        kind, stamp, awaited = self._bag.types[topic], serialized_stamp(data, 0), self._awaited
+        if kind in IMAGES or topic in self._joining:
+            before = self._beside.get(topic, 0)
+            if awaited is not None and not (passed(before, awaited) and before <= stamp):
                 self._await_odometry()
             self._beside[topic] = stamp
+        elif kind in (FIX, IMU) and awaited is not None and stamp <= awaited + SWEEP:
+            self._await_odometry()
         if topic in self._clouds:
             self._await_odometry()
-            self._awaited = serialized_stamp(data, 0)
-            self._sent += 1
+            self._awaited, self._sent = stamp, self._sent + 1
 
     def conclude(self) -> None:
         """After the last message: wait for the last odometry, and say how it went.

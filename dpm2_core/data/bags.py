@@ -21,7 +21,7 @@ from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import JUMP, Beside, RawMessage, clouds_after_others
+from dpm2_core.data.pairing import JUMP, SWEEP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.time_order import in_order
 from dpm2_core.data.trajectory import interpolate
@@ -31,8 +31,6 @@ from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import Array, Camera, Frame
 
 Stamps = NDArray[np.int64]
-
-_SWEEP = 250_000_000  # ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted
 
 
 class BagSource:
@@ -185,7 +183,7 @@ class BagSource:
         samples before it are in the buffer then."""
         known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
         others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
-        more = ((known.second_topic, 0), (self.imu_topic, -_SWEEP))
+        more = ((known.second_topic, 0), (self.imu_topic, -SWEEP))
         others |= {topic: ahead for topic, ahead in more if topic}
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too

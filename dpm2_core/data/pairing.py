@@ -20,6 +20,8 @@ JUMP = 1_000_000_000
 jumped: a looped bag, a clock that was set, a recording with a gap."""
 LATE = 500_000_000
 """ns of log time that a cloud of a recording waits for what goes with it."""
+SWEEP = 250_000_000
+"""ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted."""
 BUFFER = 32
 """Messages kept beside those that waiting clouds need; bounds memory where no cloud comes, or the stamps are of no use.
 """

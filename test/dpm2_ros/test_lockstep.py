@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -13,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import rclpy
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -27,27 +25,18 @@ from dpm2_core.config import load_settings
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Frame
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import Config
 from dpm2_ros import lockstep
-from dpm2_ros.bag_player import BagPlayer, Options
 from dpm2_ros.conversions import pose_to_msg
-from dpm2_ros.guard import GuardedNode
-from dpm2_ros.settings import RosSettings
-from dpm2_ros.subscriptions import Inputs
+from test.helpers.lockstep import Listener, contents, play
 from tools.replay import ros_environment, start
 
-OPTIONS = Options(
-    bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=20.0, subscribers=1, clock=False,
-    log=None, lockstep=True,
-)  # fmt: skip
 MS = 1_000_000
 
 
@@ -119,51 +108,6 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
     assert written.keys.tolist() == [stamp_ns(message.header) for message in odometry]
     poses = [transform_matrix(message.pose.pose) for message in odometry]
     np.testing.assert_allclose(written.poses, poses, rtol=0, atol=1e-10)  # it has 12 digits
-
-
-def play(bag: Path) -> None:
-    """In lockstep, to its end."""
-    player = rclpy.create_node("player", use_global_arguments=False)
-    try:
-        BagPlayer(player, replace(OPTIONS, bag=bag)).play()
-    finally:
-        player.destroy_node()
-
-
-class Listener(GuardedNode):
-    """Makes frames as slam_node does, and publishes an odometry for each."""
-
-    def __init__(self, second: str = "", **options: Any) -> None:
-        super().__init__("listener", **options)
-        self.frames: list[Frame] = []
-        settings = InputSettings(points_topic=topics.POINTS, second_points_topic=second)
-        self.declare_parameter("input.second_points_topic", second)
-        self._odometry = self.create_publisher(Odometry, "dpm2/odom", 10)
-        self._inputs = Inputs(self, settings, RosSettings(sync_timeout=0.3))
-        self._builder = FrameBuilder(settings, self._inputs.calibration, self.get_logger().error)
-        self._ended = threading.Event()
-        self._worker = threading.Thread(target=self._work)
-        self._worker.start()
-
-    def _work(self) -> None:
-        while not self._ended.is_set():
-            if (bundle := self._inputs.take(0.1)) is not None:
-                self.frames.append(self._builder.frame(bundle.stamp, bundle.cloud, len(self.frames), bundle.beside))
-                self._odometry.publish(Odometry(header=bundle.cloud.header))
-
-    def close(self) -> None:
-        self._ended.set()
-        self._worker.join()
-
-
-def contents(frame: Frame) -> list[Any]:
-    """All that is in it, bit for bit."""
-    images = [
-        (i.pixels.tobytes(), i.camera.K.tobytes(), i.camera.T_lidar_cam.tobytes(), i.camera.size, i.camera.distortion)
-        for i in frame.images
-    ]
-    offset = None if frame.time_offset is None else frame.time_offset.tobytes()
-    return [frame.index, frame.stamp, frame.problem, frame.points.tobytes(), offset, images]
 
 
 @pytest.mark.parametrize("seed", range(4))
