@@ -225,8 +225,9 @@ class BagPlayer:
                 self._lockstep.turn(topic, data)
             if STOP.is_set():
                 return count
-            now = max(now, log_time)  # in lockstep a cloud comes later than it was recorded
-            self._tick(now)
+            now = max(now, log_time) if self._lockstep is None else log_time
+            if self._lockstep is None or self._lockstep.awaits(topic):  # there other messages are ahead of the clouds
+                self._tick(now)
             published = time.monotonic_ns()
             self._publishers[topic].publish(data)
             count += 1

@@ -145,6 +145,10 @@ class Lockstep:
             self._await_odometry()
             self._awaited, self._sent = stamp, self._sent + 1
 
+    def awaits(self, topic: str) -> bool:
+        """Whether it has clouds that get an odometry."""
+        return topic in self._clouds
+
     def conclude(self) -> None:
         """After the last message: wait for the last odometry, and say how it went.
 

@@ -85,7 +85,7 @@ class SlamNode(ManagedNode):
         self._lidar_frame = ""  # of the last cloud
         warm_up(self._config.slam)
         self._known: Calibration | None = None
-        self._left: tuple[int, float] | None = None  # stamp and arrival of the last cloud before a deactivation
+        self._left: tuple[int, float, float] | None = None  # of the synchronizer before a deactivation
         self._begin()
         back.callback(self._give_up)
         self._index = 0

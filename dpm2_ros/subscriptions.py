@@ -164,7 +164,7 @@ class Inputs:
         now, frame, last = time.monotonic(), cloud.header.frame_id, self.synchronizer.last_arrival
         if self._frame not in (None, frame) and last is not None and now - last < OTHER_FRAME:
             raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
-        if problem and not (frame == self._frame and self.synchronizer.due(stamp_ns(cloud.header), now)):
+        if problem and not (frame == self._frame and self.synchronizer.due(stamp_ns(cloud.header), now, self._clock)):
             raise RejectedError("unreadable", problem)
         self._frame = frame
         return cloud
@@ -187,7 +187,7 @@ class Inputs:
             sensor.present = bool(self._node.count_publishers(topic))
         with self._arrived:
             lost = self.losses.add(stamp, number)
-            check = self.synchronizer.add_cloud(stamp, message, time.monotonic())
+            check = self.synchronizer.add_cloud(stamp, message, time.monotonic(), self._clock)
             self._arrived.notify()
         if lost:
             self._node.get_logger().warning(
@@ -226,6 +226,12 @@ class Inputs:
             stamp = self._stamp(message)
             self.gnss.add(stamp, message)
             self.gnss_received, self.gnss_last = self.gnss_received + 1, (stamp, time.monotonic())
+
+    @property
+    def _clock(self) -> float:
+        """s by /clock; 0 where it is not followed."""
+        clock = self._node.get_clock()
+        return float(clock.now().nanoseconds * 1e-9) if clock.ros_time_is_active else 0.0
 
     def _stamp(self, message: Any) -> int:
         """ns; drivers that leave the stamp at 0 get the time of arrival."""

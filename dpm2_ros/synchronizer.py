@@ -47,11 +47,13 @@ class StampCheck(StrEnum):
 
 @dataclass(eq=False)
 class Bundle:
-    """A cloud and what goes with it, ready to be processed; arrival and `now` are seconds of one clock."""
+    """A cloud and what goes with it, ready to be processed; arrival and `now` are seconds of one clock, `clock` is when
+    it arrived by the clock of a recording or a simulation, s, or 0 without one."""
 
     stamp: int
     cloud: Any
     arrival: float
+    clock: float
     restarted: bool
     """Whether time has gone back before it."""
     stepped: bool = False
@@ -111,10 +113,10 @@ class Synchronizer:
         self._depth = self._room = depth  # what may wait in general, and now
         self._moves = False  # whether a cloud has gone since the last was dropped: too slow, but not held up
         self._newest: int | None = None  # stamp of the last cloud accepted
-        self._arrival = 0.0  # of that cloud
+        self._arrival = self._clock = 0.0  # of that cloud
         self._period = JUMP  # ns, from the last but one to that cloud
         self._jumped: Bundle | None = None
-        self._left: tuple[float, float] = -float("inf"), 0.0  # stamp and arrival of the last cloud that went
+        self._left: tuple[float, float, float] = -float("inf"), 0.0, 0.0  # see `left`
 
     def __len__(self) -> int:
         """Clouds that are waiting."""
@@ -126,36 +128,36 @@ class Synchronizer:
         return sum(self.counts.values()) + (self._jumped is not None)
 
     @property
-    def left(self) -> tuple[int, float] | None:
-        """Stamp (ns) and arrival (s) of the last cloud that went; None before one has."""
-        stamp, arrival = self._left
-        return None if stamp == -float("inf") else (int(stamp), arrival)
+    def left(self) -> tuple[int, float, float] | None:
+        """Stamp (ns), arrival and `Bundle.clock` (s) of the last cloud that went; None before one has."""
+        stamp, arrival, clock = self._left
+        return None if stamp == -float("inf") else (int(stamp), arrival, clock)
 
-    def follow(self, stamp: int, arrival: float) -> None:
+    def follow(self, stamp: int, arrival: float, clock: float) -> None:
         """Go on where another one has ended: what is its `left`."""
-        self._left = self._newest, self._arrival = stamp, arrival
+        self._left = self._newest, self._arrival, self._clock = stamp, arrival, clock
 
-    def add_cloud(self, stamp: int, cloud: Any, now: float) -> StampCheck:
-        """Take a cloud with its stamp (ns); `now` is when it arrived."""
+    def add_cloud(self, stamp: int, cloud: Any, now: float, clock: float = 0.0) -> StampCheck:
+        """Take a cloud with its stamp (ns); `now` is when it arrived, `clock` as of `Bundle`."""
         self.last_arrival = now
         if self._jumped is not None and self._newest is not None:
             self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest))
-        check = self._check(stamp, now)
+        check, bundle = self._check(stamp, now, clock), Bundle(stamp, cloud, now, clock, restarted=False)
         if check is StampCheck.JUMPED:
-            self._jumped = Bundle(stamp, cloud, now, restarted=False)
+            self._jumped = bundle
             return check
         self.counts[check] += 1
         if check is StampCheck.ACCEPTED:
-            self._accept(Bundle(stamp, cloud, now, restarted=False))
+            self._accept(bundle)
         return check
 
-    def due(self, stamp: int, now: float) -> bool:
+    def due(self, stamp: int, now: float, clock: float = 0.0) -> bool:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
-        return self._newest is not None and self._check(stamp, now) is StampCheck.ACCEPTED
+        return self._newest is not None and self._check(stamp, now, clock) is StampCheck.ACCEPTED
 
     def add(self, topic: str, stamp: int, message: Any, now: float) -> None:
         """Take a message of another sensor with its stamp (ns)."""
-        sensor, (left, arrival) = self.sensors[topic], self._left
+        sensor, (left, arrival, _) = self.sensors[topic], self._left
         tolerance = sensor.messages.tolerance
         sensor.received += 1
         sensor.last_arrival = now
@@ -173,7 +175,7 @@ class Synchronizer:
         if ready is None:  # who asks is not behind
             self._room = self._depth
         else:
-            self._left, self._moves = (ready.stamp, ready.arrival), True
+            self._left, self._moves = (ready.stamp, ready.arrival, ready.clock), True
         return ready
 
     def _ready(self, now: float) -> Bundle | None:
@@ -199,19 +201,23 @@ class Synchronizer:
             return self._queue[0].arrival + self._timeout
         return self._jumped.arrival + HOLD if self._jumped is not None else None
 
-    def _check(self, stamp: int, now: float) -> StampCheck:
+    def _check(self, stamp: int, now: float, clock: float) -> StampCheck:
         if self._newest is None:
             return StampCheck.ACCEPTED
         step = stamp - self._newest
-        if step < -JUMP or self._ahead(stamp, now) > min(AHEAD * self._period, JUMP):
+        if step < -JUMP or self._ahead(stamp, now, clock) > min(AHEAD * self._period, JUMP):
             return StampCheck.JUMPED
         if step > 0:
             return StampCheck.ACCEPTED
         return StampCheck.OUT_OF_ORDER if step else StampCheck.REPEATED
 
-    def _ahead(self, stamp: int, arrival: float) -> float:
-        """By how much more (ns) the stamps have gone on than time has passed since the last cloud."""
-        return stamp - self._newest - (arrival - self._arrival) * 1e9 if self._newest is not None else 0.0
+    def _ahead(self, stamp: int, arrival: float, clock: float) -> float:
+        """By how much more (ns) the stamps have gone on than time has passed since the last cloud.
+
+        A recording that is played faster passes more time than one who listens, and /clock says how much.
+        """
+        passed = max(arrival - self._arrival, clock - self._clock if self._clock else 0.0)
+        return stamp - self._newest - passed * 1e9 if self._newest is not None else 0.0
 
     def _settle(self, true: bool) -> None:
         """Accept or reject the cloud whose stamp jumped."""
@@ -219,7 +225,7 @@ class Synchronizer:
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest
-        bundle.stepped = true and self._ahead(bundle.stamp, bundle.arrival) > JUMP
+        bundle.stepped = true and self._ahead(bundle.stamp, bundle.arrival, bundle.clock) > JUMP
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
         ] += 1
@@ -229,7 +235,7 @@ class Synchronizer:
     def _accept(self, bundle: Bundle) -> None:
         if self._newest is not None and bundle.stamp > self._newest:
             self._period = bundle.stamp - self._newest
-        self._newest, self._arrival = bundle.stamp, bundle.arrival
+        self._newest, self._arrival, self._clock = bundle.stamp, bundle.arrival, bundle.clock
         self._queue.append(bundle)
         if len(self._queue) > self._room and self._moves:
             self._room, self._moves = max(self._room - 1, min(FEW, self._depth)), False

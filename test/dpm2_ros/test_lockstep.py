@@ -22,10 +22,11 @@ from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.commands.run import run
 from dpm2_core.config import load_settings
-from dpm2_core.data import topics
+from dpm2_core.data import bag_messages, topics
 from dpm2_core.data.bag_file import open_bag
+from dpm2_core.data.bag_topics import IMU
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.messages import restamped, serialized_stamp, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
@@ -131,6 +132,29 @@ def test_lockstep_builds_the_frames_of_dpm2_run(ros: Callable[..., Any], bag: Pa
     node = harness.add(Listener())
     play(recording)
     assert [contents(frame) for frame in node.frames] == [contents(frame) for frame in expected]
+
+
+@pytest.mark.parametrize("gap", [3000, 0])
+def test_a_gap_is_no_clock_that_was_set(ros: Callable[..., Any], bag: Path, tmp_path: Path, gap: int) -> None:
+    """In lockstep no time passes in it but by /clock. Where the stamps alone go on by 3 s, a clock was set."""
+    types, source = get_typestore(Stores.ROS2_JAZZY), open_bag(bag)
+    kinds = {topic: source.types[topic] for topic in (topics.POINTS, topics.ODOMETRY)} | {topics.IMU: IMU}
+    set_at = BagSource(bag).stamps.tolist()[8]
+    messages = [(topic, time, bytes(data)) for topic, time, data in source.messages(list(kinds))]
+    for time in BagSource(bag).stamps.tolist():  # none in the gap either: the last cloud before waits to its end
+        sample = bag_messages.imu(time, np.full(3, 0.01), np.array([0, 0, 9.8]))
+        messages.append((topics.IMU, time + MS, bytes(types.serialize_cdr(sample, IMU))))
+    with Writer(tmp_path / "gap", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
+        for topic, time, data in sorted(messages, key=lambda message: message[1]):
+            later = time >= set_at
+            moved = restamped(data, serialized_stamp(data, time) + later * 3000 * MS)
+            writer.write(connections[topic], time + later * gap * MS, moved)
+    expected = [frame.stepped for frame in BagSource(tmp_path / "gap").frames()]
+    assert sum(expected) == (gap == 0)
+    node = ros("use_sim_time:=true").add(Listener(busy=0.05))
+    play(tmp_path / "gap", clock=True)
+    assert node.stepped == expected
 
 
 SECOND = "/second/points"

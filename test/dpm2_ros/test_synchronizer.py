@@ -281,6 +281,16 @@ def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, check: StampChec
         assert synchronizer.counts[check] == 1 + (check is StampCheck.ACCEPTED)
 
 
+@pytest.mark.parametrize(("clock", "stepped"), [((50.0, 53.0), False), ((50.0, 50.1), True), ((0.0, 53.0), True)])
+def test_a_gap_of_a_recording_that_is_played_faster_is_a_pause(clock: tuple[float, float], stepped: bool) -> None:
+    """By /clock, where it tells the time of both clouds; a clock that was set while the recording was made is none."""
+    synchronizer = make(camera=False)
+    synchronizer.add_cloud(10_000 * MS, "before", now=0.0, clock=clock[0])
+    check = synchronizer.add_cloud(13_000 * MS, "after", now=0.1, clock=clock[1])
+    assert (check is StampCheck.JUMPED) == stepped
+    assert [bundle.stepped for bundle in drain(synchronizer, 1.0)] == [False, stepped]
+
+
 def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> list[tuple[int, bool]]:
     """Clouds that arrive at a steady pace; stamp (ms) and `restarted` of those that leave."""
     out = []

@@ -27,11 +27,11 @@ OPTIONS = Options(
 )  # fmt: skip
 
 
-def play(bag: Path) -> None:
-    """In lockstep, to its end."""
+def play(bag: Path, clock: bool = False) -> None:
+    """In lockstep, to its end; `clock`: with /clock."""
     player = rclpy.create_node("player", use_global_arguments=False)
     try:
-        BagPlayer(player, replace(OPTIONS, bag=bag)).play()
+        BagPlayer(player, replace(OPTIONS, bag=bag, clock=clock)).play()
     finally:
         player.destroy_node()
 
@@ -46,6 +46,7 @@ class Listener(GuardedNode):
     def __init__(self, second: str = "", gnss: str = "", busy: float = 0.0, **options: Any) -> None:
         super().__init__("listener", **options)
         self.frames: list[Frame] = []
+        self.stepped: list[bool] = []
         settings = InputSettings(points_topic=topics.POINTS, second_points_topic=second, gnss_topic=gnss)
         self.declare_parameter("input.second_points_topic", second)
         self._busy = busy
@@ -61,6 +62,7 @@ class Listener(GuardedNode):
         while not self._ended.is_set():
             if (bundle := self._inputs.take(0.1)) is not None:
                 time.sleep(self._busy)
+                self.stepped.append(bundle.stepped)
                 self.frames.append(self._builder.frame(bundle.stamp, bundle.cloud, len(self.frames), bundle.beside))
                 self._odometry.publish(Odometry(header=bundle.cloud.header))
 
