@@ -67,8 +67,8 @@ class Diagnostics:
             out.append(self._beside("second camera", "image", known.second_camera.topic))
         if known.second_topic:
             out.append(self._beside("second lidar", "cloud", known.second_topic))
-        if self._inputs.imu_received or self._inputs.problem(known.imu_topic):
-            out.append(self._imu())
+        if (imu := self._imu()) is not None:
+            out.append(imu)
         if self._inputs.gnss is not None:
             out.append(self._gnss())
         if self.other is not None:
@@ -211,9 +211,14 @@ class Diagnostics:
             figures |= {"its ways too long by (%)": f"{100 * other.slip:.1f}"}
         return self._status("other odometry", WARN if verdict else OK, text, figures)
 
-    def _imu(self) -> DiagnosticStatus:
+    def _imu(self) -> DiagnosticStatus | None:
+        """None where none is, and none was asked for."""
         inputs, last, topic = self._inputs, self._health.last, self._inputs.calibration.imu_topic
         problem = inputs.problem(topic) or self._frames.problems.get(topic, "")
+        if not problem and not inputs.imu_received:
+            if inputs.imu is None or not self._node.get_parameter("input.imu_topic").value:
+                return None
+            problem = f"nothing of use on {topic} yet"
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)

@@ -33,18 +33,21 @@ pytestmark = pytest.mark.slow
 class Robot:
     """Stands on a slope: clouds of one place at 10 Hz, samples at 100 Hz."""
 
-    def __init__(self, ros: Callable[..., Any], drive: Any, *parameters: str, place: bool = True) -> None:
+    def __init__(
+        self, ros: Callable[..., Any], drive: Any, *parameters: str, place: bool = True, topic: str = "/imu"
+    ) -> None:
         self.harness, self.drive = ros("input.images:=false", "ros.base_frame:=base_link", *parameters), drive
         self.gravity = 9.81  # m/s2
         self.wait, publisher = self.harness.wait, self.harness.publisher
-        self.lidar, self.imu = publisher(PointCloud2, POINTS), publisher(Imu, "/imu", reliable=False)
+        self.lidar, self.imu = publisher(PointCloud2, POINTS), publisher(Imu, topic, reliable=False)
         frames = {"lidar": T_BASE_LIDAR} | ({"imu_link": T_BASE_IMU} if place else {})
         static = publisher(TFMessage, "/tf_static", latched=True)
         static.publish(TFMessage(transforms=[transform_to_msg(T, 0, "base_link", n) for n, T in frames.items()]))
         self.odom = self.harness.hear(Odometry, "/dpm2/odom")
         self.diagnostics = self.harness.diagnostics
         self.node: SlamNode = self.harness.add(SlamNode())
-        self.wait(lambda: self.lidar.get_subscription_count() and self.imu.get_subscription_count(), "subscriptions")
+        self.wait(lambda: self.lidar.get_subscription_count(), "the subscription to the clouds")
+        self.wait(lambda: topic != "/imu" or self.imu.get_subscription_count(), "the subscription to the IMU")
         self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
 
     def sample(self, stamp: int, rates: Any = BIAS) -> None:
@@ -119,3 +122,18 @@ def test_forces_of_the_other_sign_are_said_at_the_start(
     r.gravity = -r.gravity
     r.send(0, 1, 2)
     assert capfd.readouterr().err.count("/imu: its forces at rest point 170 deg away from up") == 1
+
+
+def test_one_that_is_named_and_never_comes_is_said(robot: Callable[..., Robot]) -> None:
+    """As where its topic is misspelled; one that is not named need not be there."""
+    r = robot("input.imu_topic:=/imu/dta", topic="/imu/data")
+    r.send(0, 1)
+    said = r.status(saying("nothing of use on /imu/dta yet; going on without"))
+    assert said.level == DiagnosticStatus.WARN
+
+
+def test_none_is_said_where_none_is_named(robot: Callable[..., Robot]) -> None:
+    r = robot(topic="/another")
+    r.send(0, 1)
+    r.harness.status(": odometry")
+    assert not any(status.name.endswith(": imu") for message in r.diagnostics for status in message.status)
