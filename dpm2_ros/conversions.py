@@ -24,6 +24,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.data.thumbnail import moved_thumbnail
 from dpm2_core.estimates import Keyframe, OdometryResult
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
@@ -190,7 +191,7 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
 
 
 def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-    """The same place seen from the base: its pose, cloud, descriptors, edge and fix."""
+    """The same place seen from the base: its pose, cloud, descriptors, edge, fix and picture."""
     edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
     if edge is not None:
         T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
@@ -198,9 +199,11 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
     fix = keyframe.fix
     if fix is not None:
         fix = fix.moved(T_base_lidar)
+    picture = keyframe.thumbnail
     return replace(
         keyframe,
         fix=fix,
+        thumbnail=None if picture is None else moved_thumbnail(picture, T_base_lidar),
         T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
         cloud=se3.transform(T_base_lidar, keyframe.cloud),
         edge=edge,

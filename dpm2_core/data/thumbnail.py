@@ -30,9 +30,21 @@ def thumbnail(image: Image, width: int) -> bytes:
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
     scale = np.diag([width / image.camera.size[0], height / image.camera.size[1], 1.0])
     camera = replace(image.camera, K=scale @ image.camera.K, size=(width, height))
+    return _with_camera(camera, bytes(jpeg)[2:])
+
+
+def moved_thumbnail(jpeg: bytes, T_new_old: Array) -> bytes:
+    """A `thumbnail` with its camera placed in another frame than the LiDAR's, by (4, 4) T_new_old."""
+    (length,) = struct.unpack_from(">H", jpeg, 4)
+    camera = _camera(json.loads(jpeg[6 : 4 + length]))
+    return _with_camera(replace(camera, T_lidar_cam=T_new_old @ camera.T_lidar_cam), jpeg[4 + length :])
+
+
+def _with_camera(camera: Camera, rest: bytes) -> bytes:
+    """A JPEG with a comment in front of the rest of it."""
     fields = {key: np.asarray(value).tolist() for key, value in vars(camera).items()}
     comment = json.dumps(fields).encode()
-    return _START + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + bytes(jpeg)[2:]
+    return _START + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + rest
 
 
 def image_of(jpeg: bytes) -> Image | None:

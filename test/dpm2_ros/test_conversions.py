@@ -12,12 +12,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from dpm2_core.data.messages import decode_points, stamp_ns
+from dpm2_core.data.thumbnail import image_of, thumbnail
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Fix
 from dpm2_core.geometry import se3
+from dpm2_core.slam.registration.texture import Texture, textured
 from dpm2_ros import conversions
+from test.helpers.corridor import frame, random_paint
 
 tangents = hnp.arrays(np.float64, 6, elements=st.floats(-1.5, 1.5))
 EXACT = 1e-9  # double precision through a quaternion, at 100 m
@@ -125,6 +128,26 @@ def test_keyframe_names(robot: str, id: int, name: str) -> None:
 def test_other_frames_are_no_keyframes(name: str) -> None:
     with pytest.raises(UsageError, match="is no keyframe"):
         conversions.parse_keyframe_name(name)
+
+
+def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> None:
+    """The place of a camera in a map is that in the keyframe's frame: a place in a tunnel is found by it."""
+    T_base_lidar = se3.exp([np.pi, 0, 0, -0.6, 0.1, 1.7])  # a LiDAR that hangs
+    seen = frame(0.0, random_paint())
+    keyframe = Keyframe(0, 0, 0, np.eye(4), seen.points, thumbnail=thumbnail(seen.images[0], 320))
+
+    def pixels(of: Keyframe) -> tuple[Array, Texture]:
+        image = image_of(of.thumbnail or b"")
+        assert image is not None
+        texture = textured(image, 320)
+        uv, shown = texture.project(se3.transform(texture.T_cam_lidar, of.cloud[:, :3].astype(np.float64)))
+        return uv[shown], texture
+
+    from_lidar, before = pixels(keyframe)
+    from_base, after = pixels(conversions.keyframe_to_base(keyframe, T_base_lidar))
+    assert len(from_lidar) > 1000
+    np.testing.assert_allclose(from_base, from_lidar, atol=1e-2)  # the cloud is float32
+    np.testing.assert_array_equal(after.levels[0], before.levels[0])  # the JPEG itself is not made anew
 
 
 @given(tangents, tangents)
