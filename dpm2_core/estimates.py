@@ -191,7 +191,8 @@ class OdometryResult:
         seconds: wall time of each stage.
         comparison: with another odometry, where there is one and the frame was registered.
         imu: why the IMU was of no use, in words, empty where it was; None while there has been none.
-        camera: why an image of the frame was left out, in words; empty where none was.
+        camera: why an image of the frame was left out, in words; empty where none was. repeated: names of the cameras
+            whose image that is.
         times: why the times of the points are not used, in words; empty where they are.
     """
 
@@ -208,4 +209,5 @@ class OdometryResult:
     comparison: Comparison | None = None
     imu: str | None = None
     camera: str = ""
+    repeated: frozenset[str] = frozenset()
     times: str = ""

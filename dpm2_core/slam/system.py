@@ -121,9 +121,9 @@ class Slam:
             return result
         self._underway = frame.stamp
         width = max(self._thumbnail_width, PLACE_WIDTH if self._asks_pictures(result) else 0)
-        if not frame.images or not width or result.camera:
+        image = next((image for image in frame.images if image.camera.name not in result.repeated), None)
+        if image is None or not width:
             return result
-        image = frame.images[0]
         picture = thumbnail(placed(image, image.time_offset, result.twist), width)
         return replace(result, keyframe=replace(result.keyframe, thumbnail=picture))
 

@@ -103,7 +103,6 @@ class Odometry:
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
             self._forget_first(dt)
-        images = len(frame.images)
         frame, twist = self._look(frame, motion.seconds + dt)
         scan = self._registration.prepare(frame, twist)
         clock.append(perf_counter())
@@ -130,6 +129,7 @@ class Odometry:
         T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
         T = T @ T_scan_lidar
         keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
+        of_given, of_used = (frozenset(image.camera.name for image in f.images) for f in (given, frame))
         clock.append(perf_counter())
         return OdometryResult(
             stamp=given.stamp,
@@ -145,7 +145,8 @@ class Odometry:
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
             times=self._sweep.problem,
-            camera=IMAGE_PROBLEM if len(frame.images) < images else "",
+            camera=IMAGE_PROBLEM if of_given - of_used else "",
+            repeated=of_given - of_used,
         )
 
     def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:

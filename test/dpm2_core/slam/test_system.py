@@ -12,6 +12,7 @@ from types import FrameType
 import numpy as np
 import pytest
 
+from dpm2_core.data.thumbnail import image_of
 from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.pipeline import OfflineRun
@@ -165,6 +166,31 @@ def test_in_a_corridor_keyframes_keep_a_picture_by_which_the_robot_finds_itself(
     assert located[0][0, 3] == pytest.approx(11.7, abs=0.1)
     assert located[-1] is not None
     assert located[-1][0, 3] == pytest.approx(11.7 + 0.8 * 7, abs=0.1)
+
+
+@pytest.mark.parametrize("hangs", ["front", "rear"])
+def test_a_camera_that_hangs_costs_the_picture_of_no_other_one(hangs: str, tmp_path: Path) -> None:
+    """Each keyframe along a corridor has a picture, by the first camera that shows something new."""
+    paint = corridor.random_paint(3)
+    still = corridor.frame(0.0, paint).images[0]
+
+    def frame_with_both(n: int) -> Frame:
+        seen = corridor.frame(1.0 * n, paint, n)
+        images = [
+            replace(still if name == hangs else seen.images[0], camera=replace(still.camera, name=name))
+            for name in ("front", "rear")
+        ]
+        return replace(seen, images=tuple(images))
+
+    with open_session(tmp_path / "a.dpm2map", GEOMETRIC, "", resume=False) as store:
+        slam = make_slam(GEOMETRIC, store=store)
+        results = [slam.process(frame_with_both(n)).odometry for n in range(8)]
+        slam.finish()
+        pictures = [image_of(store.payload(node, "thumbnail") or b"") for node in range(len(slam.mapper.keyframes))]
+    assert all(result.camera for result in results[1:])
+    assert len(pictures) >= 2
+    works = "rear" if hangs == "front" else "front"
+    assert [picture and picture.camera.name for picture in pictures[1:]] == [works] * (len(pictures) - 1)
 
 
 def test_in_a_street_keyframes_keep_no_picture(
