@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dpm2_core.config import Settings
+from dpm2_core.descriptors import is_level, levelling
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
+from dpm2_core.geometry.tilt import up_of
 from dpm2_core.network.pretrained import DYNAMIC, PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -77,6 +79,14 @@ def without_traffic(net: Dslr, points: Points) -> NDArray[np.bool_]:
     return np.asarray(net.still(torch.from_numpy(points)).numpy())
 
 
+def in_level_axes(point_filter: PointFilter, points: Points) -> NDArray[np.bool_]:
+    """What a filter that learned from level sensors leaves of one that may be tilted: in the axes of the ground."""
+    up = up_of(points)
+    if up is None or is_level(up):
+        return point_filter(points)
+    return point_filter(np.column_stack([points[:, :3] @ levelling(up).T, points[:, 3]]))
+
+
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """What the settings name; None for `none`. `threads` are torch's, of which there is one number for a process.
 
@@ -92,6 +102,11 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
         raise UsageError(
             f"slam.filter.weights: {why} ({path}); `dpm2 train {PERCEPTION_WEIGHTS[settings.kind]}` makes some"
         )
+    return partial(in_level_axes, _named(settings, path, threads))
+
+
+def _named(settings: FilterSettings, path: Path, threads: int) -> PointFilter:
+    """The filter with the weights of a file, for scans in level axes."""
     if settings.kind == "movers":
         from dpm2_core.network.perception import dynamic_objects
 
