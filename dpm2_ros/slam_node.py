@@ -16,6 +16,7 @@ import numpy as np
 from nav_msgs.msg import Odometry
 
 from dpm2_core.data.frames import Calibration, FrameBuilder
+from dpm2_core.descriptors import is_level
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, OdometryResult, State
 from dpm2_core.frame import Array, Frame
@@ -293,7 +294,13 @@ class SlamNode(ManagedNode):
 
     def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it."""
-        keyframe = self._slam.mapper.described(keyframe)
+        described = self._slam.mapper.described
+        if not is_level(T_base_lidar[2, :3]):  # a LiDAR that hangs is to see what one that stands does
+            keyframe = keyframe_to_base(keyframe, se3.make(T_base_lidar[:3, :3], np.zeros(3)))
+            T_base_lidar = se3.make(np.eye(3), T_base_lidar[:3, 3])
+            level = described(replace(keyframe, descriptors=None))
+            keyframe = keyframe if level.descriptors is None else level
+        keyframe = described(keyframe)
         if not np.array_equal(T_base_lidar, np.eye(4)):
             keyframe = keyframe_to_base(keyframe, T_base_lidar)
         self._sender.send(keyframe)

@@ -15,12 +15,15 @@ from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
-from dpm2_ros.conversions import transform_to_msg
+from dpm2_core.network.pretrained import load_network
+from dpm2_ros.conversions import cloud_to_msg, transform_to_msg
 from dpm2_ros.tf import TFMessage
 from test.helpers.rig import ACCURATE, Rig, publish_static
 
 from ..helpers.diagnostics import figures, saying
+from .conftest import pose, scan
 
 T_BASE_SENSOR, T_SENSOR_LIDAR = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5]), se3.exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.04])
 
@@ -52,6 +55,23 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
         assert message.child_frame_id == "base_link"
         expected = T_base_lidar @ drive.pose(n) @ se3.inverse(T_base_lidar)
         assert np.linalg.norm(transform_matrix(message.pose.pose)[:3, 3] - expected[:3, 3]) < ACCURATE
+
+
+@pytest.mark.weights
+def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Rig], drive: Any) -> None:
+    """By the network, which learned from LiDARs that stand: a robot is found in the map of another one."""
+    T_base_lidar, network = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5]), load_network("small", 1)
+    r = rig("slam.loops.descriptors:=true")
+    publish_static(r, "base_link", "lidar", T_base_lidar)
+    standing = scan(pose(0))
+    hanging = se3.transform(se3.exp([-np.pi, 0, 0, 0, 0, 0]), standing)
+    r.lidar.publish(cloud_to_msg(hanging.astype(np.float32), drive.stamp(0), "lidar"))
+    r.mapped(1)
+    seen = r.node.slam.mapper.keyframes[0].descriptors
+    assert seen is not None
+    found = network.register(seen, network.describe(Frame(0, standing)))  # T_standing_base: no turn, back by the lever
+    assert found.ok
+    np.testing.assert_allclose(found.T_target_source, se3.make(np.eye(3), -T_base_lidar[:3, 3]), atol=0.1)
 
 
 def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
