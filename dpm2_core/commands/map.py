@@ -294,13 +294,17 @@ def _export_page(data: MapData, out: Path, voxel: float) -> None:
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
+    from dpm2_core.slam.mapping.occupancy import occupancy_grid, tilt_of, write_grid
     from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
     tied = _tied(data, out)
     write_grid(out, occupancy_grid(tied.clouds, tied.poses, OccupancySettings(resolution=resolution)))
+    if (tilt := tilt_of(tied.clouds, tied.poses)) > _STEEP:
+        why = "as of a LiDAR mounted at an angle: an IMU, or slam_node with /tf_static, makes a level one"
+        _note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
 
 
+_STEEP = 10.0  # degrees that the ground of a whole map may be tilted against the place where it begins
 _SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
 """Default of each option that is a spacing, m."""
 _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {

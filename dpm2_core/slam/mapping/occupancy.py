@@ -12,13 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
+from dpm2_core.geometry.scale import is_room
+from dpm2_core.geometry.tilt import up_of
 from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings
 
 _MOST = 400_000_000  # cells
+_LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
+_OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
 
 
 def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySettings) -> Grid:
@@ -33,6 +38,28 @@ def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySe
     whole = OccupancyMap(settings, 2 * _MOST)
     whole.update(clouds, poses)
     return whole.grid()
+
+
+def tilt_of(clouds: Sequence[Points], poses: Array) -> float:
+    """How far the ground that keyframes show is tilted against the map's x and y, degrees; 0 where they show none.
+
+    Of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf, some are looked at. Upside down is known
+    outdoors only: rooms have ceilings.
+    """
+    some = np.unique(np.linspace(0, len(poses) - 1, _LOOKED_AT).astype(int)).tolist()
+    found = [(node, up) for node in some if (up := _up(clouds[node])) is not None]
+    if len(found) < _SHOW_GROUND * len(some):
+        return 0.0
+    x, y, z = np.median([poses[node, :3, :3] @ up for node, up in found], axis=0)
+    return float(np.degrees(np.arctan2(np.hypot(x, y), z)))
+
+
+def _up(cloud: Points) -> NDArray[np.float32] | None:
+    """Which way (3,) is up in a cloud (M, 4), also where z points down by and large; None where it shows no ground."""
+    up = up_of(cloud)
+    if up is None and is_room(cloud) is False and (turned := up_of(cloud[:, :3] @ _OVER)) is not None:
+        return _OVER @ turned
+    return up
 
 
 def write_grid(path: Path, grid: Grid) -> Path:

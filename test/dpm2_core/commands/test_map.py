@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe, Registration
@@ -28,6 +29,8 @@ from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.merge import merge_maps, optimized
 from dpm2_core.slam.mapping.prune import prune
+from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 
@@ -85,6 +88,22 @@ def test_clouds_agree_in_every_format(tmp_path: Path, map_file: Path) -> None:
 def test_occupancy(tmp_path: Path, map_file: Path) -> None:
     assert dpm2("map", "export", map_file, tmp_path / "grid.yaml", "--resolution", 0.5).returncode == 0
     assert {p.name for p in tmp_path.glob("grid.*")} == {"grid.yaml", "grid.pgm"}
+
+
+def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Path, recording: Path) -> None:
+    """As of a LiDAR that is tilted in a drive without an IMU: the road is full of obstacles then."""
+    scene = next(iter(open_source(recording).frames())).points[::4]
+    for name, degrees in (("level", 0), ("tilted", 25)):
+        data, T_tilted_level = ring(6), se3.exp([0, np.radians(degrees), 0, 0, 0, 0])
+        clouds = CloudStore()
+        for _ in range(6):
+            clouds.append(pack_cloud(se3.transform(T_tilted_level, scene)))
+        poses = T_tilted_level @ data.poses @ se3.inverse(T_tilted_level)
+        save_as(replace(data, clouds=clouds, poses=poses), tmp_path / f"{name}.dpm2map")
+        done = dpm2("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
+        assert done.returncode == 0, done.stderr
+        assert ("the ground of the map is tilted by 2" in done.stderr) == (degrees > 0), done.stderr
+        assert (tmp_path / f"{name}.pgm").is_file()
 
 
 def test_an_export_replaces_neither_the_map_nor_another_grid(tmp_path: Path, map_file: Path) -> None:

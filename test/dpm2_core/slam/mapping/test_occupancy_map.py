@@ -5,19 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from dpm2_core.data.open import open_source
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.mapping.occupancy import occupancy_grid
+from dpm2_core.slam.mapping.occupancy import occupancy_grid, tilt_of
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, UNKNOWN, Grid, OccupancyMap, OccupancySettings
 
 SENSOR = 0.6  # m above the floor
@@ -241,3 +243,23 @@ def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
         grids.append(grid.grid().cells)
     assert (grids[0] == OCCUPIED).any()
     np.testing.assert_array_equal(*grids)
+
+
+@pytest.mark.parametrize("degrees", [0, 20, 35, 180])
+def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: float) -> None:
+    """In each keyframe the same, as of a LiDAR that is mounted like that; to what the ground of a scan is known to."""
+    T_tilted_level = se3.exp([np.radians(degrees), 0, 0, 0, 0, 0])
+    scene = next(iter(open_source(recording).frames())).points
+    cloud = se3.transform(T_tilted_level, scene).astype(np.float32)
+    poses = np.array(
+        [T_tilted_level @ se3.exp([0, 0, 0.1 * n, n, 0, 0]) @ se3.inverse(T_tilted_level) for n in range(9)]
+    )
+    assert tilt_of([cloud] * 9, poses) == pytest.approx(degrees, abs=2.0)
+
+
+def test_of_a_level_building_and_of_clouds_without_ground_no_tilt_is_known(drive: tuple[list[Points], Array]) -> None:
+    """Ceilings are no ground, and a wall is none."""
+    clouds, poses = drive
+    assert tilt_of(clouds, poses) < 2.0
+    wall = np.random.default_rng(0).uniform([5, -20, -1, 0], [5.1, 20, 8, 1], (5000, 4)).astype(np.float32)
+    assert tilt_of([wall], np.eye(4)[None]) == 0.0
