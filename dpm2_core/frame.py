@@ -49,6 +49,14 @@ class Camera:
         if not (np.isfinite(self.K).all() and self.K[0, 0] > 0 < self.K[1, 1] and (self.K[2] == (0, 0, 1)).all()):
             raise ValueError(f"{self.name}: K is no matrix of intrinsics, whose last row is 0 0 1: {self.K.tolist()}")
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of its image at another size, pixels; the center of the first pixel is (0, 0) in both."""
+        scale = np.array([width / self.size[0], height / self.size[1]])
+        K = self.K.copy()
+        K[:2] *= scale[:, None]
+        K[:2, 2] += (scale - 1) / 2
+        return replace(self, K=K, size=(width, height))
+
 
 @dataclass(frozen=True, eq=False)
 class Image:

@@ -28,9 +28,7 @@ def thumbnail(image: Image, width: int) -> bytes:
     height = max(1, round(width * image.pixels.shape[0] / image.pixels.shape[1]))
     small = cv2.resize(image.pixels, (width, height), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    scale = np.diag([width / image.camera.size[0], height / image.camera.size[1], 1.0])
-    camera = replace(image.camera, K=scale @ image.camera.K, size=(width, height))
-    return _with_camera(camera, bytes(jpeg)[2:])
+    return _with_camera(image.camera.resized(width, height), bytes(jpeg)[2:])
 
 
 def moved_thumbnail(jpeg: bytes, T_new_old: Array) -> bytes:

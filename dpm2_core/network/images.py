@@ -29,8 +29,5 @@ def small_image(image: Image, settings: ImageSettings) -> Image:
         return image
     if camera.distortion:
         pixels = np.asarray(cv2.undistort(pixels, camera.K, np.array(camera.distortion)), np.uint8)
-    scale, shift = np.diag([size[0] / pixels.shape[1], size[1] / pixels.shape[0], 1.0]), np.eye(3)
-    shift[:2, 2] = 0.5  # the center of the first pixel is (0, 0)
-    K = np.linalg.inv(shift) @ scale @ shift @ camera.K
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return Image(small, replace(camera, K=K, size=size, distortion=()))
+    return Image(small, replace(camera.resized(*size), distortion=()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -33,6 +34,20 @@ def test_a_camera_wants_matrices_of_the_right_shape() -> None:
         Camera(K=np.zeros((3, 4)), T_lidar_cam=np.eye(4), size=(40, 30))
     with pytest.raises(ValueError, match=r"T_lidar_cam \(3, 4\)"):
         Camera(K=np.eye(3), T_lidar_cam=np.zeros((3, 4)), size=(40, 30))
+
+
+def test_a_point_is_seen_where_it_was_in_an_image_of_another_size() -> None:
+    """Pixel centers are at integers: the middle of the image is (size - 1) / 2, not size / 2, in both sizes."""
+    camera = Camera(np.array([[300.0, 0, 330], [0, 310, 110], [0, 0, 1]]), np.eye(4), (640, 240))
+    at = camera.K @ [0.4, -0.2, 1.0]
+    v, u = np.mgrid[:240, :640]
+    spot = np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 8.0**2)).astype(np.float32)
+    for size in ((320, 120), (160, 80), (640, 240)):
+        small = cv2.resize(spot, size, interpolation=cv2.INTER_AREA)
+        v, u = np.mgrid[: size[1], : size[0]]
+        middle = np.array([(u * small).sum(), (v * small).sum()]) / small.sum()
+        expected = (camera.resized(*size).K @ [0.4, -0.2, 1.0])[:2]
+        assert np.abs(middle - expected).max() < 0.01, "pixels; half a pixel of the larger image is 0.25 and more"
 
 
 def test_what_would_be_read_as_something_else_is_refused() -> None:

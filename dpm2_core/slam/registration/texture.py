@@ -116,8 +116,8 @@ def textured(image: Image, width: int) -> Texture:
     scale = min(1.0, width / camera.size[0])
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
     detail = local_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _LOCAL)
-    K = np.diag([size[0] / camera.size[0], size[1] / camera.size[1], 1.0]) @ camera.K
-    return Texture(tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR), K, se3.inverse(camera.T_lidar_cam))
+    blurred = tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR)
+    return Texture(blurred, camera.resized(*size).K, se3.inverse(camera.T_lidar_cam))
 
 
 def reference(points: Points, image: Texture, count: int, axis: Array) -> Reference:

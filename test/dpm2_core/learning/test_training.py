@@ -106,9 +106,9 @@ def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings)
 def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """And so is a file of another kind."""
     train_registration(settings, tmp_path / "out")
+    other = settings.model_copy(update={"network": {"image": {"size": tiny().image.size}}})  # that of the packed images
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        other = {"image": {"size": tiny().image.size}}  # that of the packed images
-        train_registration(settings.model_copy(update={"network": other}), tmp_path / "out", resume=True)
+        train_registration(other, tmp_path / "out", resume=True)
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
         train_registration(settings, tmp_path / "out", resume=True)
