@@ -81,10 +81,10 @@ def bench_neural(options: Options) -> Report:
 
 def _options(options: Options) -> dict[str, Any]:
     """What all parts of a record have in common: those of other options are no rows of the same tables."""
+    named = {"kitti": options.kitti, "unseen": options.unseen}
     return {
-        "sources": [str(path) for path in options.sources],
-        "kitti": None if options.kitti is None else str(options.kitti),
-        "unseen": None if options.unseen is None else str(options.unseen),
+        "sources": [path.name for path in options.sources],
+        **{key: path and path.name for key, path in named.items()},  # a record names no folders of a machine
         "overrides": list(options.overrides),
         "repetitions": options.repetitions,
         "threads": options.threads,
