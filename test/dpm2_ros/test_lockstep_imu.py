@@ -29,7 +29,7 @@ def recorded(bag: Path, folder: Path) -> Path:
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(0)
     source, stamps = open_bag(bag), BagSource(bag).stamps.tolist()
     first, last = stamps[0], stamps[-1]
-    link = dict.fromkeys((topics.IMU_LINK, topics.GNSS_LINK), (topics.LIDAR, np.eye(4)))
+    link = dict.fromkeys((topics.IMU_LINK, topics.GNSS_LINK), (topics.KITTI.lidar, np.eye(4)))
     out: list[tuple[int, str, Any]] = [(first - 1000 * MS, topics.TF_STATIC, bag_messages.transforms(first, link))]
     for topic, time, data in source.messages([topics.TF_STATIC, topics.POINTS]):
         message = types.deserialize_cdr(bytes(data), source.types[topic])
