@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -54,11 +54,14 @@ class PointsSettings(Settings):
     """Take the maximum over neighbors before normalizing: several times faster. False: after, as PointNeXt does."""
     stem: int = Field(16, gt=0)
     """Channels of the point-wise stem."""
-    stages: tuple[StageSettings, ...] = (
-        StageSettings(points=2048, radius=1.5, neighbours=16, channels=32),
-        StageSettings(points=512, radius=4, neighbours=24, channels=96, residual_radii=(8,), residual_neighbours=16),
-        StageSettings(points=256, radius=8, neighbours=24, channels=128, residual_radii=(12,), residual_neighbours=16),
-        StageSettings(points=64, radius=24, neighbours=24, channels=192),
+    stages: tuple[StageSettings, ...] = Field(
+        (
+            StageSettings(points=2048, radius=1.5, neighbours=16, channels=32),
+            StageSettings(points=512, radius=4, neighbours=24, channels=96, residual_radii=(8,)),
+            StageSettings(points=256, radius=8, neighbours=24, channels=128, residual_radii=(12,)),
+            StageSettings(points=64, radius=24, neighbours=24, channels=192),
+        ),
+        min_length=1,
     )
     """From fine to coarse; the points of each are the first ones of the stage before."""
     upsample: int = Field(0, ge=0, le=16)
@@ -174,9 +177,34 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettin
     """Settings by name, with changes such as {"fusion": {"layers": 2}}.
 
     Raises:
-        UsageError: no such preset, or a change that its settings do not allow.
+        UsageError: no such preset, a change that its settings do not allow, or changes that do not fit each other.
     """
     if name not in PRESETS:
         raise UsageError(f"network preset {name}: want one of {', '.join(PRESETS)}")
     path = Path(__file__).with_name("presets") / f"{name}.yaml"
-    return settings_from(NetworkSettings, merged(read_yaml(path), changes or {}), default=f"preset {name}")
+    settings = settings_from(NetworkSettings, merged(read_yaml(path), changes or {}), default=f"preset {name}")
+    if misfits := [*_misfits(settings)]:
+        raise UsageError(f"preset {name} with these changes is no network: {'; '.join(misfits)}")
+    return settings
+
+
+def _misfits(s: NetworkSettings) -> Iterator[str]:
+    """What does not fit each other, in words."""
+    fusion, decoder = s.fusion, s.decoder
+    sizes = [stage.points for stage in s.points.stages]
+    if sorted(sizes, reverse=True) != sizes:
+        yield f"points.stages have {sizes} points, want no more than the stage before"
+    if s.points.upsample >= len(sizes):
+        yield f"points.upsample {s.points.upsample} of {len(sizes)} stages"
+    if decoder.width % decoder.heads:
+        yield f"decoder.width {decoder.width} is no multiple of decoder.heads {decoder.heads}"
+    if fusion.kind == "none":
+        return
+    if s.channels % fusion.heads:
+        yield f"channels {s.channels} is no multiple of fusion.heads {fusion.heads}"
+    if not set(fusion.levels) <= set(range(len(sizes))):
+        yield f"fusion.levels {list(fusion.levels)}: want some of 0 to {len(sizes) - 1}"
+    if fusion.reference in ("salient", "fps") and fusion.points > sizes[0]:
+        yield f"fusion.points {fusion.points}: the first of points.stages has {sizes[0]}"
+    if len(fusion.alpha_image) not in (1, fusion.heads):
+        yield f"fusion.alpha_image has {len(fusion.alpha_image)} values, want 1 or one of each of {fusion.heads} heads"

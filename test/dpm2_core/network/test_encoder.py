@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,6 +71,24 @@ def test_unknown_preset_and_backbone_are_rejected() -> None:
         Encoder(tiny(points={"backbone": "kpconv"}))
     with pytest.raises(UsageError, match=r"image.backbone vgg: want one of none, convnext, timm:NAME"):
         Encoder(tiny(image={"backbone": "vgg"}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"decoder": {"width": 33}}, r"decoder.width 33 is no multiple of decoder.heads 4"),
+        ({"channels": 30}, r"channels 30 is no multiple of fusion.heads 4"),
+        ({"fusion": {"levels": [1, 4]}}, r"fusion.levels \[1, 4\]: want some of 0 to 3"),
+        ({"fusion": {"points": 4096}}, r"fusion.points 4096: the first of points.stages has 2048"),
+        ({"fusion": {"alpha_image": [0.3, 1.0]}}, r"fusion.alpha_image has 2 values"),
+        ({"points": {"upsample": 4}}, r"points.upsample 4 of 4 stages"),
+        ({"points": {"stages": []}}, r"points.stages: .*at least 1 item"),
+    ],
+)
+def test_settings_that_do_not_fit_each_other_are_named(changes: dict[str, Any], message: str) -> None:
+    """They ended in tracebacks, some at the first step of a training."""
+    with pytest.raises(UsageError, match=f"preset small.*{message}"):
+        preset("small", changes)
 
 
 def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
