@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
 from dpm2_core.commands.map_info import MapFile, graph_of, info, unplaced
-from dpm2_core.commands.options import ConfigFile, Overrides
+from dpm2_core.commands.options import ConfigFile, Overrides, note
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.pcd import write_las, write_pcd
@@ -64,7 +64,7 @@ def export(
             raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
         with MapStore.open(path) as store:
             count = write_tiles(_tied(_loaded(store), out), out, tiles)
-        _note(f"{out} written: {count} tiles")
+        note(f"{out} written: {count} tiles")
         return
     kind = format or _ENDINGS.get(out.suffix.lower(), "")
     if kind not in _EXPORTS:
@@ -79,7 +79,7 @@ def export(
         raise UsageError(f"{out}: is the map itself")
     with MapStore.open(path) as store:
         write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
-    _note(f"{out} written")
+    note(f"{out} written")
 
 
 @app.command()
@@ -119,15 +119,10 @@ def merge(
         for (path, other), T in zip(named[1:], given, strict=False):
             if (off := off_by_satellites(first, other, T)) > _OFF:
                 doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
-                _note(f"{path}: {doubt}")
+                note(f"{path}: {doubt}")
             first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
-    _note(f"{out}: {len(first)} keyframes")
-
-
-def _note(text: str) -> None:
-    """To the user, not among the results."""
-    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
+    note(f"{out}: {len(first)} keyframes")
 
 
 def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
@@ -137,7 +132,7 @@ def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
         own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
         if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
             said = f"{count} of its {len(data)} keyframes are in a map before it, too: they will be there twice"
-            _note(f"{path}: {said}")
+            note(f"{path}: {said}")
         known |= own
 
 
@@ -161,11 +156,11 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
         (path, other), (T, loops) = waiting.pop(number), found
         merged = merge_maps(first, other, T, loops)
         first = optimized(merged, PoseGraph(settings.pose_graph))
-        _note(f"{path}: {len(loops)} loops to what came before")
+        note(f"{path}: {len(loops)} loops to what came before")
         checked = zip(merged.edges, first.edges, strict=True)
         if rejected := [f"{now.from_node} and {now.to_node}" for was, now in checked if was.ok and not now.ok]:
             said = "loops that contradict the rest are rejected, those of the new map's keyframes"
-            _note(f"{path}: {said} {', '.join(rejected)}")
+            note(f"{path}: {said} {', '.join(rejected)}")
     return first
 
 
@@ -187,7 +182,7 @@ def prune(
         data = load_map(store)
         less = pruned(data, redundant_nodes(data, distance, angle))
         save_as(less, out)
-    _note(f"{out}: {len(less)} keyframes of {len(data)}")
+    note(f"{out}: {len(less)} keyframes of {len(data)}")
 
 
 @app.command()
@@ -258,7 +253,7 @@ def _say_without(out: Path, drive: tuple[str, int], count: int, total: int, reas
     """Say that keyframes of a drive (robot, session) are not in a file."""
     robot, session = drive
     name = f"session {session} of {robot}" if robot else f"session {session}"
-    _note(f"{out}: without {count} of the {total} keyframes of {name}: {reason}")
+    note(f"{out}: without {count} of the {total} keyframes of {name}: {reason}")
 
 
 def _cloud(data: MapData, out: Path, voxel: float) -> Points:
@@ -301,7 +296,7 @@ def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     write_grid(out, occupancy_grid(tied.clouds, tied.poses, OccupancySettings(resolution=resolution)))
     if (tilt := tilt_of(tied.clouds, tied.poses)) > _STEEP:
         why = "as of a LiDAR mounted at an angle: an IMU, or slam_node with /tf_static, makes a level one"
-        _note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
+        note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
 
 
 _STEEP = 10.0  # degrees that the ground of a whole map may be tilted against the place where it begins

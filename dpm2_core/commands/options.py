@@ -48,6 +48,11 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
             file.write(text)
 
 
+def note(text: str) -> None:
+    """To the user, not among the results; nothing with `--quiet`."""
+    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
+
+
 def parse_names(text: str | None) -> tuple[str, ...]:
     """`a, b` to names; none of None."""
     return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.console import Console
+from dpm2_core.commands.options import note
 
 
 def report(
@@ -31,4 +31,4 @@ def report(
     text = runs_page(", ".join(folder.resolve().name for folder in folders), runs, tables)
     with atomic_write(out) as file:
         file.write(text)
-    Console(stderr=True).print(f"{out}: {len(runs)} runs, {len(text) / 1e6:.1f} MB", soft_wrap=True)
+    note(f"{out}: {len(runs)} runs, {len(text) / 1e6:.1f} MB")

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.localise import parse_hint, run_localized
-from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, progress_bar, show
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, progress_bar, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
@@ -100,7 +100,7 @@ def run(
         if resume and (out / TRAJECTORY).exists():
             first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
             before = set_aside(out, f"before_{first}")
-            typer.echo(f"{before}: the results so far; those of this run begin at frame {first}", err=True)
+            note(f"{before}: the results so far; those of this run begin at frame {first}")
         live = None
         if view or record is not None:
             live = open_things.enter_context(LiveView(drive.source.name, view, record))
@@ -143,8 +143,8 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
     console, source = Console(stderr=True), result.source
     if result.interrupted:
         console.print(f"interrupted after {len(result)} frames; writing what there is", style="yellow")
-    for note in source.notes:
-        console.print(note, style="yellow", soft_wrap=True)
+    for text in source.notes:
+        console.print(text, style="yellow", soft_wrap=True)
     of_imu = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
     for problem, count in (of_imu | result.problems).items():
         console.print(f"{problem} ({count} of {len(result)} frames)", style="yellow", soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.console import Console
+from dpm2_core.commands.options import note
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
@@ -54,7 +54,7 @@ def show(
         looked = image_attention(model, moving, point) if requested else None
         panels.append((f"{title}, {Path(name).stem}" if len(models) > 1 else title, model, looked))
     compared_png(out, panels, moving, target)
-    Console(stderr=True).print(f"{out}: {title}", soft_wrap=True)
+    note(f"{out}: {title}")
 
 
 def _two(text: str) -> tuple[int, int]:

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, parse_names, progress_bar, show
+from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, note, parse_names, progress_bar, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, say_learned, train
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
 
@@ -134,7 +133,7 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
         same = measured.digest() == data["content"]  # as of a copy
         say_learned(f"--val {val[0]} is what the task", places, places if same else sequence_places(src, sequences))
     train_task(new_task(name, settings), scans, out, resume, measured)
-    typer.echo(f"{out / WEIGHTS}: written", err=True)
+    note(f"{out / WEIGHTS}: written")
 
 
 def eval_task(
@@ -157,7 +156,7 @@ def eval_task(
     scans = open_scans(src, needs, parse_names(sequences))
     if picture is not None:
         draw(task, scans, frame, picture)
-        Console(stderr=True).print(f"{picture}: written", soft_wrap=True)
+        note(f"{picture}: written")
     figures = measure(task, scans)
     if slam:
         from dpm2_core.tasks.slam_figures import slam_figures  # imports the whole SLAM

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, Workers, progress_bar
+from dpm2_core.commands.options import PROCESSORS, Workers, note, progress_bar
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.data.source import parse_range
@@ -120,9 +120,9 @@ def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[st
             asked = _packing(frames, preset, overrides)
             packed = write(source, out, network, chosen, lambda: bar.advance(task), asked)
     finally:
-        for note in source.notes:  # such as an image that cannot be read
-            typer.echo(note, err=True)
-    typer.echo(f"{out}: {packed} frames", err=True)
+        for text in source.notes:  # such as an image that cannot be read
+            note(text)
+    note(f"{out}: {packed} frames")
 
 
 @train.command()
@@ -220,4 +220,4 @@ def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Pat
     both = [name for folder, name in measured.items() if folder in learned]
     if both:
         which = "" if len(both) == len(measured) else f": {', '.join(both)}"
-        typer.echo(f"note: {what} learns from{which}", err=True)
+        note(f"note: {what} learns from{which}")

@@ -181,6 +181,9 @@ def test_command_and_mixture(kitti: Path, packed: Path, tmp_path: Path) -> None:
     arguments = ["train", "pack", str(kitti), str(out), "--frames", "1:", "--set", "sequence=03"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
+    assert f"{out}: 3 frames" in done.stderr
+    arguments[3] = str(tmp_path / "quiet")
+    assert CliRunner().invoke(app, [*arguments, "--quiet"]).stderr == ""
     assert PackedDrive(out).about["source"] == "03"
     assert len(PackedDrive(out)) == 3
     settings = DataSettings(packed={str(out.parent): 0.9, str(packed): 0.1}, workers=0)
