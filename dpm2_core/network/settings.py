@@ -204,7 +204,7 @@ def _misfits(s: NetworkSettings) -> Iterator[str]:
         yield f"channels {s.channels} is no multiple of fusion.heads {fusion.heads}"
     if not set(fusion.levels) <= set(range(len(sizes))):
         yield f"fusion.levels {list(fusion.levels)}: want some of 0 to {len(sizes) - 1}"
-    if fusion.reference in ("salient", "fps") and fusion.points > sizes[0]:
+    if fusion.reference == "salient" and fusion.points > sizes[0]:
         yield f"fusion.points {fusion.points}: the first of points.stages has {sizes[0]}"
     if len(fusion.alpha_image) not in (1, fusion.heads):
         yield f"fusion.alpha_image has {len(fusion.alpha_image)} values, want 1 or one of each of {fusion.heads} heads"
