@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from math import isfinite
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -137,6 +138,14 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{path}: no folder can be made there: {error.strerror or error}") from error
+
+
+def numbered(path: Path, suffix: str = "") -> Iterator[Path]:
+    """The path, and without end the same with -2, -3, ... before that suffix; a folder has none, though its name may
+    have a dot."""
+    yield path
+    stem = path.name.removesuffix(suffix)
+    yield from (path.with_name(f"{stem}-{n}{suffix}") for n in count(2))
 
 
 def file_digest(path: Path) -> str:

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 
 from dpm2_core.errors import UsageError
+from dpm2_core.files import numbered
 
 _NAME = "drive"
 _SUFFIX = ".dpm2map"
@@ -46,7 +46,7 @@ class MapFolder:
 
     def free(self, requested: Path) -> Iterator[Path]:
         """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds."""
-        for path in _numbered(self.of_robot(requested), requested.suffix):
+        for path in numbered(self.of_robot(requested), requested.suffix):
             if not path.exists() and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
@@ -58,7 +58,7 @@ class MapFolder:
         """
         assert self.folder is not None
         own = file.stem if file is not None else self._of_robot(_NAME)
-        for folder in _numbered(self.folder / (name.removesuffix(_SUFFIX) or own)):
+        for folder in numbered(self.folder / (name.removesuffix(_SUFFIX) or own)):
             if name and file_beside(folder).exists():
                 continue  # another drive's map
             with suppress(FileExistsError):
@@ -82,11 +82,3 @@ def file_beside(folder: Path) -> Path:
 
 def _age(path: Path) -> float:
     return path.stat().st_mtime
-
-
-def _numbered(path: Path, suffix: str = "") -> Iterator[Path]:
-    """The path, and without end the same with -2, -3, ... before that suffix; a folder has none, though its name may
-    have a dot."""
-    yield path
-    stem = path.name.removesuffix(suffix)
-    yield from (path.with_name(f"{stem}-{n}{suffix}") for n in count(2))

@@ -293,9 +293,12 @@ class SlamNode(ManagedNode):
             self._tf.send(T_own_odom, motion.stamp + ros.ahead, ros.odom_frame)
 
     def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it."""
+        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it.
+
+        One that is mounted at an angle sees it in the axes of the base.
+        """
         described = self._slam.mapper.described
-        if not is_level(T_base_lidar[2, :3]):  # a LiDAR that hangs is to see what one that stands does
+        if not is_level(T_base_lidar[2, :3]):  # descriptors are of LiDARs that stand
             keyframe = keyframe_to_base(keyframe, se3.make(T_base_lidar[:3, :3], np.zeros(3)))
             T_base_lidar = se3.make(np.eye(3), T_base_lidar[:3, 3])
             level = described(replace(keyframe, descriptors=None))

@@ -10,7 +10,6 @@ import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge
 from dpm2_core.evaluation.kitti_metric import known
-from dpm2_core.files import atomic_write, make_folder
+from dpm2_core.files import atomic_write, make_folder, numbered
 from dpm2_core.frame import Array
 
 TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
@@ -123,8 +122,7 @@ def set_aside(folder: Path, name: str) -> Path:
     Raises:
         Dpm2Error: one could not be moved.
     """
-    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
-    into = next(path for path in map(folder.joinpath, names) if not path.exists())
+    into = next(path for path in numbered(folder / name) if not path.exists())
     make_folder(into)
     for result in (TRAJECTORY, *MAPPING):
         try:

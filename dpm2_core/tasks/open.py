@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dpm2_core.errors import UsageError
@@ -58,14 +58,17 @@ def folders_of(path: Path, sequences: Sequence[str]) -> list[Path]:
 
 def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
     """What the sequences and pairs that `open_scans` takes are called, however they were named."""
-    pairs = [pair.name for pair in pairs_of(path, sequences)]
-    return pairs + ["/".join(names_of(folder, path)) for folder in folders_of(path, sequences)]
+    return [name for _, name in _named(path, sequences)]
 
 
 def sequence_places(path: Path, sequences: Sequence[str]) -> dict[Path, str]:
     """Name of each of these by its folder, or the file of its pair, however that was reached."""
-    pairs, folders = pairs_of(path, sequences), folders_of(path, sequences)
-    return {p.path.resolve(): p.name for p in pairs} | {f.resolve(): "/".join(names_of(f, path)) for f in folders}
+    return {place.resolve(): name for place, name in _named(path, sequences)}
+
+
+def _named(path: Path, sequences: Sequence[str]) -> Iterator[tuple[Path, str]]:
+    yield from ((pair.path, pair.name) for pair in pairs_of(path, sequences))
+    yield from ((folder, "/".join(names_of(folder, path))) for folder in folders_of(path, sequences))
 
 
 def names_of(folder: Path, path: Path) -> list[str]:

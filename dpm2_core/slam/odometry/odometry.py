@@ -129,7 +129,8 @@ class Odometry:
         T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
         T = T @ T_scan_lidar
         keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
-        of_given, of_used = (frozenset(image.camera.name for image in f.images) for f in (given, frame))
+        looked_at = {image.camera.name for image in frame.images}
+        repeated = frozenset(image.camera.name for image in given.images) - looked_at
         clock.append(perf_counter())
         return OdometryResult(
             stamp=given.stamp,
@@ -145,8 +146,8 @@ class Odometry:
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
             times=self._sweep.problem,
-            camera=IMAGE_PROBLEM if of_given - of_used else "",
-            repeated=of_given - of_used,
+            camera=IMAGE_PROBLEM if repeated else "",
+            repeated=repeated,
         )
 
     def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:
