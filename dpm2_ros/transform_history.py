@@ -66,9 +66,9 @@ class _Track:
         if end - begin > GAP:
             raise UsageError(f"{link} has a gap of {(end - begin) * 1e-9:.2f} s")
         (pose, before), (later, then) = self.samples[after - 1 : after + 1]
-        T, part = _matrix(pose, child), (stamp - begin) / (end - begin)
-        step = se3.log(se3.inverse(T) @ _matrix(later, child))
-        return T @ se3.exp(part * step), before if part < 0.5 else then
+        part = (stamp - begin) / (end - begin)
+        T = se3.interpolated(_matrix(pose, child), _matrix(later, child), part)
+        return T, before if part < 0.5 else then
 
 
 class TransformHistory:

@@ -216,9 +216,8 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
     known = stamps[left] == at
     out[known] = poses[left[known]]
     between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _GAP)
-    T0, T1 = poses[left[between]], poses[right[between]]
-    fraction = ((at - stamps[left])[between] / gap[between])[:, None]
-    out[between] = T0 @ se3.exp(fraction * se3.log(se3.inverse(T0) @ T1))
+    part = (at - stamps[left])[between] / gap[between]
+    out[between] = se3.interpolated(poses[left[between]], poses[right[between]], part)
     return out
 
 

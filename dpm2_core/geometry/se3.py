@@ -63,6 +63,11 @@ def log(T: Array) -> Array:
     return xi
 
 
+def interpolated(T0: Array, T1: Array, part: ArrayLike) -> Array:
+    """(..., 4, 4) poses at a part of the way from T0 to T1 (..., 4, 4), 0 to 1, which is a screw."""
+    return T0 @ exp(np.asarray(part)[..., None] * log(inverse(T0) @ T1))
+
+
 def rotation(w: Array) -> Array:
     """Rotation vectors (..., 3), rad, to (..., 3, 3)."""
     return exp(np.concatenate([w, np.zeros_like(w)], -1))[..., :3, :3]

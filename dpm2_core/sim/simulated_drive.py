@@ -139,8 +139,7 @@ class TurningRobot(_Simulated):
     def pose(self, times: Array) -> Array:
         """T_world_lidar (M, 4, 4) at times (M,) s."""
         k = np.floor(times / _STEP).astype(int)
-        part = (times / _STEP - k)[:, None]
-        return np.asarray(self._T[k] @ se3.exp(part * se3.log(se3.inverse(self._T[k]) @ self._T[k + 1])))
+        return se3.interpolated(self._T[k], self._T[k + 1], times / _STEP - k)
 
     def frame(self, i: int) -> Frame:
         """As `_Simulated`; its samples are those since the sweep before."""

@@ -70,9 +70,8 @@ def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array)
     before = np.clip(np.searchsorted(keyframes, position, side="right") - 1, 0, len(keyframes) - 1)
     after = np.minimum(before + 1, len(keyframes) - 1)
     span = np.maximum(keyframes[after] - keyframes[before], 1)
-    ratio = np.clip((position - keyframes[before]) / span, 0, 1)[:, None]
-    between = se3.log(se3.inverse(corrections[before]) @ corrections[after])
-    return corrections[before] @ se3.exp(ratio * between) @ T_odom_lidar
+    ratio = np.clip((position - keyframes[before]) / span, 0, 1)
+    return se3.interpolated(corrections[before], corrections[after], ratio) @ T_odom_lidar
 
 
 def save_map(mapper: Mapper, directory: Path) -> None:

@@ -129,4 +129,4 @@ class KeyframeSelector:
         after = next(i for i, (stamp, _) in enumerate(trace) if stamp >= fix.stamp)
         (t0, T0), (t1, T1) = trace[max(after - 1, 0)], trace[after]
         part = (fix.stamp - t0) / (t1 - t0) if t1 > t0 else 0.0
-        self._fix = fix, T0 @ se3.exp(part * se3.log(se3.inverse(T0) @ T1))
+        self._fix = fix, se3.interpolated(T0, T1, part)

@@ -43,6 +43,14 @@ def test_log_inverts_exp(xi: np.ndarray) -> None:
     np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
 
 
+@given(tangents(), tangents(), st.floats(0, 1))
+def test_the_way_between_two_poses_is_gone_evenly(start: np.ndarray, step: np.ndarray, part: float) -> None:
+    T0, T1 = se3.exp(start), se3.exp(start) @ se3.exp(step)
+    np.testing.assert_allclose(se3.interpolated(T0, T1, part), T0 @ se3.exp(part * step), atol=1e-8)
+    several = se3.interpolated(np.stack([T0, T0]), np.stack([T1, T0]), [1.0, part])
+    np.testing.assert_allclose(several, [T1, T0], atol=1e-8)
+
+
 @given(arrays(np.float64, 3, elements=st.floats(-1, 1)), st.floats(0, 1e-7), st.floats(-50, 50))
 def test_half_a_turn_is_no_special_case(axis: np.ndarray, less: float, t: float) -> None:
     """Where the vector may be either of two, it leads to the same pose; 1e-6 m of 50 m: rounding of half turns."""
