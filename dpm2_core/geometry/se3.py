@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.frame import Array
 from dpm2_core.frame import is_rigid as is_rigid
@@ -170,12 +169,6 @@ def from_rows(rows: ArrayLike) -> Array:
     rows = np.asarray(rows, np.float64)
     matrices = rows.reshape(*rows.shape[:-1], 3, 4)
     return orthonormalized(make(matrices[..., :3], matrices[..., 3]))
-
-
-def quaternion(T: Array) -> Array:
-    """Rotation of (4, 4) as the unit quaternion x, y, z, w with w >= 0."""
-    q = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return q if q[3] >= 0 else -q
 
 
 def is_covariance(covariance: Array, largest: float = 1e15) -> bool:

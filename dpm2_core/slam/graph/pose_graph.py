@@ -185,7 +185,7 @@ class PoseGraph:
             if not self.busy:
                 self._submit()
             return
-        self._apply(robust.optimize(self._sending(), self._settings), self._sent)
+        self._apply(robust.optimize(self._sending(), self._settings))
         self.problem = ""
 
     def collect(self, wait: bool = False) -> bool:
@@ -215,7 +215,7 @@ class PoseGraph:
             if self._moved:
                 self._submit()
                 continue
-            self._apply(solution, self._sent)
+            self._apply(solution)
             self.problem, self._failures, changed = "", 0, True
             if len(self._loops) > self._sent or (wait and self.unsolved):
                 self._submit()
@@ -225,22 +225,18 @@ class PoseGraph:
         """End the other process, if there is one."""
         self._worker.close()
 
-    def covariance(self, node: int) -> Array:
-        """(6, 6) [rotation rad, translation m] of xi in T_map_kf @ Exp(xi), relative to the node that is held fixed."""
-        return self._joint([node])
-
     def georeference_covariance(self) -> Array | None:
         """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None where too few fixes tell."""
         if not self._chosen():
             return None
         data = self._data()
         try:
-            return robust.joint_covariance(data, data.poses, self._kept(), np.array([len(self)]))
+            return robust.joint_covariance(data, self._kept(), np.array([len(self)]))
         except RuntimeError:  # gtsam's: the system is singular, as with one fix, which says nothing of the heading
             return None
 
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> Array:
-        """(P, 6, 6) of xi in T_a_b @ Exp(xi) of each pair; small between neighbors, however far from the start.
+        """(P, 6, 6) [rad, m] of xi in T_a_b @ Exp(xi) of each pair; small between neighbors, wherever these are.
 
         The graph is factorized once for many.
 
@@ -249,11 +245,11 @@ class PoseGraph:
         """
         if same := [a for a, b in pairs if a == b]:
             raise ValueError(f"covariance of node {same[0]} relative to itself")
-        out = np.zeros((len(pairs), 6, 6))
+        out, data, places = np.zeros((len(pairs), 6, 6)), self._data(), self._trajectories.places()
         for first in range(0, len(pairs), _TOGETHER):
             part = pairs[first : first + _TOGETHER]
             nodes = sorted({node for pair in part for node in pair})
-            joint = self._joint(nodes)
+            joint = robust.joint_covariance(data, self._kept(), places[nodes])
             for number, (a, b) in enumerate(part, first):
                 rows = [6 * nodes.index(node) + k for node in (a, b) for k in range(6)]
                 J = np.hstack([-se3.adjoint(se3.inverse(self._poses[b]) @ self._poses[a]), np.eye(6)])
@@ -268,10 +264,6 @@ class PoseGraph:
         data = self._data()
         ids = np.append(self._trajectories.order(), np.arange(len(self), len(data)))
         write_g2o(path, G2o(data, ids, planar=False), self._kept())
-
-    def _joint(self, nodes: list[int]) -> Array:
-        data = self._data()
-        return robust.joint_covariance(data, data.poses, self._kept(), self._trajectories.places()[nodes])
 
     def _kept(self) -> NDArray[np.bool_]:
         """(E,) which loops, and then which fixes, constrain the poses."""
@@ -320,8 +312,8 @@ class PoseGraph:
         self._moved = False
         self._worker.submit(self._sending(), self._settings)
 
-    def _apply(self, solution: Solution, loops: int) -> None:
-        fixes = self._sent_fixes
+    def _apply(self, solution: Solution) -> None:
+        loops, fixes = self._sent, self._sent_fixes
         count = len(solution.poses) - bool(fixes)
         self._poses[:count] = list(solution.poses[self._trajectories.places(count)])
         if fixes:

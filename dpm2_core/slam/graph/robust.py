@@ -39,6 +39,7 @@ _FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, a
 _SHARED = 0.6
 """Loops per place: at 0.5 no two share one, and wrong ones may have their way where all are solved at once."""
 _WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
+_STEPS = 50  # of the plain least squares, at most
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
@@ -132,26 +133,23 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
 
 
 @_solvable()
-def least_squares(graph: GraphData, kept: NDArray[np.bool_], iterations: int = 50) -> Array:
+def least_squares(graph: GraphData, kept: NDArray[np.bool_]) -> Array:
     """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown.
 
     Raises:
         Dpm2Error: the system is singular.
     """
     condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
-    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), [graph.poses], iterations)
+    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), [graph.poses], _STEPS)
 
 
-def joint_covariance(graph: GraphData, poses: Array, kept: NDArray[np.bool_], nodes: Index) -> Array:
-    """(6 n, 6 n) covariance of distinct nodes' poses, [rotation, translation] of T_map_node @ Exp(xi) each in turn.
-
-    Args:
-        poses: (N, 4, 4) optimized. kept: (E,) loops to count.
-    """
+def joint_covariance(graph: GraphData, kept: NDArray[np.bool_], nodes: Index) -> Array:
+    """(6 n, 6 n) covariance of distinct nodes' poses, which are optimized, [rotation, translation] of
+    T_map_node @ Exp(xi) each in turn; `kept`: (E,) loops to count."""
     ends = graph.ends[kept].ravel()
     condensed = CondensedOdometry(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
     ends = np.searchsorted(condensed.nodes, graph.ends)  # of loops not kept too, which are then not read
-    at = poses[condensed.nodes]
+    at = graph.poses[condensed.nodes]
     marginals = gtsam.Marginals(_factors(graph, condensed, ends, at, kept, None), _values(at))
     keys = np.searchsorted(condensed.nodes, nodes)
     if len(keys) == 1:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import cloud_fields, point_columns
@@ -61,7 +62,7 @@ def drive(bags: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ar
 def placed(bags: Any, name: str, camera: Camera) -> Any:
     message = bags.transform("velo_link", name, tuple(camera.T_lidar_cam[:3, 3].tolist()))
     rotation = message.transforms[0].transform.rotation
-    rotation.x, rotation.y, rotation.z, rotation.w = se3.quaternion(camera.T_lidar_cam).tolist()
+    rotation.x, rotation.y, rotation.z, rotation.w = Rotation.from_matrix(camera.T_lidar_cam[:3, :3]).as_quat().tolist()
     return message
 
 
