@@ -86,7 +86,7 @@ class SlamNode(ManagedNode):
         self._lidar_frame = ""  # of the last cloud
         warm_up(self._config.slam)
         self._known: Calibration | None = None
-        self._left: tuple[int, float, float] | None = None  # of the synchronizer before a deactivation
+        self._left: Bundle | None = None  # of the synchronizer before a deactivation
         self._begin()
         back.callback(self._give_up)
         self._index = 0
@@ -103,8 +103,7 @@ class SlamNode(ManagedNode):
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros, self._known)
         self._known = self._inputs.calibration
-        if self._left is not None:
-            self._inputs.synchronizer.follow(*self._left)
+        self._inputs.synchronizer.follow(self._left)
         self._frames = FrameBuilder(
             reading, self._known, self.get_logger().error, imu=self._inputs.imu, gnss=self._inputs.gnss
         )

@@ -101,6 +101,7 @@ class Synchronizer:
 
     Attributes:
         sensors: those, by topic.
+        left: the last cloud that went; None before one has.
     """
 
     def __init__(self, beside: Iterable[str], depth: int, timeout: float, tolerance: float) -> None:
@@ -112,11 +113,10 @@ class Synchronizer:
         self._queue: deque[Bundle] = deque()
         self._depth = self._room = depth  # what may wait in general, and now
         self._moves = False  # whether a cloud has gone since the last was dropped: too slow, but not held up
-        self._newest: int | None = None  # stamp of the last cloud accepted
-        self._arrival = self._clock = 0.0  # of that cloud
-        self._period = JUMP  # ns, from the last but one to that cloud
+        self._newest: Bundle | None = None  # the last one accepted
+        self._period = JUMP  # ns, from the last but one to that
         self._jumped: Bundle | None = None
-        self._left: tuple[float, float, float] = -float("inf"), 0.0, 0.0  # see `left`
+        self.left: Bundle | None = None
 
     def __len__(self) -> int:
         """Clouds that are waiting."""
@@ -127,21 +127,15 @@ class Synchronizer:
         """Clouds that have come in."""
         return sum(self.counts.values()) + (self._jumped is not None)
 
-    @property
-    def left(self) -> tuple[int, float, float] | None:
-        """Stamp (ns), arrival and `Bundle.clock` (s) of the last cloud that went; None before one has."""
-        stamp, arrival, clock = self._left
-        return None if stamp == -float("inf") else (int(stamp), arrival, clock)
-
-    def follow(self, stamp: int, arrival: float, clock: float) -> None:
+    def follow(self, left: Bundle | None) -> None:
         """Go on where another one has ended: what is its `left`."""
-        self._left = self._newest, self._arrival, self._clock = stamp, arrival, clock
+        self.left = self._newest = left
 
     def add_cloud(self, stamp: int, cloud: Any, now: float, clock: float = 0.0) -> StampCheck:
         """Take a cloud with its stamp (ns); `now` is when it arrived, `clock` as of `Bundle`."""
         self.last_arrival = now
         if self._jumped is not None and self._newest is not None:
-            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest))
+            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp))
         check, bundle = self._check(stamp, now, clock), Bundle(stamp, cloud, now, clock, restarted=False)
         if check is StampCheck.JUMPED:
             self._jumped = bundle
@@ -157,13 +151,13 @@ class Synchronizer:
 
     def add(self, topic: str, stamp: int, message: Any, now: float) -> None:
         """Take a message of another sensor with its stamp (ns)."""
-        sensor, (left, arrival, _) = self.sensors[topic], self._left
+        sensor, left = self.sensors[topic], self.left
         tolerance = sensor.messages.tolerance
         sensor.received += 1
         sensor.last_arrival = now
-        late = -JUMP < stamp - left <= (tolerance if sensor.missed else -tolerance)
+        late = left is not None and -JUMP < stamp - left.stamp <= (tolerance if sensor.missed else -tolerance)
         sensor.late += late
-        if not late or now <= arrival + self._timeout:
+        if left is None or not late or now <= left.arrival + self._timeout:
             sensor.missed = 0  # a late one would have come in time, had that cloud waited
         sensor.messages.add(stamp, message, [bundle.stamp for bundle in self._queue])
 
@@ -175,7 +169,7 @@ class Synchronizer:
         if ready is None:  # who asks is not behind
             self._room = self._depth
         else:
-            self._left, self._moves = (ready.stamp, ready.arrival, ready.clock), True
+            self.left, self._moves = ready, True
         return ready
 
     def _ready(self, now: float) -> Bundle | None:
@@ -204,7 +198,7 @@ class Synchronizer:
     def _check(self, stamp: int, now: float, clock: float) -> StampCheck:
         if self._newest is None:
             return StampCheck.ACCEPTED
-        step = stamp - self._newest
+        step = stamp - self._newest.stamp
         if step < -JUMP or self._ahead(stamp, now, clock) > min(AHEAD * self._period, JUMP):
             return StampCheck.JUMPED
         if step > 0:
@@ -216,15 +210,17 @@ class Synchronizer:
 
         A recording that is played faster passes more time than one who listens, and /clock says how much.
         """
-        passed = max(arrival - self._arrival, clock - self._clock if self._clock else 0.0)
-        return stamp - self._newest - passed * 1e9 if self._newest is not None else 0.0
+        if (last := self._newest) is None:
+            return 0.0
+        passed = max(arrival - last.arrival, clock - last.clock if last.clock else 0.0)
+        return stamp - last.stamp - passed * 1e9
 
     def _settle(self, true: bool) -> None:
         """Accept or reject the cloud whose stamp jumped."""
         bundle, self._jumped = self._jumped, None
         if bundle is None or self._newest is None:
             return
-        bundle.restarted = true and bundle.stamp < self._newest
+        bundle.restarted = true and bundle.stamp < self._newest.stamp
         bundle.stepped = true and self._ahead(bundle.stamp, bundle.arrival, bundle.clock) > JUMP
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
@@ -233,9 +229,9 @@ class Synchronizer:
             self._accept(bundle)
 
     def _accept(self, bundle: Bundle) -> None:
-        if self._newest is not None and bundle.stamp > self._newest:
-            self._period = bundle.stamp - self._newest
-        self._newest, self._arrival, self._clock = bundle.stamp, bundle.arrival, bundle.clock
+        if self._newest is not None and bundle.stamp > self._newest.stamp:
+            self._period = bundle.stamp - self._newest.stamp
+        self._newest = bundle
         self._queue.append(bundle)
         if len(self._queue) > self._room and self._moves:
             self._room, self._moves = max(self._room - 1, min(FEW, self._depth)), False
