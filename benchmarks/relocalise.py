@@ -20,6 +20,7 @@ from benchmarks.roads import open_road, road_files
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
@@ -64,7 +65,8 @@ def bench_relocalise(options: Options) -> Report:
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
             verifier = Verifier(settings.relocalise.verification, settings.geometric)
             known = KnownMap(data.keyframes, data.clouds, data.poses)
-            relocalizer = Relocalizer(settings.relocalise, settings.visual, verifier, network, known)
+            verifiers = ByScale(verifier, verifier)
+            relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, known)
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):

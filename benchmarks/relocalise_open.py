@@ -15,6 +15,7 @@ from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Frame, Image
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
@@ -91,7 +92,8 @@ def _relocalised(
     clouds = [keyframe.cloud for keyframe in keyframes]
     in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
     verifier = Verifier(settings.relocalise.verification, settings.geometric)
-    relocalizer = Relocalizer(settings.relocalise, settings.visual, verifier, network, in_map)
+    verifiers = ByScale(verifier, verifier)
+    relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, in_map)
     rows = []
     for place in visited:
         visit, started = keyframe(place.frame), perf_counter()

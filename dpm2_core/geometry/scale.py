@@ -6,6 +6,9 @@ And what follows for the network, which learned streets: a room that is enlarged
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
 import numpy as np
 
 from dpm2_core.frame import Points
@@ -29,6 +32,8 @@ ROOM_SCALE = 5.0
 """Of scans in rooms. Measured, 16 beams, pairs up to 1 / 1 to 2 m apart that are registered to 0.3 m and 3 degrees:
 67 to 100 / 20 to 47 % as they are, 100 / 73 to 93 % enlarged, with a fifth of the error; 4 to 8 do alike."""
 
+T = TypeVar("T")
+
 
 def is_room(points: Points) -> bool | None:
     """True for a room, a corridor or a hall, False for a street or a tunnel, None where it may be either.
@@ -51,9 +56,21 @@ def is_room(points: Points) -> bool | None:
     return True if reach <= _HALL or (len(cells) <= _ROOM[0] and reach <= _ROOM[1]) else None
 
 
+@dataclass(frozen=True)
+class ByScale(Generic[T]):
+    """What is used in the open, and where it may be either; and what in rooms."""
+
+    outdoor: T
+    indoor: T
+
+    def suited_to(self, points: Points) -> T:
+        """The one for what a scan (N, 4), or a keyframe's cloud, shows."""
+        return self.indoor if is_room(points) else self.outdoor
+
+
 def scale_of(points: Points) -> float:
     """The factor by which a scan (N, 4), or a keyframe's cloud, is enlarged for the network: 1 in the open."""
-    return ROOM_SCALE if is_room(points) else 1.0
+    return ByScale(1.0, ROOM_SCALE).suited_to(points)
 
 
 def is_enclosed(points: Points) -> bool:

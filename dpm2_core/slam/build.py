@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import make_filter
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -124,7 +125,7 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
         mapper.poses[nodes],
         lambda i: mapper.thumbnail(nodes[i]),
     )
-    relocalizer = Relocalizer(s.relocalise, s.visual, _verifier(s), _network(s), known)
+    relocalizer = Relocalizer(s.relocalise, s.visual, _verifiers(s), _network(s), known)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
 
@@ -134,19 +135,18 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    verifier, network = _verifier(s), _network(s)
+    verifiers, network = _verifiers(s), _network(s)
 
     def around(data: MapData) -> Relocalizer:
         known = KnownMap(data.keyframes, data.clouds, data.poses, data.thumbnail)
-        return Relocalizer(s.relocalise, s.visual, verifier, network, known)
+        return Relocalizer(s.relocalise, s.visual, verifiers, network, known)
 
     relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).describe)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
 
-def _verifier(s: SlamSettings) -> Verifier:
-    i = s.indoors()
-    return Verifier(s.relocalise.verification, s.geometric, Verifier(i.relocalise.verification, i.geometric))
+def _verifiers(s: SlamSettings) -> ByScale[Verifier]:
+    return ByScale(*(Verifier(one.relocalise.verification, one.geometric) for one in (s, s.indoors())))
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:
@@ -156,8 +156,8 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    i = s.indoors()
-    return LoopCloser(s.loops, s.geometric, _network(s) if described else None, (i.loops, i.geometric))
+    ways = ByScale(*((one.loops, Verifier(one.loops.verification, one.geometric)) for one in (s, s.indoors())))
+    return LoopCloser(ways, _network(s) if described else None)
 
 
 def _network(s: SlamSettings) -> DeepPointMap2:

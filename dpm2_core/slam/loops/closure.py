@@ -23,7 +23,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.scale import is_room
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain, margin
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import (
@@ -32,7 +32,6 @@ from dpm2_core.slam.loops.verification import (
     Verifier,
     objection_of_others,
 )
-from dpm2_core.slam.registration.icp import GeometricSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
@@ -73,17 +72,10 @@ class LoopSettings(Settings):
 class LoopCloser:
     """Finds and verifies the loops of each new keyframe. A node is a keyframe's position in the map."""
 
-    def __init__(
-        self,
-        settings: LoopSettings,
-        registration: GeometricSettings,
-        network: DeepPointMap2 | None = None,
-        room: tuple[LoopSettings, GeometricSettings] | None = None,
-    ) -> None:
-        """`room`: for keyframes that show a room; None: as for all."""
-        self._usual = settings, Verifier(settings.verification, registration)
-        self._room = self._usual if room is None else (room[0], Verifier(room[0].verification, room[1]))
-        self._settings, self._verifier = self._usual
+    def __init__(self, ways: ByScale[tuple[LoopSettings, Verifier]], network: DeepPointMap2 | None = None) -> None:
+        """`ways`: to search and verify, by what a keyframe shows."""
+        self._ways = ways
+        self._settings, self._verifier = ways.outdoor
         self._places = PlaceRecognition(network) if network is not None else None
         self._path = OdometryChain()
         self._consistency = Consistency(self._path)
@@ -127,8 +119,7 @@ class LoopCloser:
         if not self._settings.enabled or len(keyframes) < 2:
             return []
         node = len(keyframes) - 1
-        if self._room is not self._usual:
-            self._settings, self._verifier = self._room if is_room(clouds[node]) else self._usual
+        self._settings, self._verifier = self._ways.suited_to(clouds[node])
         self._consistency.update(poses, parts)
         since = self._path.since(node)
         tried, proposals = self._proposals(node, since, keyframes, poses)

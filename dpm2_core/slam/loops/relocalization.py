@@ -23,6 +23,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Image, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import (
@@ -86,7 +87,7 @@ class Relocalizer:
         self,
         settings: RelocalizationSettings,
         visual: VisualSettings,
-        verifier: Verifier,
+        verifiers: ByScale[Verifier],
         network: DeepPointMap2,
         known: KnownMap,
     ) -> None:
@@ -95,7 +96,7 @@ class Relocalizer:
         self._places = PlaceRecognition(network)
         self._places.update(self._keyframes)
         self._pictures = PicturedPlaces(visual, known)
-        self._verifier = verifier
+        self._verifiers = verifiers
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -127,7 +128,7 @@ class Relocalizer:
         if found.ok or texture is None:
             return found
         nodes = self._places.similar(descriptors, allowed, self._settings.pictured)
-        verifier, T_across = self._verifier.suited_to(cloud), self._across(places)
+        verifier, T_across = self._verifiers.suited_to(cloud), self._across(places)
         place = self._pictures.find(cloud, texture, nodes, verifier, T_across)
         if place is None:
             return found
@@ -155,7 +156,7 @@ class Relocalizer:
             return nowhere("outside the map")
         nodes = near[np.argsort(distance[near])[: self._settings.keyframes]].tolist()
         T_at_map = se3.inverse(self._poses[nodes[0]])
-        verifier = self._verifier.suited_to(cloud)
+        verifier = self._verifiers.suited_to(cloud)
         around = verifier.surroundings([self._clouds[n] for n in nodes], T_at_map @ self._poses[nodes])
         open_way = None if along is None else along(nodes)
         result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, along=open_way)

@@ -15,7 +15,6 @@ from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
-from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.probe import probed
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
@@ -91,17 +90,9 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
 class Verifier:
     """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
 
-    def __init__(
-        self, settings: VerificationSettings, registration: GeometricSettings, room: Verifier | None = None
-    ) -> None:
-        """`room`: another one for clouds that show a room; None: this one."""
+    def __init__(self, settings: VerificationSettings, registration: GeometricSettings) -> None:
         self._settings = settings
-        self._room = room
         self._registration = GeometricRegistration(registration)
-
-    def suited_to(self, cloud: Points) -> Verifier:
-        """The one for a cloud (M, 4), by what it shows."""
-        return self._room if self._room is not None and is_room(cloud) else self
 
     def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
         """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""

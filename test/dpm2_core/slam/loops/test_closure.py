@@ -16,6 +16,7 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.decoder import Correlated, Decoder
 from dpm2_core.network.model import DeepPointMap2
@@ -62,8 +63,10 @@ def where(s: float, lateral: float = 0.0, heading: float = 0.0) -> Array:
     return suburb().pose_at(s, lateral, heading)
 
 
-def closer(**settings: object) -> LoopCloser:
-    return LoopCloser(LoopSettings.model_validate(settings), GeometricSettings(), network())
+def closer(with_network: bool = True, **settings: object) -> LoopCloser:
+    loops = LoopSettings.model_validate(settings)
+    way = loops, Verifier(loops.verification, GeometricSettings())
+    return LoopCloser(ByScale(way, way), network() if with_network else None)
 
 
 def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Edge], Array]:
@@ -201,7 +204,7 @@ def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
     truth = np.array([where(*place) for place in at])
     poses = truth.copy()
     poses[-1] = jump @ poses[-1]
-    search = LoopCloser(LoopSettings(gap=30.0), GeometricSettings())
+    search = closer(with_network=False, gap=30.0)
     clouds = [scan(*place) for place in at]
     keyframes = [
         Keyframe(i, i, i, poses[i], clouds[i], Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if i else None)

@@ -13,6 +13,7 @@ from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.pictures import KnownMap
@@ -47,12 +48,16 @@ def in_map(keyframes: list[Keyframe]) -> KnownMap:
     return KnownMap(keyframes, [k.cloud for k in keyframes], poses, lambda node: keyframes[node].thumbnail)
 
 
+def searching(known: KnownMap, visual: VisualSettings) -> Relocalizer:
+    verifier = Verifier(VerificationSettings(), GeometricSettings())
+    network = load_network("small", 1)
+    return Relocalizer(RelocalizationSettings(), visual, ByScale(verifier, verifier), network, known)
+
+
 def relocalizer(paint: Paint, pictured: bool = True, visual: VisualSettings | None = None) -> Relocalizer:
     keyframes = [keyframe(x, paint, n, pictured) for n, x in enumerate(AT)]
     known = in_map(keyframes)
-    verifier = Verifier(VerificationSettings(), GeometricSettings())
-    settings = visual or VisualSettings()
-    return Relocalizer(RelocalizationSettings(), settings, verifier, load_network("small", 1), known)
+    return searching(known, visual or VisualSettings())
 
 
 def picture_of(keyframe: Keyframe) -> Image | None:
@@ -114,8 +119,6 @@ def test_a_damaged_picture_in_a_map_is_no_picture() -> None:
     assert jpeg is not None
     keyframes[4] = replace(keyframes[4], thumbnail=jpeg[:1000])
     known = in_map(keyframes)
-    verifier = Verifier(VerificationSettings(), GeometricSettings())
-    where = Relocalizer(RelocalizationSettings(), VisualSettings(), verifier, load_network("small", 1), known)
-    found = where.find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    found = searching(known, VisualSettings()).find(visit.cloud, None, visit.descriptors, picture_of(visit))
     assert found.ok, found.reason
     assert found.T_target_source[0, 3] == pytest.approx(18.3, abs=0.1)

@@ -13,6 +13,7 @@ import pytest
 from dpm2_core.estimates import Keyframe, Registration, State
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
@@ -57,7 +58,8 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
     ]
     settings = RelocalizationSettings()
     verifier = Verifier(settings.verification, GeometricSettings())
-    return Relocalizer(settings, VisualSettings(), verifier, network, KnownMap(keyframes, clouds, poses))
+    known, verifiers = KnownMap(keyframes, clouds, poses), ByScale(verifier, verifier)
+    return Relocalizer(settings, VisualSettings(), verifiers, network, known)
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:
