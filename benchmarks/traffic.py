@@ -25,7 +25,6 @@ from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry.odometry import Odometry
-from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
@@ -105,7 +104,7 @@ def _run(scans: Scans, truth: NDArray[np.float64], settings: SlamSettings, metho
     return found
 
 
-def _odometry(odometry: Odometry | ScaledOdometry, clouds: list[Points], truth: NDArray[np.float64]) -> dict[str, Any]:
+def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float64]) -> dict[str, Any]:
     """Errors of the odometry alone, without loops, and its time."""
     poses, failed, cpu = np.zeros_like(truth), 0, process_time()
     for i, cloud in enumerate(clouds):

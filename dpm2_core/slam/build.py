@@ -19,8 +19,7 @@ from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap, TiledRelocalizer
-from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
-from dpm2_core.slam.odometry.odometry import Odometry
+from dpm2_core.slam.odometry.odometry import Odometry, Tools
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.registration.fused import FusedScanRegistration
@@ -75,17 +74,15 @@ def make_map(
     return mapper, make_localizer(s, mapper) if store is not None and store.read_only else None
 
 
-def make_odometry(s: SlamSettings, robot: str = "") -> Odometry | ScaledOdometry:
-    """The odometry with its collaborators; with `preset: auto` one for streets and one for rooms."""
-    return (
-        ScaledOdometry(_odometry(s, robot), _odometry(s.indoors(), robot))
-        if s.preset == "auto"
-        else _odometry(s, robot)
-    )
+def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
+    """The odometry with its tools; with `preset: auto` those for streets and those for rooms."""
+    if s.preset == "auto":
+        return ScaledOdometry(ByScale(_tools(s), _tools(s.indoors())), robot)
+    return Odometry(_tools(s), robot)
 
 
-def _odometry(s: SlamSettings, robot: str) -> Odometry:
-    return Odometry(s.odometry, make_registration(s), KeyframeSelector(s.keyframes, robot))
+def _tools(s: SlamSettings) -> Tools:
+    return Tools(s.odometry, make_registration(s), s.keyframes)
 
 
 def make_registration(s: SlamSettings) -> ScanRegistration:

@@ -18,7 +18,6 @@ from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
-from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.registration.texture import VisualSettings
 
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
@@ -70,7 +69,7 @@ class Slam:
 
     def __init__(
         self,
-        odometry: Odometry | ScaledOdometry,
+        odometry: Odometry,
         mapper: Mapper,
         localizer: Localizer | None = None,
         thumbnail_width: int = 0,

@@ -45,28 +45,28 @@ class KeyframeSelector:
     """Makes a keyframe of the first registered scan and then by motion."""
 
     def __init__(self, settings: KeyframeSettings, robot: str = "") -> None:
-        self._settings = settings
         self._robot = robot
+        self.use(settings)
         self.reset()
 
+    def use(self, settings: KeyframeSettings) -> None:
+        """From now on; the keyframes so far stay."""
+        self._settings, self._spacing = settings, Spacing(settings.distance, settings.residual)
+
     def reset(self) -> None:
+        """Forget everything."""
+        self.use(self._settings)
         self._last: Keyframe | None = None
         self._uncertainty = np.zeros((6, 6))
         self._weakest: Registration | None = None  # the least certain one since the last keyframe
         self._requested = False
         self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # of the frames before, without a break
         self._fix: tuple[Fix, Array] | None = None  # the last one, and T_odom_lidar when it was measured
-        self._spacing = Spacing(self._settings.distance, self._settings.residual)
 
     @property
     def next_id(self) -> int:
         """Of the next keyframe."""
         return 0 if self._last is None else self._last.id + 1
-
-    def take_over(self, before: KeyframeSelector) -> None:
-        """Go on after the keyframes of another one."""
-        self._last, self._uncertainty, self._requested = before._last, before._uncertainty, before._requested
-        self._weakest, self._trace, self._fix = before._weakest, before._trace, before._fix
 
     def request(self) -> None:
         """Make a keyframe of the next registered scan at any distance: relocalization needs one even at standstill."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -20,7 +20,7 @@ from dpm2_core.geometry.scale import is_enclosed
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.odometry.bridge import Bridge, Limits
 from dpm2_core.slam.odometry.inertial import InertialMotion
-from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.other import OtherMotion
 from dpm2_core.slam.odometry.scan_matcher import Match, ScanMatcher
@@ -33,17 +33,28 @@ _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: 
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 
 
+@dataclass(frozen=True, eq=False)
+class Tools:
+    """What an odometry works with; the registration remembers nothing: each odometry has one like it."""
+
+    settings: OdometrySettings
+    registration: ScanRegistration
+    keyframes: KeyframeSettings
+
+
 class Odometry:
     """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
 
-    scale = ""
-    """What the settings are for, where that follows the scans: see `ScaledOdometry`."""
-
-    def __init__(self, settings: OdometrySettings, registration: ScanRegistration, keyframes: KeyframeSelector) -> None:
-        self._settings = settings
-        self._registration = registration
-        self._keyframes = keyframes
+    def __init__(self, tools: Tools, robot: str = "") -> None:
+        """`robot`: namespace of its keyframes."""
+        self._keyframes = KeyframeSelector(tools.keyframes, robot)
+        self._use(tools)
         self.reset()
+
+    @property
+    def scale(self) -> str:
+        """What the tools are for, where that follows the scans: see `ScaledOdometry`."""
+        return ""
 
     @property
     def uses_images(self) -> bool:
@@ -71,8 +82,22 @@ class Odometry:
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks = 0
         self._broken = 0  # id of the first keyframe after the last break
-        self._registration = self._registration.fresh()
+        self._registration = self._tools.registration.fresh()
         self._keyframes.reset()
+
+    def _use(self, tools: Tools) -> None:
+        """Work with these from now on; registration and motion follow, by `reset` or `_go_on_with`."""
+        self._tools, self._settings = tools, tools.settings
+        self._keyframes.use(tools.keyframes)
+
+    def _go_on_with(self, tools: Tools, frame: Frame) -> None:
+        """After a frame that was registered: with its pose and motion, and a map of that scan alone."""
+        self._use(tools)
+        self._motion.settings = self._settings
+        self._failures, self._first, self._bridge = 0, None, None
+        self._registration = tools.registration.fresh()
+        scan = self._registration.prepare(self._sweep.centered(frame), self._motion.known_twist)
+        self._registration.update(scan, self._motion.T)
 
     @property
     def next_keyframe(self) -> int:
@@ -83,17 +108,6 @@ class Odometry:
         """A map has shown where the keyframe of that id is: the way across the breaks before it is known."""
         if self._breaks and found >= self._broken:
             self._breaks = 0
-
-    def take_over(self, before: Odometry, frame: Frame) -> None:
-        """Go on where another one has just registered a frame: its pose and motion, and a map of that scan alone."""
-        self.reset()
-        self._motion, self._clock, self._sweep = copy(before._motion), before._clock, before._sweep
-        self._motion.settings = self._settings
-        self._breaks, self._broken = before._breaks, before._broken
-        self._repeated, self._part, self._images = before._repeated, before._part, before._images
-        self._keyframes.take_over(before._keyframes)
-        scan = self._registration.prepare(self._sweep.centered(frame), self._motion.known_twist)
-        self._registration.update(scan, self._motion.T)
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
