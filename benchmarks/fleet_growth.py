@@ -19,13 +19,13 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
 from dpm2_core.fleet.places import FleetIndex
 from dpm2_core.fleet.regions import LARGEST, Join, solve
-from dpm2_core.frame import Array
+from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.retrieval import WIDTH
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map, save_as
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 

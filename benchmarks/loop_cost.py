@@ -14,12 +14,11 @@ from benchmarks.harness import Options, Report, settings_of
 from benchmarks.memory import resident_mb
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe, Registration
-from dpm2_core.frame import Array
+from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_loops
-from dpm2_core.slam.store.map_data import NO_POINTS
 
 SIZES = (100, 1000, 5000, 20000)
 _MEASURED = 15  # keyframes at each size

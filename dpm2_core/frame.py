@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
+NO_POINTS: Points = np.zeros((0, 4), np.float32)
 
 
 def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:

@@ -19,10 +19,10 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import NO_POINTS
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
 from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
-from dpm2_core.slam.store.map_data import NO_POINTS
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_messages import BUDGET, WIRE, descriptors_from_msg, payload_from_msg, received_to_msg

@@ -9,11 +9,11 @@ import numpy as np
 
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.regions import Join
-from dpm2_core.frame import Array
+from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData
+from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.rows import Session
 
 NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import Fix, Georeference
+from dpm2_core.frame import NO_POINTS, Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData
-from dpm2_core.slam.store.rows import NO_POINTS, Session
+from dpm2_core.slam.store.rows import Session
 
 SPACING = 5.0
 """m between keyframes."""

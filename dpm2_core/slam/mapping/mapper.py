@@ -14,7 +14,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import Array, Georeference, Points
+from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -26,7 +26,7 @@ from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.mapping.session_start import SessionStart
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import NO_POINTS, Thumbnail, borrowing, load_map, map_cloud
+from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map, map_cloud
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.writer import MapWriter
 

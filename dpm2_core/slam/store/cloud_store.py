@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import NO_POINTS, Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import CodecError, pack_mask, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.lazy import LazySequence
@@ -145,7 +145,7 @@ class CloudStore(LazySequence[Points]):
         """
         data = self.packed(range(len(self))[index])
         with self._named(index):
-            return np.zeros((0, 4), np.float32) if data is None else unpack_cloud(data)
+            return NO_POINTS if data is None else unpack_cloud(data)
 
     @contextmanager
     def _named(self, index: int) -> Iterator[None]:

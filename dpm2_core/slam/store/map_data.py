@@ -16,13 +16,12 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import part_beside
-from dpm2_core.frame import Array, Georeference, Points
+from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_file import move_map, remove_map
 from dpm2_core.slam.store.map_store import Change, MapStore
-from dpm2_core.slam.store.rows import NO_POINTS as NO_POINTS
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
     Session,

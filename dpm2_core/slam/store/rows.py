@@ -16,12 +16,11 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors, quantized
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import Array, Fix, Georeference, Points
+from dpm2_core.frame import NO_POINTS, Array, Fix, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
 
-NO_POINTS: Points = np.zeros((0, 4), np.float32)
 FARTHEST = 1e7
 """m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
 MAX_ID = 2**31 - 1

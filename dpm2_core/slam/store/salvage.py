@@ -13,12 +13,12 @@ import numpy as np
 
 from dpm2_core.data.thumbnail import image_of
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import Array, Georeference
+from dpm2_core.frame import NO_POINTS, Array, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
 from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData, odometry_by_node, subset
+from dpm2_core.slam.store.map_data import MapData, odometry_by_node, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62

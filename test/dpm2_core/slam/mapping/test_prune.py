@@ -11,7 +11,7 @@ import pytest
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import Array, Fix
+from dpm2_core.frame import NO_POINTS, Array, Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
@@ -20,7 +20,7 @@ from dpm2_core.slam.mapping.parts import first_part, parts_of
 from dpm2_core.slam.mapping.prune import composed, eliminate, inverted, prune, redundant_nodes
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import NO_POINTS, MapData, load_map, save_as, trajectory
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 
