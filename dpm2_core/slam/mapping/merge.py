@@ -16,7 +16,7 @@ from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.parts import frame_of, parts_of
 from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import MapData
+from dpm2_core.slam.store.map_data import MapData, numbered_behind
 
 _GIVEN_COVARIANCE = np.diag([0.05] * 3 + [1.0] * 3) ** 2  # of a transform by hand, rad and m: any loop is surer
 FindLoops = Callable[[MapData, MapData], list[Edge]]
@@ -33,17 +33,17 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         T_a_b: (4, 4). loops: as `FindLoops` gives them.
     """
     n = len(a)
-    sessions = max((s.number for s in a.sessions), default=0)
+    b = numbered_behind(b, n, max((session.number for session in a.sessions), default=0))
     moving = [*(a.clouds.moving(i) for i in range(n)), *(b.clouds.moving(i) for i in range(len(b)))]
     loans = {i: loan for i in range(n) if (loan := a.clouds.loan(i))}
     loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}
     both = MapData(
         [*a.keyframes, *b.keyframes],
-        [*a.session, *(number + sessions for number in b.session)],
+        [*a.session, *b.session],
         np.concatenate([a.poses, T_a_b @ b.poses]),
-        [*a.edges, *(e.shifted(n) for e in b.edges), *(e.between(e.from_node, e.to_node + n) for e in loops)],
-        [*a.trail, *(replace(p, node=p.node + n, session=p.session + sessions) for p in b.trail)],
-        [*a.sessions, *(replace(s, number=s.number + sessions) for s in b.sessions)],
+        [*a.edges, *b.edges, *(e.between(e.from_node, e.to_node + n) for e in loops)],
+        [*a.trail, *b.trail],
+        [*a.sessions, *b.sessions],
         CloudStore(lambda i: a.clouds.packed(i) if i < n else b.clouds.packed(i - n), moving, loans),
         lambda i: a.thumbnail(i) if i < n else b.thumbnail(i - n),
         lambda i: a.describe(i) if i < n else b.describe(i - n),

@@ -204,9 +204,10 @@ def append_map(store: MapStore, data: MapData) -> None:
     Raises:
         Dpm2Error: it could not be written.
     """
-    first, before = store.size, max((row[0] for row in store.rows("sessions", "session")), default=0)
-    store.add_sessions(replace(session, number=session.number + before) for session in data.sessions)
-    sessions = {first + node: number + before for node, number in enumerate(data.session)}
+    first = store.size
+    data = numbered_behind(data, first, max((row[0] for row in store.rows("sessions", "session")), default=0))
+    store.add_sessions(data.sessions)
+    sessions = {first + node: number for node, number in enumerate(data.session)}
     for node, keyframe in enumerate(data.keyframes):
         loan, mask = data.clouds.loan(node), data.clouds.moving(node)
         packed = data.clouds.packed(node) if loan is None else replace(loan, lender=loan.lender + first)
@@ -218,9 +219,18 @@ def append_map(store: MapStore, data: MapData) -> None:
             moving={} if mask is None else {first + node: mask},
         )
         store.write(change, sessions)
-    edges = [edge.shifted(first) for edge in data.edges]
-    trail = [replace(p, node=p.node + first, session=p.session + before) for p in data.trail]
-    store.write(Change(edges=edges, trail=trail, georeference=None if first else data.georeference))
+    store.write(Change(edges=data.edges, trail=data.trail, georeference=None if first else data.georeference))
+
+
+def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:
+    """A map whose edges, trail and sessions count on after so many nodes, and the last session of another map."""
+    return replace(
+        data,
+        session=[number + sessions for number in data.session],
+        edges=[edge.shifted(nodes) for edge in data.edges],
+        trail=[replace(p, node=p.node + nodes, session=p.session + sessions) for p in data.trail],
+        sessions=[replace(session, number=session.number + sessions) for session in data.sessions],
+    )
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: Iterable[RemovedKeyframe]) -> MapData:
