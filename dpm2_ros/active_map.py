@@ -206,7 +206,7 @@ class ActiveMap:
         if problem := self.mapper.store_problem:
             raise Dpm2Error(f"map saved in {folder.resolve()}, but its file is incomplete: {problem}")
         path = self._path
-        if name and self._store is not None:
+        if name and isinstance(self._store, MapStore):
             path = file_beside(folder)
             self._store.copy_to(path)
         file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""

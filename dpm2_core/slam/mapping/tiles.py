@@ -123,14 +123,6 @@ class TiledMap:
         """Close all files."""
         self._keep(())
 
-    def copy_to(self, path: Path) -> None:
-        """There is no one file.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(f"{path}: {self.path} is a folder of tiles, which stays as it is: copy that")
-
     @property
     def open(self) -> set[Tile]:
         """The squares whose keyframes are in memory."""
