@@ -215,9 +215,7 @@ class Mapper:
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
         """Bring the map file, if there is one, up to date with a new keyframe."""
         if self._writer is not None:
-            self._writer.add(node, self.keyframes[node], thumbnail)
-            for edge in edges:
-                self._writer.add_edge(edge)
+            self._writer.add(node, self.keyframes[node], thumbnail, edges)
             self._writer.sync(self.poses, self.georeference)
 
     def finish(self) -> None:

@@ -37,13 +37,10 @@ class MapWriter:
         self._moving: set[int] = set()
         self._judged: list[Edge] = []
 
-    def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> None:
-        """A keyframe; its cloud is in the cloud store."""
+    def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
+        """A keyframe, whose cloud is in the cloud store, and the edges that came with it."""
         self._keyframes.append((node, keyframe, thumbnail))
-
-    def add_edge(self, edge: Edge) -> None:
-        """An edge, after its keyframes."""
-        self._edges.append(edge)
+        self._edges += edges
 
     def judge(self, loops: Sequence[Edge]) -> None:
         """Loops as they are now: with the next `sync` those of the file whose verdict is another one are rewritten."""
