@@ -294,7 +294,7 @@ class ActiveMap:
         self.located = located
         if located.state is before:
             return
-        if located.jumped:
+        if located.state is State.RELOCALIZED:
             x, y, z = located.T_map_kf[:3, 3].tolist()
             kind = "kidnapped; found again" if before.located else "found"
             self._log.info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m of {self._config.ros.map_frame}")

@@ -71,8 +71,9 @@ class LocalizationReport:
             self._reason = located.registration.reason
         if located is None or located.state is before or located.state is State.TRACKING:
             return ""
-        kind = "kidnapped" if located.jumped and before.located else "found" if located.jumped else str(located.state)
-        if located.jumped and self._first is None:
+        jumped = located.state is State.RELOCALIZED
+        kind = "kidnapped" if jumped and before.located else "found" if jumped else str(located.state)
+        if jumped and self._first is None:
             self._first = number
         event: dict[str, Any] = {
             "frame": tracked.index,
@@ -80,7 +81,7 @@ class LocalizationReport:
             "event": kind,
             "reason": located.registration.reason,
         }
-        if located.jumped:
+        if jumped:
             event["position_m"] = located.T_map_kf[:3, 3].round(3).tolist()
         self._events.append(event)
         return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"

@@ -27,15 +27,14 @@ class LocalizationResult:
     Attributes:
         T_map_kf: (4, 4); where the odometry puts it unless `registration.ok`.
         covariance: (6, 6) of it, as in `Registration`; huge while lost.
+        state: RELOCALISED: it was somewhere else than thought, after being lost, or kidnapped.
         registration: how it was found, or why not.
-        jumped: it was somewhere else than thought: after being lost, or kidnapped.
     """
 
     T_map_kf: Array
     covariance: Array
     state: State
     registration: Registration
-    jumped: bool = False
 
 
 class Localizer:
@@ -117,7 +116,7 @@ class Localizer:
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         result = self._relocalizer.verify(keyframe.cloud, T_predicted, picture)
         if result.ok:
-            return self._located(keyframe, result, jumped=False)
+            return self._located(keyframe, result, State.TRACKING)
         self._failures += 1
         return self._find(keyframe, picture, result)
 
@@ -132,7 +131,7 @@ class Localizer:
             near = meters <= self._allowed
             repeated = self._far is not None and self._apart(self._far @ keyframe.T_odom_kf, result) <= self._allowed
             if not tracking or near or (repeated and self._failures >= self._max_failures):
-                return self._located(keyframe, result, jumped=not (tracking and near))
+                return self._located(keyframe, result, State.TRACKING if tracking and near else State.RELOCALIZED)
             self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf)
             result = replace(result, ok=False, reason=f"found {meters:.1f} m away, not confirmed yet")
         elif tracking:
@@ -155,8 +154,8 @@ class Localizer:
         if self._state.located:
             self._state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
 
-    def _located(self, keyframe: Keyframe, result: Registration, jumped: bool) -> LocalizationResult:
+    def _located(self, keyframe: Keyframe, result: Registration, state: State) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
-        self._state = State.RELOCALIZED if jumped else State.TRACKING
+        self._state = state
         self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.id
-        return LocalizationResult(result.T_target_source, result.covariance, self._state, result, jumped)
+        return LocalizationResult(result.T_target_source, result.covariance, state, result)
