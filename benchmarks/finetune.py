@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Group
 
 from benchmarks.harness import Options, Report, earlier, requested, torch_threads, write_report
-from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.pair_set import NEAR, SUCCESS, PairSet
@@ -112,7 +112,7 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 def _run(settings: FinetuneSettings, data: Path, out: Path, validations: dict[str, PairSet]) -> dict[str, Any]:
     """One training, what it cost, and the errors that are left; one that was stopped goes on with the same settings."""
-    resume = begin_training(out, dump_settings(settings), [weights_path(settings.weights)])
+    resume = begin_training(out, settings, [weights_path(settings.weights)])
     cpu = process_time()
     weights = finetune(settings, out, resume=resume, data=data)
     seconds = process_time() - cpu

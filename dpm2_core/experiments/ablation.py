@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import Field
 
-from dpm2_core.config import Settings, dump_settings, merged
+from dpm2_core.config import Settings, merged
 from dpm2_core.data.packed import open_packed, packed_digest
 from dpm2_core.evaluation.pair_set import PairSet
 from dpm2_core.experiments.paired import Gain, paired_gain
@@ -94,8 +94,7 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     weights, known = folder / WEIGHTS, folder / "figures.json"
     asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
     read = [Path(training.start)] if training.start else []
-    text = dump_settings(training) + "".join(f"# {line}\n" for line in _content(training.data.packed))
-    resume = begin_training(folder, text, read)
+    resume = begin_training(folder, training, read, {"content": _content(training.data.packed)})
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():

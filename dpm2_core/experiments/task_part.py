@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Literal, TypedDict
 
-from dpm2_core.config import dump_settings, load_settings
+from dpm2_core.config import load_settings
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
 from dpm2_core.files import make_folder
@@ -77,8 +77,7 @@ def train(
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     asked = {"training": training, "until": until, "content": scans.digest()}
-    text = dump_settings(settings) + json.dumps(asked) + "\n"
-    resume = begin_training(folder, text, start=None if start is None else Path(start))
+    resume = begin_training(folder, settings, data=asked, start=None if start is None else Path(start))
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)
     advance(1, 1)

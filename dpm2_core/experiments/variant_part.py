@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from dpm2_core.config import dump_settings, load_settings, merged
+from dpm2_core.config import load_settings, merged
 from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import PackedDrive, packed_digest
 from dpm2_core.fleet.part import Advance, Figures
@@ -74,8 +74,8 @@ def train(
         UsageError: no such weights, or no packed drive.
     """
     chosen = training_of(training["config"], training["settings"], training["start"], network, [*map(Path, packed)])
-    text = dump_settings(chosen) + f"# {packed_digest(map(PackedDrive, map(Path, packed)))}\n"
-    resume = begin_training(folder, text, [Path(chosen.start)])
+    content = packed_digest(map(PackedDrive, map(Path, packed)))
+    resume = begin_training(folder, chosen, [Path(chosen.start)], {"content": content})
     weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps
     advance(steps, steps)

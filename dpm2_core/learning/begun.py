@@ -13,34 +13,38 @@ from typing import Any
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
-from dpm2_core.files import atomic_write, file_digest, json_text, make_folder
+from dpm2_core.files import file_digest, json_text, make_folder, write_json
 from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
 
-_BEGUN, _ASKED = "begun.yaml", "begun.json"
+_ASKED = "begun.json"
+"""What was asked for when the training in this folder began."""
 _FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
 
 
-def begin_training(folder: Path, text: str, read: Sequence[Path] = (), start: Path | None = None) -> bool:
-    """Ready a folder for a training that is asked for by `text`; whether there is a checkpoint to go on from.
+def begin_training(
+    folder: Path,
+    settings: Settings,
+    read: Sequence[Path] = (),
+    data: dict[str, Any] | None = None,
+    start: Path | None = None,
+) -> bool:
+    """Ready a folder for a training; whether there is a checkpoint of this very one to go on from.
 
-    What a training that was asked for by another text, or from other files, has left there is removed.
+    What a training that was asked for otherwise has left there is removed.
 
     Args:
-        read: files that the training begins with, such as weights.
+        read, data: as of `begin_or_resume`.
         start: folder of a training whose checkpoint and log a new one goes on from.
     """
     make_folder(folder)
-    begun = folder / _BEGUN
-    files = [*read, *([] if start is None else [start / CHECKPOINT])]
-    text += "".join(f"# {path}: {_content(path)}\n" for path in files)
-    if not (begun.is_file() and begun.read_text(encoding="utf-8") == text):
+    asked, now = folder / _ASKED, _asked(settings, [*read, *([] if start is None else [start / CHECKPOINT])], data)
+    if not asked.is_file() or _before(asked) != now:
         for old in (CHECKPOINT, LOG, WEIGHTS):
             (folder / old).unlink(missing_ok=True)
         if start is not None:
             for kept in (CHECKPOINT, LOG):
                 shutil.copy(start / kept, folder / kept)
-        with atomic_write(begun) as file:  # the last: what is killed before is begun anew
-            file.write(text)
+        write_json(asked, now)  # the last: what is killed before is begun anew
     return (folder / CHECKPOINT).exists()
 
 
@@ -65,19 +69,12 @@ def begin_or_resume(
         raise UsageError(f"{folder}: holds a training; --resume continues it, another --out keeps it")
     if resume and not there:
         raise UsageError(f"{folder}: no {CHECKPOINT} to resume")
-    now = dict(_values(settings)) | {f"content of {path}": _content(path) for path in read} | (data or {})
-    now["processes"] = _processes()
-    now = json.loads(json_text(now))  # as it is read again
+    now = _asked(settings, read, data)
     if not resume or not asked.is_file():
-        with atomic_write(asked) as file:
-            file.write(json_text(now))
+        write_json(asked, now)
         return
-    try:
-        before = json.loads(asked.read_text(encoding="utf-8"))
-        differing = [key for key in now if key in before and before[key] != now[key]]
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{asked}: {error}") from None
-    if differing:
+    before = _before(asked)
+    if differing := [key for key in now if key in before and before[key] != now[key]]:
         name, old, new = _difference(differing[0], before[differing[0]], now[differing[0]])
         raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
 
@@ -90,6 +87,26 @@ def check_one_process(command: str) -> None:
 
 def _processes() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def _asked(settings: Settings, read: Sequence[Path], data: dict[str, Any] | None) -> dict[str, Any]:
+    """All that changes what is learned, as it is read again."""
+    content = {f"content of {path}": _content(path) for path in read}
+    return dict(
+        json.loads(json_text({**dict(_values(settings)), **content, **(data or {}), "processes": _processes()}))
+    )
+
+
+def _before(asked: Path) -> dict[str, Any]:
+    """What was asked for when the training began.
+
+    Raises:
+        UsageError: the file is damaged.
+    """
+    try:
+        return dict(json.loads(asked.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"{asked}: {error}") from None
 
 
 def _content(path: Path) -> str:

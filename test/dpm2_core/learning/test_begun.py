@@ -40,24 +40,26 @@ def read(tmp_path: Path) -> Path:
 
 
 def test_the_same_training_goes_on(tmp_path: Path, read: Path) -> None:
+    """Also with settings that do not change what is learned."""
     folder = tmp_path / "training"
-    assert not begin_training(folder, "steps: 10\n", [read])
+    assert not begin_training(folder, Training(), [read], {"SRC": "a"})
     left(folder)
-    assert begin_training(folder, "steps: 10\n", [read])
+    assert begin_training(folder, Training(workers=3), [read], {"SRC": "a"})
     assert (folder / WEIGHTS).exists()
 
 
-@pytest.mark.parametrize("changed", ["text", "content", "missing"])
+@pytest.mark.parametrize("changed", ["settings", "data", "content", "missing"])
 def test_another_one_begins_anew(tmp_path: Path, read: Path, changed: str) -> None:
     """Also where only the content of a file of the same name is another."""
     folder = tmp_path / "training"
-    begin_training(folder, "steps: 10\n", [read])
+    begin_training(folder, Training(), [read], {"SRC": "a"})
     left(folder)
     if changed == "content":
         read.write_text("others!")
     elif changed == "missing":
         read.unlink()
-    assert not begin_training(folder, "steps: 20\n" if changed == "text" else "steps: 10\n", [read])
+    settings = Training(optimiser=OptimizerSettings(steps=20)) if changed == "settings" else Training()
+    assert not begin_training(folder, settings, [read], {"SRC": "b" if changed == "data" else "a"})
     assert not (folder / WEIGHTS).exists()
 
 
@@ -67,11 +69,11 @@ def test_it_goes_on_from_the_checkpoint_of_another_one(tmp_path: Path) -> None:
     start.mkdir()
     left(start)
     for _ in range(2):
-        assert begin_training(folder, "steps: 10\n", start=start)
+        assert begin_training(folder, Training(), start=start)
         assert (folder / CHECKPOINT).read_text() == "of the training before"
     (folder / WEIGHTS).write_text("its own")
     (start / CHECKPOINT).write_text("of another one")
-    assert begin_training(folder, "steps: 10\n", start=start)
+    assert begin_training(folder, Training(), start=start)
     assert (folder / CHECKPOINT).read_text() == "of another one"
     assert not (folder / WEIGHTS).exists()
 
@@ -79,7 +81,7 @@ def test_it_goes_on_from_the_checkpoint_of_another_one(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_is_an_error_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file/training: no folder can be made there: Not a directory"):
-        begin_training(tmp_path / "file" / "training", "")
+        begin_training(tmp_path / "file" / "training", Training())
 
 
 @pytest.mark.parametrize(
