@@ -21,7 +21,6 @@ from benchmarks.harness import (
     rounded,
     settings_of,
     truth_of,
-    unique_name,
 )
 from benchmarks.pairs import pairs_of
 from dpm2_core.data.open import open_source
@@ -59,23 +58,21 @@ def bench_covariance(options: Options) -> Report:
     results: dict[str, dict[str, Any]] = {}
     with processors(options.threads), Progress(transient=True) as progress:
         for part in requested(options, PARTS):
-            rows = results[part] = {}
             with drives(options) if part == "real" else _simulated(options) as sources:
-                for source in progress.track(sources, description=part):
-                    rows[unique_name(source, rows)] = _of_drive(source, options)
+                named = progress.track(sources.items(), description=part)
+                results[part] = {name: _of_drive(source, options) for name, source in named}
     return Report(results, Group(*(_table(part, rows) for part, rows in results.items())))
 
 
 @contextmanager
-def _simulated(options: Options) -> Iterator[list[Source]]:
+def _simulated(options: Options) -> Iterator[dict[str, Source]]:
     """Drives whose truth is exact, of sensors that have noise but no error of calibration."""
-    sources = []
+    sources: dict[str, Source] = {}
     for number, (preset, beams) in enumerate(_WORLDS):
         out = options.cache / "covariance" / f"{preset}_{beams}"
         tree = {"frames": _FRAMES, "seed": _SEED + number, "road": "random", "preset": preset, "images": False}
         simulate(out, DriveConfig(**tree, lidar=LidarConfig(beams=beams)), options.threads)
-        sources.append(open_source(out / "sequences" / "00"))
-        sources[-1].name = out.name
+        sources[out.name] = open_source(out / "sequences" / "00")
     yield sources
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of, unique_name
+from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from dpm2_core.estimates import OdometryResult, State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -54,10 +54,10 @@ def bench_gaps(options: Options) -> Report:
     methods = requested(options, ("geometric", "adaptive", "refined", "neural"))
     results: dict[str, Any] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
-        for source in sources:
+        for name, source in sources.items():
             truth, frames = truth_of(source), list(source.frames())
             cases = list(gaps([frame.stamp for frame in frames]))
-            name, task = unique_name(source, results), progress.add_task(source.name, total=len(cases) * len(methods))
+            task = progress.add_task(name, total=len(cases) * len(methods))
             results[name] = {}
             for method in methods:
                 settings, rows = settings_of(options, f"slam.registration={method}"), []

@@ -22,7 +22,6 @@ from benchmarks.harness import (
     quantiles_ms,
     settings_of,
     truth_of,
-    unique_name,
 )
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
@@ -131,17 +130,16 @@ def bench_geometric(options: Options) -> Report:
     truth: dict[str, str] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
-        for source in sources:
+        for drive, source in sources.items():
             poses, frames = truth_of(source), list(source.frames())
             outcomes: dict[str, list[Outcome]] = {name: [] for name in methods}
             for _ in range(options.repetitions):
                 for name, run in methods.items():
-                    progress.update(task, description=f"{source.name}: {name}")
+                    progress.update(task, description=f"{drive}: {name}")
                     outcomes[name].append(run(frames))
                     progress.advance(task)
-            name = unique_name(source, results)
-            results[name] = {method: summary(poses, outcomes[method]) for method in methods}
-            truth[name] = source.truth
+            results[drive] = {method: summary(poses, outcomes[method]) for method in methods}
+            truth[drive] = source.truth
             del frames
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
     for methods_of_drive in results.values():

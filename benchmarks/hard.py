@@ -13,8 +13,7 @@ from rich.progress import Progress
 from benchmarks.figures import verdicts_png
 from benchmarks.geometric import BASELINE, Method, Outcome, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
-from benchmarks.harness import Options, Report, drives, processors, requested, truth_of, unique_name
-from dpm2_core.data.source import Source
+from benchmarks.harness import Options, Report, drives, processors, requested, truth_of
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
@@ -42,20 +41,18 @@ def bench_hard(options: Options) -> Report:
         if run is not None:
             methods[name] = run
     results: dict[str, Any] = {}
-    with drives(options) as real, processors(options.threads), Progress(transient=True) as progress:
-        synthetic = (
-            [] if options.sources else [SimulatedDrive(road, preset, seed, preset) for road, preset, seed in _SYNTHETIC]
-        )
-        sources: list[Source] = [*real, *synthetic]
-        for source in sources:
-            frames = list(source.frames(0, None if source in real else _SYNTHETIC_FRAMES))
+    worlds = () if options.sources else _SYNTHETIC
+    synthetic = [SimulatedDrive(road, preset, seed, preset) for road, preset, seed in worlds]
+    with drives(options, synthetic) as sources, processors(options.threads), Progress(transient=True) as progress:
+        for name, source in sources.items():
+            frames = list(source.frames(0, _SYNTHETIC_FRAMES if source in synthetic else None))
             hard = list(cases(frames, truth_of(source)[: len(frames)]))
-            name, task = unique_name(source, results), progress.add_task(source.name, total=len(hard) * len(methods))
+            task = progress.add_task(name, total=len(hard) * len(methods))
             results[name] = {}
             for case in hard:
                 results[name][case.name] = row = {}
                 for method, run in methods.items():
-                    progress.update(task, description=f"{source.name}: {case.name}, {method}")
+                    progress.update(task, description=f"{name}: {case.name}, {method}")
                     row[method] = _figures(case, run(case.frames))
                     progress.advance(task)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Container, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
@@ -95,15 +95,18 @@ class Report:
 
 
 @contextmanager
-def drives(options: Options) -> Iterator[list[Source]]:
-    """The drives to run on; an excerpt that is packed is unpacked for as long as the block lasts.
+def drives(options: Options, more: Sequence[Source] = ()) -> Iterator[dict[str, Source]]:
+    """The drives to run on, by name, and `more` after them; an excerpt that is packed is unpacked for as long as the
+    block lasts.
+
+    A drive of the name of one before it, such as a second folder `00`, is `00 (2)`.
 
     Raises:
         UsageError: there is none.
     """
     how = _configuration(options).input
     if options.sources:
-        yield [open_source(path, how) for path in options.sources]
+        yield _named([*(open_source(path, how) for path in options.sources), *more])
         return
     kitti = options.excerpt
     if not kitti.is_dir():
@@ -118,7 +121,7 @@ def drives(options: Options) -> Iterator[list[Source]]:
         sequences = sorted(path for path in (root / "sequences").glob("*") if (path / "velodyne").is_dir())
         if not sequences:
             raise UsageError(f"{kitti}: neither unpack.py nor sequences/NN/velodyne in it")
-        yield [open_source(path, how) for path in sequences]
+        yield _named([*(open_source(path, how) for path in sequences), *more])
 
 
 def truth_of(source: Source) -> Array:
@@ -132,10 +135,12 @@ def truth_of(source: Source) -> Array:
     return source.poses
 
 
-def unique_name(source: Source, taken: Container[str]) -> str:
-    """The drive's name, counted up where another one, such as a second folder `00`, already has it."""
-    names = (source.name if n == 1 else f"{source.name} ({n})" for n in count(1))
-    return next(name for name in names if name not in taken)
+def _named(sources: Iterable[Source]) -> dict[str, Source]:
+    found: dict[str, Source] = {}
+    for source in sources:
+        names = (source.name if n == 1 else f"{source.name} ({n})" for n in count(1))
+        found[next(name for name in names if name not in found)] = source
+    return found
 
 
 @contextmanager

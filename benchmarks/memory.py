@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.progress import track
 
-from benchmarks.harness import Options, Report, drives, settings_of, unique_name
+from benchmarks.harness import Options, Report, drives, settings_of
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.slam.build import make_slam
 from dpm2_core.tables import FigureTable
@@ -30,15 +30,15 @@ def bench_memory(options: Options) -> Report:
     settings = settings_of(options)
     results: dict[str, Any] = {}
     with drives(options) as sources:
-        for source in sources:
+        for name, source in sources.items():
             slam = make_slam(settings)
             samples = [(0, resident_mb())]
-            frames = track(source.frames(), description=f"{source.name}: memory", total=len(source), transient=True)
+            frames = track(source.frames(), description=f"{name}: memory", total=len(source), transient=True)
             for count, frame in enumerate(frames, 1):
                 slam.process(frame)
                 if count % _EVERY == 0:
                     samples.append((count, resident_mb()))
-            results[unique_name(source, results)] = levelling(samples) | {"keyframes": len(slam.mapper.keyframes)}
+            results[name] = levelling(samples) | {"keyframes": len(slam.mapper.keyframes)}
     return Report({"drives": results}, Group(_table(results)))
 
 

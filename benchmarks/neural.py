@@ -24,7 +24,6 @@ from benchmarks.harness import (
     requested,
     settings_of,
     truth_of,
-    unique_name,
     write_report,
 )
 from benchmarks.neural_view import view
@@ -106,11 +105,10 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
         found: dict[str, Any] = {}
         truth: dict[str, str] = {}
         with drives(options) as sources:
-            for source in sources:
+            for name, source in sources.items():
                 poses, frames = truth_of(source), list(source.frames())
                 if network.encoder.image is None:
                     frames = [replace(frame, images=()) for frame in frames]
-                name = unique_name(source, found)
                 found[name], truth[name] = one(poses, frames, network, options), source.truth
         return {"drives": found, "truth": truth}
 

@@ -10,9 +10,8 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of, unique_name
+from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from benchmarks.loops import check_loops
-from dpm2_core.data.source import Source
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.sim.simulated_drive import SimulatedDrive
@@ -52,12 +51,11 @@ def bench_paper(options: Options) -> Report:
         UsageError: there is no drive, or one has no ground truth.
     """
     results: dict[str, Any] = {}
-    with drives(options) as real, processors(options.threads), Progress(transient=True) as progress:
-        synthetic: list[Source] = [] if options.sources else [_lap()]
-        for source in [*real, *synthetic]:
+    more = [] if options.sources else [_lap()]
+    with drives(options, more) as sources, processors(options.threads), Progress(transient=True) as progress:
+        for name, source in sources.items():
             frames = list(source.frames())
-            name, truth = unique_name(source, results), truth_of(source)[: len(frames)]
-            results[name] = {}
+            truth, results[name] = truth_of(source)[: len(frames)], {}
             ways = requested(options, WAYS)
             for way in progress.track(ways, description=name):
                 results[name][way] = _driven(settings_of(options, *WAYS[way]), frames, truth)

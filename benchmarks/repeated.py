@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.figures import bars_png
-from benchmarks.harness import Options, drives, truth_of, unique_name
+from benchmarks.harness import Options, drives, truth_of
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.learning.generate import training_camera
@@ -40,8 +40,7 @@ def repeated(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     with drives(options) as sources:
-        for source in sources:
-            name = unique_name(source, found)
+        for name, source in sources.items():
             found[name] = shares(list(source.frames()), truth_of(source), network.settings, options.pairs)
     for kind in _SIMULATED if options.unseen is None else ():
         found[f"simulated {kind}"] = shares(*_simulated(kind, network.settings), network.settings, options.pairs)

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from rich.console import Group
 
-from benchmarks.harness import Options, Report, drives, unique_name, write_report
+from benchmarks.harness import Options, Report, drives, write_report
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
 from dpm2_core.data.bags import BagSource
@@ -45,9 +45,8 @@ def bench(
     options = Options(sources=sources or (), repetitions=repetitions)
     results: dict[str, dict[str, float | int | None]] = {}
     with drives(options) as found, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:
-        for drive in found:
+        for title, drive in found.items():
             assert isinstance(drive, KittiSource)
-            title = unique_name(drive, results)
             bag, work = Path(folder) / f"bag_{title}", Path(folder) / title
             work.mkdir()
             convert(KittiSource(drive.path), bag)

@@ -31,7 +31,7 @@ def bench_sensor(options: Options) -> Report:
     """
     real = []
     with drives(options) as sources:
-        for source in sources:
+        for source in sources.values():
             chosen = set(np.linspace(0, len(source) - 1, _SCANS // len(sources)).astype(int).tolist())
             real += [frame.points for i, frame in enumerate(source.frames()) if i in chosen]
     results = {

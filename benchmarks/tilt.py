@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of, unique_name
+from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of
 from benchmarks.pairs import summarized
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import Descriptors
@@ -38,10 +38,9 @@ def bench_tilt(options: Options) -> Report:
     """
     s = settings_of(options)
     network = load_network(s.neural.weights, options.threads, s.neural.preset)
-    results: dict[str, Any] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
-        for source in progress.track(sources):
-            results[unique_name(source, results)] = _of_drive(source, network, options.pairs)
+        named = progress.track(sources.items())
+        results = {name: _of_drive(source, network, options.pairs) for name, source in named}
     return Report({"drives": results}, Group(_table(results)))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, unique_name
+from benchmarks.harness import Options, Report, drives, processors
 from dpm2_core.config import load_settings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error
@@ -55,7 +55,7 @@ def bench_views(options: Options) -> Report:
     """
     results: dict[str, Any] = {}
     with drives(options) as sources, processors(options.threads):
-        for source in sources:
+        for name, source in sources.items():
             with tempfile.TemporaryDirectory(prefix="dpm2_views_") as folder:
                 place = Path(folder)
                 row = _recorded(source, options, place)
@@ -65,7 +65,7 @@ def bench_views(options: Options) -> Report:
                     write_map_page(page, data, _VOXEL)
                 megabytes = round(page.stat().st_size / 1e6, 2)
                 row["page"] = {"keyframes": len(data.poses), "megabytes": megabytes, **_looked_at(page)}
-                results[unique_name(source, results)] = row
+                results[name] = row
     return Report({"drives": results}, Group(_table(results)))
 
 

@@ -199,15 +199,15 @@ def test_processors_are_limited_inside_the_block_alone() -> None:
 def test_drives_are_read_as_the_settings_say(sequence: Path) -> None:
     options = Options(sources=[sequence], overrides=["input.vertical_angle_correction_deg=0.3"])
     with drives(options) as sources:
-        assert [source.vertical_angle_correction_deg for source in sources] == [0.3]  # the recording says 0
+        assert [source.vertical_angle_correction_deg for source in sources.values()] == [0.3]  # the recording says 0
 
 
 def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(sequence: Path, tmp_path: Path) -> None:
     unpack = tmp_path / "unpack.py"
     unpack.write_text(f"import shutil, sys\nshutil.copytree({str(sequence)!r}, sys.argv[1] + '/sequences/07')")
     with drives(Options(kitti=tmp_path)) as sources:
-        assert [(source.name, len(source)) for source in sources] == [("07", FRAMES)]
-        frame = next(iter(sources[0].frames(0, 1)))
+        assert [(name, len(source)) for name, source in sources.items()] == [("07", FRAMES)]
+        frame = next(iter(sources["07"].frames(0, 1)))
     assert len(frame.points) == 36_000
     unpack.write_text("raise SystemExit('scan 3 is damaged')")
     with pytest.raises(Dpm2Error, match=r"unpack\.py: .*scan 3 is damaged"), drives(Options(kitti=tmp_path)):
