@@ -24,7 +24,7 @@ from rich.console import Group
 
 from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
 from benchmarks.fleet_growth import bench_growth, bench_whole
-from benchmarks.harness import Options, Report, requested
+from benchmarks.harness import Options, Report, earlier, requested
 from benchmarks.roads import FIRST_SEED, road_files
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.machine import processors
@@ -61,11 +61,9 @@ def bench_fleet(options: Options) -> Report:
         "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers,
         "growth": lambda folder, _: bench_growth(folder), "whole": lambda folder, _: bench_whole(folder),
     }  # fmt: skip
-    results: dict[str, Any] = {}
-    file = options.out / "fleet.json"
-    if options.only is not None and file.is_file():  # the other parts stay as they were measured
-        before = json.loads(file.read_text(encoding="utf-8"))
-        results = {name: before[name] for name in parts if name in before}
+    # With --only the other parts stay as they were measured.
+    before = {} if options.only is None else {name: earlier(options.out / "fleet.json", name) for name in parts}
+    results: dict[str, Any] = {name: figures for name, figures in before.items() if figures}
     for name in requested(options, parts):
         with tempfile.TemporaryDirectory(prefix="dpm2_bench_fleet_") as folder:
             results[name] = parts[name](Path(folder), options)

@@ -16,7 +16,6 @@ from rich.progress import Progress
 from benchmarks.harness import (
     Options,
     Report,
-    clean_cloud,
     drives,
     processors,
     quantiles_ms,
@@ -25,7 +24,7 @@ from benchmarks.harness import (
 )
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
-from dpm2_core.experiments.peers import kiss_icp_config
+from dpm2_core.experiments.peers import cloud_and_times, kiss_icp_config
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
@@ -87,23 +86,17 @@ def dpm2(options: Options, *more: str) -> Method:
     return run
 
 
-def kiss_config(options: Options) -> Any | None:
-    """KISS-ICP's configuration for KITTI, whose scans are deskewed already; None where it is not installed."""
-    try:
-        return kiss_icp_config(options.threads, deskew=False)
-    except MissingPackageError:
-        return None
-
-
 def kiss_icp(options: Options) -> Method | None:
-    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it; None where it is not installed."""
-    config = kiss_config(options)
-    if config is None:
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it, for KITTI, whose scans are deskewed
+    already; None where it is not installed."""
+    try:
+        config = kiss_icp_config(options.threads, deskew=False)
+    except MissingPackageError:
         return None
     from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Outcome:
-        clouds = [clean_cloud(frame) for frame in frames]
+        clouds = [cloud_and_times(frame)[0] for frame in frames]
         odometry = KissICP(config)
         poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
         cpu = process_time()

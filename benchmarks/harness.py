@@ -23,7 +23,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, write_record
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array
 from dpm2_core.openmp import allowed
 from dpm2_core.slam.settings import Config, SlamSettings
 
@@ -195,8 +195,3 @@ def quantiles_ms(seconds: Sequence[float] | Array) -> dict[str, float]:
     """Median and 95th percentile of (N,) seconds, ms."""
     median, p95 = np.percentile(1e3 * np.asarray(seconds), [50, 95])
     return {"median": round(float(median), 2), "p95": round(float(p95), 2)}
-
-
-def clean_cloud(frame: Frame) -> Array:
-    """(M, 3) float64 points of a frame without those that are not finite, as other programs want them."""
-    return frame.points[np.isfinite(frame.points[:, :3]).all(1), :3].astype(np.float64)

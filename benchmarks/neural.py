@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.figures import success_png
-from benchmarks.geometric import BASELINE, Method, dpm2, kiss_config, kiss_icp, summary
+from benchmarks.geometric import BASELINE, Method, dpm2, kiss_icp, summary
 from benchmarks.harness import (
     Options,
     Report,
@@ -125,8 +125,8 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
     near = {name: methods[name] for name in ("neural", "refined")}
     if (gicp := gicp_from_identity(options.threads)) is not None:
         methods["small_gicp"] = gicp
-    if (config := kiss_config(options)) is not None:
-        methods[BASELINE] = kiss_from_identity(config)
+    if (kiss := kiss_from_identity(options.threads)) is not None:
+        methods[BASELINE] = kiss
     kinds = {"consecutive": near, "8 apart": near} | dict.fromkeys(APART, methods)
     points = make_registration(settings_of(options, "slam.registration=geometric"))
     return all_pairs(kinds, frames, poses, options.pairs, points)

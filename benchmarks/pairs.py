@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import clean_cloud
+from dpm2_core.experiments.peers import KissIcp, cloud_and_times
+from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -91,24 +92,27 @@ def gicp_from_identity(threads: int) -> PairMethod | None:
         return None
 
     def register(first: Frame, second: Frame) -> Array:
-        target, source = clean_cloud(first), clean_cloud(second)
+        target, source = (cloud_and_times(frame)[0] for frame in (first, second))
         options = {"max_correspondence_distance": 2.0, "max_iterations": 50, "num_threads": threads}
         return np.asarray(small_gicp.align(target, source, **options).T_target_source)
 
     return register
 
 
-def kiss_from_identity(config: Any) -> PairMethod:
-    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity."""
+def kiss_from_identity(threads: int) -> PairMethod | None:
+    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity. None where it is not
+    installed."""
 
     def register(first: Frame, second: Frame) -> Array:
-        from kiss_icp.kiss_icp import KissICP
+        odometry = KissIcp(threads, deskew=False)
+        odometry.add(first)
+        odometry.add(second)
+        return np.asarray(odometry.poses()[-1])
 
-        odometry = KissICP(config)
-        for frame in (first, second):
-            odometry.register_frame(clean_cloud(frame), np.array([]))
-        return np.asarray(odometry.last_pose)
-
+    try:
+        KissIcp(threads, deskew=False)
+    except MissingPackageError:
+        return None
     return register
 
 

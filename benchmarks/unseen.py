@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.geometric import BASELINE, kiss_config
+from benchmarks.geometric import BASELINE
 from benchmarks.harness import Options, settings_of
 from benchmarks.pairs import MANY, PairMethod, by_registration, kiss_from_identity, summarized
 from dpm2_core.data.corrupt import hidden_by, random_box
@@ -121,7 +121,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     direction included.
     """
     camera = network.encoder.image is not None
-    config = kiss_config(options)
+    kiss = kiss_from_identity(options.threads)
     out: dict[str, Any] = {"pairs": {}}
     for kind in ("highway", "tunnel"):
         pairs = _pairs(network, options, kind, options.pairs)
@@ -133,8 +133,8 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
             for name in ("neural", "refined"):
                 registered = by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
                 methods[f"{name} {word}"] = _near_errors(pairs, registered)
-        if config is not None:
-            methods[BASELINE] = _near_errors(pairs, kiss_from_identity(config))
+        if kiss is not None:
+            methods[BASELINE] = _near_errors(pairs, kiss)
         near = methods["descriptors without camera"][:, 0] <= NEAR
         out["pairs"][f"{kind}, up to 5 m"] = {name: summarized(rows[near, 1:]) for name, rows in methods.items()}
     if not camera:
