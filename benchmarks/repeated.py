@@ -61,7 +61,7 @@ def _simulated(kind: PresetName, network: NetworkSettings) -> tuple[list[Frame],
     for i in range(_FRAMES):
         time, noise = 0.1 * i if kind != "indoor" else 0.5 * i, np.random.default_rng([_SEED, i])  # at 1.2 m/s
         T = world.drive_pose(time, config.height, sway)
-        points = lidar.drive_scan(world, T, time, noise, world.drive_twist(time, config.height, sway)).points
+        points = lidar.drive_scan(world, T, time, noise).points
         poses.append(T @ lidar.T_level_lidar)
         pixels = render(world, camera, poses[-1] @ view.T_lidar_cam, time, noise)
         frames.append(Frame(i, points, images=(Image(pixels, view),)))

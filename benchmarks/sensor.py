@@ -51,8 +51,8 @@ def _simulated(config: LidarConfig) -> list[np.ndarray]:
         for seed in _SEEDS:
             world, rng = build_world("random", kind, seed, 300.0), np.random.default_rng(seed)
             for time in np.linspace(0, 15, _SCANS // (len(_KINDS) * len(_SEEDS))):
-                T, twist = (of(float(time), config.height, sway) for of in (world.drive_pose, world.drive_twist))
-                out.append(lidar.drive_scan(world, T, float(time), rng, twist).points)
+                T = world.drive_pose(float(time), config.height, sway)
+                out.append(lidar.drive_scan(world, T, float(time), rng).points)
     return out
 
 

@@ -142,7 +142,6 @@ class _Drive:
         self.times = np.arange(_frames(drive)) * FRAME_PERIOD
         height, sway = drive.lidar.height, drive.lidar.real.sway
         self.T_world_level = np.stack([world.drive_pose(t, height, sway) for t in self.times])
-        self.twists = np.stack([world.drive_twist(t, height, sway) for t in self.times])
         self.T_world_lidar = self.T_world_level @ self.lidar.T_level_lidar
         color = calibration(drive.camera)
         # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
@@ -173,7 +172,7 @@ class _Drive:
     def _write_frame(self, sequence: Path, i: int) -> None:
         world, time, T = self.world, float(self.times[i]), self.T_world_lidar[i]
         rng = np.random.default_rng([world.seed, _LIDAR_STREAM, i])
-        scan = self.lidar.drive_scan(world, self.T_world_level[i], time, rng, self.twists[i])
+        scan = self.lidar.drive_scan(world, self.T_world_level[i], time, rng)
         scan.points.tofile(sequence / "velodyne" / f"{i:06d}.bin")
         scan.label.tofile(sequence / "labels" / f"{i:06d}.label")
         scan.static.tofile(sequence / "static" / f"{i:06d}.bin")

@@ -109,18 +109,17 @@ class Lidar:
         points = self._points(aim, returns, believed)
         return Scan(points, label[back], moving[back], self.beams.ring[back], time_offset, static)
 
-    def drive_scan(
-        self, world: World, T_world_level: Array, time: float, rng: np.random.Generator, twist: Array
-    ) -> Scan:
-        """One turn of the mounted sensor in motion, with what a driver leaves of the motion (`Imperfections.skew`).
+    def drive_scan(self, world: World, T_world_level: Array, time: float, rng: np.random.Generator) -> Scan:
+        """One turn of the mounted sensor as it drives, with what a driver leaves of the motion (`Imperfections.skew`).
 
         Args:
-            T_world_level: (4, 4), without the turn of the mount. twist: (6,) [rad/s, m/s] of that frame.
+            T_world_level: (4, 4), without the turn of the mount. time: s, of the drive, whose motion it has then.
         """
         T_world_lidar = T_world_level @ self.T_level_lidar
         if not self.config.real.skew:
             return self.scan(world, T_world_lidar, time, rng)
-        own = (np.asarray(twist).reshape(2, 3) @ self.T_level_lidar[:3, :3]).ravel()
+        twist = world.drive_twist(time, self.config.height, self.config.real.sway)
+        own = (twist.reshape(2, 3) @ self.T_level_lidar[:3, :3]).ravel()
         return self.scan(world, T_world_lidar, time, rng, own, own * (1 + self.config.real.skew * rng.normal()))
 
     def _paint(
