@@ -212,8 +212,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
     for number, s in enumerate(track(at, description=f"lap {lap + 1}", transient=True, console=Console(stderr=True))):
         T_world_kf = world.pose_at(float(s))
         scan = lidar.scan(world, T_world_kf, 100.0 * lap + s / 8, rng)
-        near = np.flatnonzero(np.einsum("ij,ij->i", scan.points[:, :3], scan.points[:, :3]) < 60.0**2)
-        near = near[voxel_first(scan.points[near], 0.3)]
+        near = voxel_first(scan.points, 0.3, far=60.0)
         node = lap * len(at) + number
         edge, T_odom_kf = None, T_world_kf
         if previous is not None:

@@ -22,11 +22,12 @@ from dpm2_core.commands.options import run_command
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
+from dpm2_core.learning.generate import training_camera
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.settings import CameraConfig, LidarConfig, PresetName
+from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
@@ -82,10 +83,7 @@ def errors(network: DeepPointMap2, kind: PresetName, seed: int) -> Array:
 def _frames(world: World, network: DeepPointMap2) -> Iterator[tuple[Array, Frame]]:
     """T_world_lidar and a frame with the images of all cameras, every `STEP` m."""
     lidar, rng = Lidar(LidarConfig()), np.random.default_rng(world.seed)
-    height, width = network.settings.image.size
-    config = CameraConfig(
-        width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241
-    )  # as `dpm2 train data` has
+    config = training_camera(network.settings)
     start = float(world.road.distance(1.0))
     times = np.arange(1.0, 20.0, 0.005)
     at = np.interp(start + STEP * np.arange(FRAMES), [float(world.road.distance(t)) for t in times], times)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.learning.generate import GenerateSettings, generate
 from dpm2_core.learning.train_overlap import FRAMES, OVERLAP, average_precision, draw_overlap
+from dpm2_core.network.images import in_encoded_axes
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.slam.build import make_registration
@@ -158,11 +158,7 @@ def _turned(pairs: PairSet, key: tuple[int, int, float], number: int) -> Frame:
     drive, index, yaw = key
     turn, sample = se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index]
     cloud = se3.transform(turn, sample.cloud)
-    images = tuple(
-        Image(image.pixels, replace(image.camera, T_lidar_cam=turn @ image.camera.T_lidar_cam))
-        for image in sample.images
-        if pairs.images
-    )
+    images = tuple(in_encoded_axes(image, turn[:3, :3], 1.0) for image in sample.images if pairs.images)
     return Frame(number, np.c_[cloud, np.zeros(len(cloud))].astype(np.float32), images=images, index=number)
 
 

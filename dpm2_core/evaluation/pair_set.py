@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,9 @@ from scipy.spatial.distance import pdist
 from dpm2_core.data.packed import open_packed
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Image
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
+from dpm2_core.network.images import in_encoded_axes
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.packed_frames import check_images, cropped_anew, is_cropped_anew
 from dpm2_core.network.pyramid import build_pyramid, collate
@@ -29,11 +29,6 @@ def has_pair(poses: Array, low: float, high: float) -> bool:
     """Whether two of (N, 4, 4) poses are so far apart, m; those that are NaN are not looked at."""
     distance = pdist(poses[:, :3, 3])
     return bool(((distance > low) & (distance <= high)).any())
-
-
-def _turned(image: Image, turn: Array) -> Image:
-    """The same where the axes of the LiDAR are turned."""
-    return replace(image, camera=replace(image.camera, T_lidar_cam=turn @ image.camera.T_lidar_cam))
 
 
 class PairSet:
@@ -87,7 +82,8 @@ class PairSet:
             for drive, index, yaw in keys[begin : begin + 8]:
                 sample = self.drives[drive][index]
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
-                images.append([_turned(image, turn) for image in sample.images] if self.images else [])
+                R = turn[:3, :3]
+                images.append([in_encoded_axes(image, R, 1.0) for image in sample.images] if self.images else [])
                 anew = self._cropped_anew[drive]
                 cloud = cropped_anew(sample.cloud, self.network.points) if anew else sample.cloud
                 pyramids.append(build_pyramid(se3.transform(turn, cloud), self.network, images[-1]))

@@ -14,7 +14,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.settings import ImageSettings
 
 
-def in_encoded_axes(image: Image, R: NDArray[np.float32], scale: float) -> Image:
+def in_encoded_axes(image: Image, R: NDArray[np.floating], scale: float) -> Image:
     """An image whose camera stands in other axes, into which R (3, 3) turns the LiDAR's, in a scene that is enlarged by
     `scale`."""
     T_lidar_cam = se3.make(R, np.zeros(3)) @ image.camera.T_lidar_cam
