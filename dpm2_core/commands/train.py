@@ -201,11 +201,12 @@ def _begin(
     """Ready `out` for a training on packed drives, see `begin_or_resume`."""
     from dpm2_core.data.packed import open_packed, packed_digest
     from dpm2_core.learning.begun import begin_or_resume
+    from dpm2_core.network.pretrained import weights_path
 
     drives = {folder: open_packed(Path(folder)) for folder in settings.data.packed}
     frames = {folder: sum(map(len, found)) for folder, found in drives.items()}
     content = {folder: packed_digest(found) for folder, found in drives.items()}
-    read = [Path(settings.start)] if settings.start else []
+    read = [weights_path(settings.start)] if settings.start else []
     begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
     if validation := getattr(settings, "validation", ""):  # the training of the image branch has none
         measured = {drive.folder.resolve(): drive.name for drive in open_packed(Path(validation))}

@@ -21,6 +21,7 @@ from dpm2_core.files import atomic_write
 from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
 from dpm2_core.tables import FigureTable
 
@@ -93,7 +94,7 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     folder = out / name.replace(" ", "_") / str(seed)
     weights, known = folder / WEIGHTS, folder / "figures.json"
     asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
-    read = [Path(training.start)] if training.start else []
+    read = [weights_path(training.start)] if training.start else []
     resume = begin_training(folder, training, read, {"content": _content(training.data.packed)})
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])

@@ -29,6 +29,7 @@ from dpm2_core.learning.trainer import OptimizerSettings, Trainer
 from dpm2_core.network.losses import cosine, info_nce, label_distances
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.packed_frames import check_images
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import image_features
 from dpm2_core.network.views import Views, collate_views
@@ -70,7 +71,7 @@ class ImageTrainingSettings(Settings):
     """Deviation of the second image's points from the true ones, m: descriptors never sit at the very same place."""
     optimiser: OptimizerSettings = OptimizerSettings()
     start: str = ""
-    """Weights (safetensors) of the network, whose other parts stay as they are; empty: random."""
+    """Weights of the network, a name or a .safetensors file, whose other parts stay as they are; empty: random."""
 
 
 class ImageDataset:
@@ -160,7 +161,7 @@ def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False
     network = preset(settings.preset, settings.network)
     module = ImageTraining(network, settings.shift)
     if settings.start:
-        load_weights(module.model, Path(settings.start))
+        load_weights(module.model, weights_path(settings.start))
     data = ImageDataset(settings.data, network, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[ImagePairs]]:

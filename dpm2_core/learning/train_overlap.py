@@ -28,6 +28,7 @@ from dpm2_core.network.losses import confidence_loss, overlap_loss
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.precision import mixed_precision
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.solved import Solved, confidence_of, overlap_features
@@ -53,7 +54,7 @@ class OverlapTrainingSettings(Settings):
     """The overlap training; the network is that of the registration training, with all its settings."""
 
     start: str
-    """Weights of the registration training (safetensors)."""
+    """Weights of the registration training, a name or a .safetensors file."""
     data: GroupSettings = GroupSettings()
     """Packed drives, of which frames are drawn that overlap and that do not, see `draw_overlap`."""
     validation: str = ""
@@ -154,9 +155,10 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
     `out`."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
-    network = network_settings(Path(settings.start))
+    start = weights_path(settings.start)
+    network = network_settings(start)
     module = OverlapTraining(network)
-    about = load_weights(module.model, Path(settings.start))
+    about = load_weights(module.model, start)
     data = GroupDataset(settings.data, network, _draw, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, Tensor, Tensor]]:

@@ -22,6 +22,7 @@ from dpm2_core.network.encoder import Encoded
 from dpm2_core.network.losses import cosine, info_nce, label_pairs
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pointnext import Scale
+from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.network.spatial import image_features
@@ -116,7 +117,7 @@ class RegistrationTrainingSettings(Settings):
     sets: float = Field(0.25, ge=0, le=1)
     """Fraction of steps that also register merged sets: one frame to the others, or half to half."""
     start: str = ""
-    """Weights (safetensors) to start from; empty: random."""
+    """Weights to start from, a name or a .safetensors file; empty: random."""
     encoder: bool = True
     """Whether the encoder learns; else the decoder alone, for the descriptors that `start` makes."""
     partial: bool = False
@@ -147,9 +148,9 @@ def train_registration(
     module = RegistrationTraining(network, settings.loss, settings.encoder)
     random: list[str] = []
     if settings.start and settings.partial:
-        random = load_fitting(module.model, Path(settings.start))
+        random = load_fitting(module.model, weights_path(settings.start))
     elif settings.start:
-        load_weights(module.model, Path(settings.start))
+        load_weights(module.model, weights_path(settings.start))
     data = GroupDataset(settings.data, network, settings.data.draw, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Views | None, tuple[SetPairs, ...]]]:

@@ -81,3 +81,18 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(packed: P
         done = dpm2(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
         assert done.returncode == 0, done.stderr
         assert notes(done.stderr) == [f"note: validation {packed} is what the network learns from"] * said
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_weights_to_start_from_have_a_name_as_everywhere(tmp_path: Path) -> None:
+    """Of those that come with dpm2 the path was wanted, in trainings alone."""
+    done = dpm2("train", "phase1", "--out", tmp_path / "a", "--set", "start=small")
+    assert "data.packed: want packed drives" in done.stderr  # the weights were there
+    (content,) = [
+        key for key in json.loads((tmp_path / "a" / "begun.json").read_text()) if key.startswith("content of")
+    ]
+    assert content.endswith("/small.safetensors")
+    done = dpm2("train", "phase2", "--out", tmp_path / "b", "--set", "start=nowhere")
+    assert (done.returncode, "weights nowhere: no such file; weights that come with dpm2: " in done.stderr) == (2, True)
+    assert not (tmp_path / "b").exists()
