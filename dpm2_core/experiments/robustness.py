@@ -5,16 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
-from dpm2_core.data.open import open_source
-from dpm2_core.data.source import Source
+from dpm2_core.data.source import Source, frame_at
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
-from dpm2_core.experiments.sequences import SHOWN, cells, missing_note, own_part, present, registrations, run_folders
+from dpm2_core.experiments.sequences import (
+    SHOWN,
+    cells,
+    missing_note,
+    own_part,
+    present,
+    reading,
+    registrations,
+    run_folders,
+)
+from dpm2_core.experiments.slam_part import open_drive
 from dpm2_core.experiments.table import MEAN, ResultTable
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.slam.build import make_odometry
@@ -51,12 +59,11 @@ def _sees(request: Request, settings: Sequence[str]) -> bool:
 def _has_images(request: Request) -> bool:
     """Whether the first frame of a sequence has an image."""
     sources = (_opened(request, sequence) for sequence in present(request, TESTED, ORIGINAL_POSES))
-    return any(frame.images for source in sources for frame in islice(source.frames(0, 1), 1))
+    return any(frame_at(source, 0).images for source in sources)
 
 
 def _opened(request: Request, sequence: str) -> Source:
-    settings = load_settings(Config, None, [f"input.sequence='{sequence}'", *ORIGINAL_POSES])
-    return open_source(request.data, settings.input)
+    return open_drive(request.data, reading(request, sequence, ORIGINAL_POSES))
 
 
 def _parts(request: Request) -> Sequence[Sequence[Part]]:
@@ -103,7 +110,7 @@ def _picture(request: Request, sequence: str, notes: list[str]) -> None:
     source = _opened(request, sequence)
     at = min(_PICTURED, len(source) - 1)
     hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
-    (before,), (after,) = (list(of.frames(at, at + 1)) for of in (source, hit))
+    before, after = (frame_at(of, at) for of in (source, hit))
     path = request.out / f"corrupted_{sequence}.png"
     title = f"{sequence}, frame {before.index}: camera black, box before the LiDAR"
     drawn(path, notes, lambda to: corrupted_png(to, before, after, title))

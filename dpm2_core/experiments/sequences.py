@@ -19,6 +19,12 @@ SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
 """Figures of the KITTI metric, and how they are printed."""
 
 
+def reading(request: Request, sequence: str, settings: Sequence[str] = ()) -> list[str]:
+    """The settings by which a sequence is read; `settings` count for less than the user's, of which those of the SLAM
+    and of trainings are left out."""
+    return [f"input.sequence='{sequence}'", *settings, *(s for s in request.overrides if s.startswith("input."))]
+
+
 def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) -> list[str]:
     """The sequences to be tested on: those asked for, or those of the paper that the data set has.
 
@@ -27,10 +33,10 @@ def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) ->
     """
     if request.sequences:
         for sequence in request.sequences:
-            if problem := has_sequence(request.data, [f"input.sequence='{sequence}'", *more]):
+            if problem := has_sequence(request.data, reading(request, sequence, more)):
                 raise UsageError(problem)
         return list(request.sequences)
-    problems = {sequence: has_sequence(request.data, [f"input.sequence='{sequence}'", *more]) for sequence in paper}
+    problems = {sequence: has_sequence(request.data, reading(request, sequence, more)) for sequence in paper}
     found = [sequence for sequence, problem in problems.items() if not problem]
     if not found:
         raise UsageError(f"{next(iter(problems.values()))}; or choose others with --sequences")
@@ -76,7 +82,7 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
         if equals and "{sequence}" not in file and len(sequences) > 1:
             raise UsageError(f"--peer {text}: of {len(sequences)} sequences; put {{sequence}} where its name stands")
         for sequence in sequences:
-            asked = [f"input.sequence='{sequence}'", *settings, *_input(request.overrides)]
+            asked = reading(request, sequence, settings)
             drive, content = _drive(request, asked), drive_content(request.data, asked)
             if equals:
                 path = Path(file.replace("{sequence}", sequence))
@@ -112,11 +118,6 @@ def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
         "frames": list(request.frames or (0, None)),
         "lengths": list(request.lengths or OFFICIAL_LENGTHS),
     }
-
-
-def _input(overrides: Sequence[str]) -> list[str]:
-    """Those that say how frames are read: other programs have no use for the rest."""
-    return [text for text in overrides if text.startswith("input.")]
 
 
 def _folder(name: str) -> str:

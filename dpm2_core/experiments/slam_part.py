@@ -179,9 +179,18 @@ def _measured(
     return metrics.model_dump(exclude={"per_length", "per_speed"})
 
 
+def open_drive(data: Path | str, settings: Sequence[str]) -> Source:
+    """A drive as the settings KEY=VALUE of `Config` have it read.
+
+    Raises:
+        UsageError: as `open_source`.
+    """
+    return open_source(data, load_settings(Config, None, settings).input)
+
+
 def drive_content(data: Path, settings: Sequence[str]) -> str:
-    """What a drive holds, see `digest_of`, as the settings KEY=VALUE of `Config` have it read."""
-    return digest_of(open_source(data, load_settings(Config, None, settings).input))
+    """What a drive holds, see `digest_of`."""
+    return digest_of(open_drive(data, settings))
 
 
 def has_sequence(data: Path, settings: Sequence[str]) -> str:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.config import load_settings, merged
-from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import PackedDrive, packed_digest
+from dpm2_core.experiments.slam_part import open_drive
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.checkpoint import LOG
@@ -18,7 +18,6 @@ from dpm2_core.learning.generate import pack as write_packed_drive
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import network_settings, read_metadata
-from dpm2_core.slam.settings import Config
 
 PACK = "dpm2_core.experiments.variant_part:pack"
 TRAIN = "dpm2_core.experiments.variant_part:train"
@@ -32,7 +31,7 @@ def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], wei
     Raises:
         UsageError: no such sequence, no poses, or images of some frames only.
     """
-    source = open_source(data, load_settings(Config, None, settings).input)
+    source = open_drive(data, settings)
     done = 0
 
     def count() -> None:

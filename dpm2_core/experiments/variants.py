@@ -5,25 +5,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
-from dpm2_core.config import load_settings
-from dpm2_core.data.open import open_source
+from dpm2_core.data.source import frame_at
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
-from dpm2_core.experiments.sequences import SHOWN, cells, learned_note, missing_note, own_part, present, run_folders
-from dpm2_core.experiments.slam_part import drive_content
+from dpm2_core.experiments.sequences import (
+    SHOWN,
+    cells,
+    learned_note,
+    missing_note,
+    own_part,
+    present,
+    reading,
+    run_folders,
+)
+from dpm2_core.experiments.slam_part import drive_content, open_drive
 from dpm2_core.experiments.table import MEAN, ResultTable
 from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
-from dpm2_core.slam.settings import Config
 
 LEARNED = ("00", "01", "02", "03", "04", "05")
 AS_PAPER: dict[str, Any] = {
@@ -74,7 +80,7 @@ class VariantTable:
         start = request.weights or "small"
         packs = []
         for sequence in _learned(request):
-            asked = [f"input.sequence='{sequence}'"]
+            asked = reading(request, sequence)
             of = {"data": str(request.data), "weights": start, "settings": asked}
             content = drive_content(request.data, asked)
             packs.append(Part(f"packed/{sequence}", PACK, of, [weights_path(start)], content=content))
@@ -127,8 +133,7 @@ class VariantTable:
 
     def _panel(self, request: Request, sequence: str, notes: list[str]) -> None:
         """The paper's figure 7: what one reference point reads from the image, by every variant that attends."""
-        source = open_source(request.data, load_settings(Config, None, [f"input.sequence='{sequence}'"]).input)
-        (frame,) = islice(source.frames(0, 1), 1)
+        frame = frame_at(open_drive(request.data, reading(request, sequence)), 0)
         if not frame.images:
             notes.append("no attention maps: the data set has no images")
             return

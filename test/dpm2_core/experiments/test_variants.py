@@ -94,6 +94,14 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
     assert not any(figures_of(part, tmp_path / "out") for part in trainings(request))
 
 
+def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, weights: Path, tmp_path: Path) -> None:
+    """`--set input...` changed the second alone: a data set that needs it was packed otherwise, or not at all."""
+    asked = ("input.images=false", "optimiser.steps=1", "slam.threads=1")
+    packs, _, driven = fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=asked))
+    assert [part.arguments["settings"] for part in packs] == [["input.sequence='00'", "input.images=false"]]
+    assert "input.images=false" in driven[0].arguments["drive"]["settings"]
+
+
 @pytest.mark.long
 def test_reference_points(kitti: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every row; 4,096 points would take minutes here."""
