@@ -40,15 +40,8 @@ class SegmentErrors:
     def __len__(self) -> int:
         return len(self.length)
 
-    def of_length(self, length: float) -> SegmentErrors:
-        """Those of one length."""
-        return self._chosen(self.length == length)
-
-    def of_speed(self, low: float, high: float) -> SegmentErrors:
-        """Those driven at `low` <= speed < `high`, m/s."""
-        return self._chosen((self.speed >= low) & (self.speed < high))
-
-    def _chosen(self, chosen: NDArray[np.bool_]) -> SegmentErrors:
+    def where(self, chosen: NDArray[np.bool_]) -> SegmentErrors:
+        """Those that are chosen (S,)."""
         return SegmentErrors(self.length[chosen], self.t_err[chosen], self.r_err[chosen], self.speed[chosen])
 
     def mean(self) -> tuple[float, float] | None:

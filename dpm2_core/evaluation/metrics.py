@@ -8,6 +8,7 @@ All compare the poses of the same sensor frame; the alignment of the two world f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -116,18 +117,17 @@ def evaluate(
             f"only {both.sum()} of {len(gt)} frames have both an estimate and ground truth; want 2 or more"
         )
     segments = segment_errors(gt, est, lengths, stamps)
-    t_err, r_err = _percent(segments)
     rpe_trans, rpe_rot = rpe(gt, est, stamps)
     position = _position_errors(gt[both], est[both])
     return Metrics(
         frames=len(est),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
         path_length_m=path_length(gt[has_gt]),
-        t_err_percent=t_err,
-        r_err_deg_per_100m=r_err,
+        **_kitti(segments),
         lengths_m=tuple(lengths),
-        segments=len(segments),
-        per_length=tuple(_of_length(segments, length) for length in lengths),
+        per_length=tuple(
+            LengthErrors(length_m=length, **_kitti(segments.where(segments.length == length))) for length in lengths
+        ),
         per_speed=_by_speed(segments),
         ape_rmse_m=_rms(position),
         ape_mean_m=float(position.mean()),
@@ -190,25 +190,14 @@ def path_length(poses: Array) -> float:
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
-def _of_length(segments: SegmentErrors, length: float) -> LengthErrors:
-    chosen = segments.of_length(length)
-    t_err, r_err = _percent(chosen)
-    return LengthErrors(length_m=length, segments=len(chosen), t_err_percent=t_err, r_err_deg_per_100m=r_err)
-
-
 def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
-    out = []
-    speeds = segments.speed[np.isfinite(segments.speed)]
-    for step in sorted({int(np.floor(speed / SPEED_STEP + 0.5)) for speed in speeds.tolist()}):
-        center = step * SPEED_STEP
-        chosen = segments.of_speed(center - SPEED_STEP / 2, center + SPEED_STEP / 2)
-        t_err, r_err = _percent(chosen)
-        if len(chosen):
-            errors = {"t_err_percent": t_err, "r_err_deg_per_100m": r_err}
-            out.append(SpeedErrors(speed_mps=center, segments=len(chosen), **errors))
-    return tuple(out)
+    step = np.floor(segments.speed / SPEED_STEP + 0.5)
+    of = ((k, segments.where(step == k)) for k in np.unique(step[np.isfinite(step)]).tolist())
+    return tuple(SpeedErrors(speed_mps=k * SPEED_STEP, **_kitti(chosen)) for k, chosen in of)
 
 
-def _percent(segments: SegmentErrors) -> tuple[float | None, float | None]:
+def _kitti(segments: SegmentErrors) -> dict[str, Any]:
+    """The KITTI metric of some segments, under the names that all models here have for it."""
     mean = segments.mean()
-    return (None, None) if mean is None else (100 * mean[0], 100 * float(np.degrees(mean[1])))
+    t_err, r_err = (None, None) if mean is None else (100 * mean[0], 100 * float(np.degrees(mean[1])))
+    return {"segments": len(segments), "t_err_percent": t_err, "r_err_deg_per_100m": r_err}
