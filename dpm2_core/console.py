@@ -7,6 +7,7 @@ from contextvars import ContextVar
 from typing import Any
 
 import rich.console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.errors import printable
 
@@ -29,3 +30,30 @@ class Console(rich.console.Console):
 def lines(text: str) -> str:
     """Text from elsewhere for a terminal, of several lines or one."""
     return "\n".join(map(printable, text.split("\n")))
+
+
+class Lines(Progress):
+    """Progress where no terminal is: a line each tenth of the way, so that a log shows it."""
+
+    def update(self, task_id: TaskID, **fields: Any) -> None:
+        """As rich's."""
+        before = self._tasks[task_id].percentage // 10
+        super().update(task_id, **fields)
+        task = self._tasks[task_id]
+        if task.total and task.percentage // 10 > before:
+            left = task.time_remaining
+            when = f", {left:.0f} s left" if left else ""
+            self.console.print(f"{task.description}: {task.completed:.0f}/{task.total:.0f}{when}", soft_wrap=True)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """As rich's."""
+        self.update(task_id, advance=advance)
+
+
+def progress_bar(console: Console | None = None) -> Progress:
+    """A bar with a description, the count and the time left; on stderr by default. Lines where that is no terminal."""
+    console = console or Console(stderr=True)
+    if not console.is_terminal:
+        return Lines(console=console, disable=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console)

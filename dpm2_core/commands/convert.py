@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, Overrides, progress_bar
+from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source, Span, parse_range

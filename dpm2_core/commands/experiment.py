@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Group
 
-from dpm2_core.commands.options import JsonFile, parse_lengths, parse_names, progress_bar, show
-from dpm2_core.console import Console
+from dpm2_core.commands.options import JsonFile, parse_lengths, parse_names, show
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable

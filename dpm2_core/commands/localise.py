@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.commands.options import progress_bar
-from dpm2_core.console import Console
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import State

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several commands have in common: options, and the progress bar."""
+"""What several commands have in common: options, and how they show what they found."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.console import Console
 from dpm2_core.errors import UsageError, exit_code
@@ -74,30 +73,3 @@ def run_command(command: Callable[..., int | None]) -> int:
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(command)
     return exit_code(lambda: app(standalone_mode=False))
-
-
-class Lines(Progress):
-    """Progress where no terminal is: a line each tenth of the way, so that a log shows it."""
-
-    def update(self, task_id: TaskID, **fields: Any) -> None:
-        """As rich's."""
-        before = self._tasks[task_id].percentage // 10
-        super().update(task_id, **fields)
-        task = self._tasks[task_id]
-        if task.total and task.percentage // 10 > before:
-            left = task.time_remaining
-            when = f", {left:.0f} s left" if left else ""
-            self.console.print(f"{task.description}: {task.completed:.0f}/{task.total:.0f}{when}", soft_wrap=True)
-
-    def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """As rich's."""
-        self.update(task_id, advance=advance)
-
-
-def progress_bar(console: Console | None = None) -> Progress:
-    """A bar with a description, the count and the time left; on stderr by default. Lines where that is no terminal."""
-    console = console or Console(stderr=True)
-    if not console.is_terminal:
-        return Lines(console=console, disable=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console)

@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.localise import parse_hint, run_localized
-from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, progress_bar, show
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, show
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source, parse_range
 from dpm2_core.errors import Dpm2Error, UsageError

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, note, parse_names, progress_bar, show
+from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, note, parse_names, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, say_learned, train
 from dpm2_core.config import load_settings
+from dpm2_core.console import progress_bar
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
 

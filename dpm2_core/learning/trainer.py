@@ -16,11 +16,11 @@ from typing import Any, Literal
 
 import torch
 from pydantic import Field
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from dpm2_core.config import Settings
+from dpm2_core.console import QUIET, progress_bar
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.checkpoint import CHECKPOINT, Log, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
@@ -76,7 +76,8 @@ def keep_memory() -> None:
 
 @contextmanager
 def process_group() -> Iterator[tuple[int, int, torch.device]]:
-    """Rank, world size and device of this process; joins the group when started by torchrun."""
+    """Rank, world size and device of this process; joins the group when started by torchrun, where the first one alone
+    shows its progress."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     cuda = torch.cuda.is_available()
     device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if cuda else torch.device("cpu")
@@ -86,8 +87,11 @@ def process_group() -> Iterator[tuple[int, int, torch.device]]:
         yield 0, 1, device
         return
     torch.distributed.init_process_group("nccl" if cuda else "gloo")
+    rank = torch.distributed.get_rank()
+    if rank:
+        QUIET.set(True)
     try:
-        yield torch.distributed.get_rank(), world, device
+        yield rank, world, device
     finally:
         torch.distributed.destroy_process_group()
 
@@ -176,8 +180,7 @@ class Trainer:
                 wrapped.compile(dynamic=False)
             log = Log(self.out, start) if rank == 0 else None
             skipped = 0  # steps in a row without a finite gradient
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-            with Progress(*columns, disable=rank != 0) as progress:
+            with progress_bar() as progress:
                 task = progress.add_task("training", total=self.settings.steps, completed=start)
                 for step in steps:
                     begin = time.perf_counter()

@@ -20,8 +20,7 @@ import pytest
 from typer.core import TyperCommand, TyperGroup
 
 from dpm2_core.cli import COMMANDS, GROUPS, load_command
-from dpm2_core.commands.options import progress_bar
-from dpm2_core.console import Console
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import exit_code
 from dpm2_core.geometry import se3

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -20,6 +21,7 @@ from typer.testing import CliRunner
 
 from dpm2_core.cli import app
 from dpm2_core.config import merged, settings_from
+from dpm2_core.console import QUIET
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.augment import AugmentSettings
@@ -152,6 +154,33 @@ def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
     with pytest.raises(Dpm2Error, match="diverged: no finite gradient since step 7 of 400"):
         Trainer(Diverging(2, 1), batches, steps, tmp_path, saved.append).run()
     assert not saved
+
+
+def test_the_progress_of_a_training_is_that_of_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On stderr, without a terminal in lines, and not with --quiet; it was a bar among the results, whatever was asked
+    for."""
+
+    class Line(torch.nn.Linear):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss = super().forward(x).sum() ** 2
+            return loss, {"loss": loss.detach()}
+
+    def shown(quiet: bool) -> tuple[str, list[str]]:
+        token = QUIET.set(quiet)
+        try:
+            steps = OptimizerSettings(steps=20, compile=False, bf16=False)
+            Trainer(Line(2, 1), lambda *_: repeat((torch.ones(2),)), steps, tmp_path / str(quiet), lambda m: None).run()
+        finally:
+            QUIET.reset(token)
+        out, err = capsys.readouterr()
+        return out, err.splitlines()
+
+    out, lines = shown(quiet=False)
+    assert (out, len(lines)) == ("", 10)
+    assert re.fullmatch(r"loss \d+\.\d{3}: 2/20(, \d+ s left)?", lines[0])
+    assert shown(quiet=True) == ("", [])
 
 
 def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None:
