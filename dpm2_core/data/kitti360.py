@@ -63,8 +63,7 @@ class SweptDrive:
         """(len,) ns; line k of timestamps.txt is of scan k."""
         lines = read_lines(path)
         if len(lines) <= self.numbers[-1]:
-            self.notes.append(f"{path}: missing or too short; frames are taken to be {_PERIOD} s apart")
-            return np.round(self.numbers * _PERIOD * 1e9).astype(np.int64)
+            return self._settings.steady_stamps(self.numbers, f"{path}: missing or too short", self.notes)
         return np.array([_stamp(lines[number], f"{path}:{number + 1}") for number in self.numbers], np.int64)
 
     def _image_size(self) -> tuple[int, int] | None:

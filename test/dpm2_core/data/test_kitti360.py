@@ -95,6 +95,15 @@ def test_frames(root: Path) -> None:
     assert next(open_source(root, InputSettings(images=False)).frames()).images == ()
 
 
+def test_without_timestamps_scans_are_as_far_apart_as_of_every_folder(root: Path) -> None:
+    """`input.period` was of no use here."""
+    (root / "data_3d_raw" / DRIVE / "velodyne_points" / "timestamps.txt").unlink()
+    for settings, period in ((InputSettings(), 100_000_000), (InputSettings(period=0.5), 500_000_000)):
+        source = open_source(root, settings)
+        assert list(source.stamps) == [number * period for number in source.numbers]
+        assert any(f"{period * 1e-9:g} s apart (input.period)" in note for note in source.notes)
+
+
 def test_the_lidar_turns_clockwise_from_behind() -> None:
     """Forward is now, left was a quarter of a turn earlier; it was later, which doubled the distortion of a scan."""
     points = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]], np.float32)
