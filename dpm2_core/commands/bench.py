@@ -36,22 +36,17 @@ def bench(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
     ] = None,
-    weights: Annotated[
-        str | None, typer.Option(help="neural, traffic: shipped weights, or a .safetensors file.")
-    ] = None,
+    weights: Annotated[str | None, typer.Option(help="Of the network: a name or a .safetensors file.")] = None,
     unseen: Annotated[
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
-    pairs: Annotated[
-        int | None,
-        typer.Option(min=1, help="covariance, finetune, neural, tilt: pairs of each kind; relocalise: visits [60]."),
-    ] = None,
-    only: Annotated[
-        str | None,
-        typer.Option(help="finetune, fleet, neural, traffic: this part alone; else those that NAME.json lacks."),
-    ] = None,
+    pairs: Annotated[int | None, typer.Option(min=1, help="Of each kind; of relocalise: visits [60].")] = None,
+    only: Annotated[str | None, typer.Option(help="This part alone, of a benchmark that has several.")] = None,
 ) -> None:
-    """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network."""
+    """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.
+
+    An option that a benchmark has no use for is an error, which names those that it has.
+    """
     _find_benchmarks()
     from benchmarks import BENCHES, check_options  # imports the whole SLAM
     from benchmarks.harness import Options, write_report
