@@ -32,13 +32,12 @@ from benchmarks.loops import error_of
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.pipeline import OfflineRun
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import DriveConfig, LidarConfig, PresetName
-from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.tables import FigureTable
 
 WORLDS: dict[str, tuple[PresetName, int, int]] = {
@@ -79,24 +78,20 @@ def bench_indoor(options: Options) -> Report:
 def _drive(path: Path, settings: SlamSettings, progress: Progress, name: str) -> tuple[dict[str, Any], Mapper]:
     source = KittiSource(path, InputSettings(images=False))
     assert source.poses is not None
-    slam, recorder, failed = make_slam(settings), TrajectoryRecorder(), 0
     task = progress.add_task(name, total=len(source))
-    for frame in source.frames():
-        tracked = slam.process(frame).odometry
-        recorder.add(tracked)
-        failed += not tracked.registration.ok
-        progress.advance(task)
-    mapper = slam.mapper
-    alone = recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes]))
+    with OfflineRun(source, Config(slam=settings)) as run:
+        result = run.run(lambda _: progress.advance(task))
+    mapper = result.mapper
+    alone = result.recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes]))
     errors = {"odometry": evaluate(source.poses, alone, LENGTHS),
-              "slam": evaluate(source.poses, recorder.poses(mapper.poses), LENGTHS)}  # fmt: skip
+              "slam": evaluate(source.poses, result.poses, LENGTHS)}  # fmt: skip
     truth = source.poses[[k.index for k in mapper.keyframes]]
     loops = [loop for loop in mapper.loops if loop.ok]
     return {
-        "preset": slam.odometry.scale,
+        "preset": run.slam.odometry.scale,
         "frames": len(source),
-        "failed_frames": failed,
-        "breaks": recorder.breaks,
+        "failed_frames": result.methods["failed"],
+        "breaks": result.recorder.breaks,
         "path_length_m": errors["slam"].path_length_m,
         **{kind: {"t_err_percent": m.t_err_percent, "ape_rmse_m": m.ape_rmse_m} for kind, m in errors.items()},
         "keyframes": len(mapper.keyframes),

@@ -15,11 +15,10 @@ from benchmarks.harness import Options, Report, settings_of
 from benchmarks.loops import check_loops
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.pipeline import OfflineRun
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
-from dpm2_core.slam.build import make_slam
-from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.tables import FigureTable
 
 ROADS: dict[str, PresetName] = {
@@ -56,18 +55,13 @@ def open_road(path: Path) -> SimulatedDrive:
 def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, Any]:
     """One road: metrics of odometry alone and of the SLAM, and its loops."""
     source = open_road(path)
-    slam, recorder = make_slam(settings), TrajectoryRecorder()
     task = progress.add_task(path.stem, total=len(source))
-    failed = 0
-    for frame in source.frames():
-        tracked = slam.process(frame).odometry
-        recorder.add(tracked)
-        failed += not tracked.registration.ok
-        progress.advance(task)
-    mapper = slam.mapper
+    with OfflineRun(source, Config(slam=settings)) as run:
+        result = run.run(lambda _: progress.advance(task))
+    mapper, failed = result.mapper, result.methods["failed"]
     keyframes = np.array([k.index for k in mapper.keyframes])
-    alone = evaluate(source.poses, recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes])))
-    corrected = evaluate(source.poses, recorder.poses(mapper.poses), failed_frames=failed)
+    alone = evaluate(source.poses, result.recorder.poses(np.array([k.T_odom_kf for k in mapper.keyframes])))
+    corrected = evaluate(source.poses, result.poses, failed_frames=failed)
     return {
         "frames": len(source),
         "path_length_m": corrected.path_length_m,
