@@ -5,7 +5,7 @@ and measured on the same unseen pairs."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from statistics import mean
@@ -66,11 +66,7 @@ Table = dict[str, dict[str, dict[str, list[float]]]]
 """Figures of `PairSet.measure` by variant and drives: one of each seed."""
 
 
-def ablation(
-    settings: AblationSettings,
-    out: Path,
-    progress: Callable[[str, int, dict[str, Any]], None] = lambda name, seed, row: None,
-) -> Table:
+def ablation(settings: AblationSettings, out: Path) -> Table:
     """Train and measure every variant; what was trained or measured alike before, in `out`, is not done again.
 
     All variants of a seed are trained before the next seed, so that what is stopped has compared something.
@@ -78,11 +74,9 @@ def ablation(
     table: Table = {name: {drives: {} for drives in settings.measure} for name in settings.variants}
     for seed in range(settings.seeds):
         for name in settings.variants:
-            measured = _measured(settings, name, seed, out)
-            for drives, figures in measured.items():
+            for drives, figures in _measured(settings, name, seed, out).items():
                 for figure, value in figures.items():
                     table[name][drives].setdefault(figure, []).append(value)
-            progress(name, seed, measured)
     return table
 
 
