@@ -65,19 +65,15 @@ def _with(frames: Sequence[Frame], truth: Array, wrong: tuple[float, float, int]
 
 
 def _drive(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
-    slam, poses, failed, used = make_slam(settings), list[Array](), 0, 0
-    for frame in frames:
-        tracked = slam.process(frame).odometry
-        poses.append(tracked.T_odom_lidar)
-        failed += not tracked.registration.ok
-        used += tracked.comparison is not None and tracked.comparison.used
+    slam = make_slam(settings)
+    tracked = [slam.process(frame).odometry for frame in frames]
     slam.finish()
     mapper = slam.mapper
     of = [keyframe.index for keyframe in mapper.keyframes]
     return {
-        "failed_frames": failed,
-        "frames_led": used,
-        "ape_rmse_m": ape_rmse(truth, np.array(poses)),
+        "failed_frames": sum(not one.registration.ok for one in tracked),
+        "frames_led": sum(one.comparison is not None and one.comparison.used for one in tracked),
+        "ape_rmse_m": ape_rmse(truth, np.array([one.T_odom_lidar for one in tracked])),
         "map_ape_rmse_m": ape_rmse(truth[of], np.array(mapper.poses)),
         "keyframes": len(of),
         "loops": sum(loop.ok for loop in mapper.loops),

@@ -67,20 +67,16 @@ def bench_imu(options: Options) -> Report:
 
 
 def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
-    odometry, poses, failed, of_use = make_odometry(settings), list[Array](), 0, 0
-    for frame in frames:
-        tracked = odometry.process(frame)
-        poses.append(tracked.T_odom_lidar)
-        failed += not tracked.registration.ok
-        of_use += tracked.imu == ""
-    found = evaluate(truth, np.array(poses), LENGTHS)
+    tracked = list(map(make_odometry(settings).process, frames))
+    poses = np.array([one.T_odom_lidar for one in tracked])
+    found = evaluate(truth, poses, LENGTHS)
     return {
-        "failed_frames": failed,
-        "frames_with_imu": of_use,
+        "failed_frames": sum(not one.registration.ok for one in tracked),
+        "frames_with_imu": sum(one.imu == "" for one in tracked),
         "ape_rmse_m": found.ape_rmse_m,
         "t_err_percent": found.t_err_percent,
         "rpe_rot_deg": found.rpe_rot_deg,
-        "worst_tilt_deg": float(_tilt(np.array(poses), truth).max()),
+        "worst_tilt_deg": float(_tilt(poses, truth).max()),
     }
 
 

@@ -57,12 +57,9 @@ def bench_motion(options: Options) -> Report:
 
 
 def _ours(frames: Iterable[Frame], robot: TurningRobot, settings: SlamSettings) -> dict[str, Any]:
-    odometry, failed, poses = make_odometry(settings), 0, list[Array]()
-    for frame in frames:
-        tracked = odometry.process(frame)
-        poses.append(tracked.T_odom_lidar)
-        failed += not tracked.registration.ok
-    return {**_errors(np.array(poses), robot.poses), "failed_frames": failed}
+    tracked = list(map(make_odometry(settings).process, frames))
+    failed = sum(not one.registration.ok for one in tracked)
+    return {**_errors(np.array([one.T_odom_lidar for one in tracked]), robot.poses), "failed_frames": failed}
 
 
 def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[str, Any] | None:
