@@ -84,7 +84,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
         key = key.strip()
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
-        put(kind, tree, key.split("."), _value(text))
+        put(kind, tree, key.split("."), value_of(text))
         origin.pop(key, None)  # the last one is to blame
         origin[key] = f"--set {setting}"
     return settings_from(kind, tree, origin, str(path) if path else "configuration")
@@ -169,7 +169,7 @@ def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, F
             yield prefix + name, info
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
     """The value of a setting, YAML; invalid YAML is taken as a string; so is 04, a KITTI sequence, not octal 4."""
     try:
         return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)

@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from dpm2_core.config import Settings, settings_from
+from dpm2_core.config import Settings, settings_from, value_of
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
@@ -218,9 +217,6 @@ def parse_corruption(text: str) -> CorruptionSettings:
         key, equals, value = (piece.strip() for piece in part.partition("="))
         if not (key and equals and value):
             raise UsageError(f"--corrupt {text}: want NAME=VALUE,..., such as camera=0.3,seed=1")
-        try:
-            tree[key] = yaml.safe_load(value)
-        except (yaml.YAMLError, ValueError):
-            tree[key] = value
+        tree[key] = value_of(value)
         origin[key] = f"--corrupt {part.strip()}"
     return settings_from(CorruptionSettings, tree, origin, "--corrupt")
