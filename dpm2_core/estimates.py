@@ -94,11 +94,14 @@ class Keyframe:
     Attributes:
         id: count within its robot. robot: namespace, "" for the only one. stamp: ns. index: `Frame.index`.
         T_odom_kf: (4, 4) pose when it was made, in the odometry frame; the pose graph holds the optimized one.
-        cloud: (M, 4) float32 sub-sampled points in its own LiDAR frame: the map and later refinement.
+        cloud: (M, 4) float32 sub-sampled points in its own frame, that of the LiDAR or of the base: the map and later
+            refinement.
         edge: registration of this keyframe to the one before, T_before_this; None for the first.
         descriptors: neural ones, in its own LiDAR frame; None where the registration makes none.
         thumbnail: JPEG for the map file, or None.
         fix: the last one on the way here from the keyframe before, or None.
+        origin: (3,) m, where in its own frame the LiDAR was, of several the first: from there `cloud` was seen. It goes
+            with the cloud, also into the map file.
     """
 
     id: int
@@ -111,6 +114,7 @@ class Keyframe:
     descriptors: Descriptors | None = None
     thumbnail: bytes | None = None
     fix: Fix | None = None
+    origin: Array = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

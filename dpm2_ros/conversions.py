@@ -191,7 +191,7 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
 
 
 def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-    """The same place seen from the base: its pose, cloud, descriptors, edge, fix and picture."""
+    """The same place seen from the base: its pose, cloud and LiDAR, descriptors, edge, fix and picture."""
     edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
     if edge is not None:
         T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
@@ -206,6 +206,7 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         thumbnail=None if picture is None else moved_thumbnail(picture, T_base_lidar),
         T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
         cloud=se3.transform(T_base_lidar, keyframe.cloud),
+        origin=T_base_lidar[:3, :3] @ keyframe.origin + T_base_lidar[:3, 3],
         edge=edge,
         descriptors=None if keyframe.descriptors is None else keyframe.descriptors.moved(T_base_lidar),
     )

@@ -22,7 +22,7 @@ from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import NO_POINTS
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
-from dpm2_core.slam.store.cloud_codec import CodecError, unpack_cloud
+from dpm2_core.slam.store.cloud_codec import CodecError, origin_of, unpack_cloud
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_messages import BUDGET, WIRE, descriptors_from_msg, payload_from_msg, received_to_msg
@@ -255,10 +255,8 @@ class Feed:
         stream.taken += 1
         assert parts.cloud is not None
         packed, fix, thumbnail = parts.cloud
-        stream.given(
-            id,
-            self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed), fix=fix, thumbnail=thumbnail)),
-        )
+        keyframe = replace(keyframe, origin=origin_of(packed), fix=fix, thumbnail=thumbnail)
+        stream.given(id, self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed))))
 
     def _acknowledge(self, stream: Stream, now: float) -> None:
         if stream.session:

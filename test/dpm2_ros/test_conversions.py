@@ -167,6 +167,7 @@ def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray) -> None:
     assert seen.edge is not None
     assert seen.fix is not None
     np.testing.assert_allclose(seen.fix.antenna, seen.cloud[0, :3], atol=1e-5)
+    np.testing.assert_allclose(seen.origin, T_base_lidar[:3, 3], atol=EXACT)
     in_odom = seen.T_odom_kf @ np.append(seen.cloud[0, :3].astype(float), 1)
     expected = T_base_lidar @ T_odom_lidar @ np.append(cloud[0, :3].astype(float), 1)
     np.testing.assert_allclose(in_odom, expected, atol=1e-5)  # the cloud is float32

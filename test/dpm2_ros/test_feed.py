@@ -37,7 +37,7 @@ DRIVE, NEXT = "0123abcd", "89ab0123"  # sessions
 
 def keyframe(id: int) -> Keyframe:
     points = np.random.default_rng(id).uniform(0, 20, (100, 4)).astype(np.float32)
-    return Keyframe(id, 1000 + id, id, np.eye(4), points)
+    return Keyframe(id, 1000 + id, id, np.eye(4), points, origin=np.array([0.5, 0.0, 1.5]))
 
 
 class Node(GuardedNode):
@@ -111,6 +111,9 @@ def test_what_has_arrived_reaches_the_map(robot: Robot) -> None:
     robot.wait(DRIVE, COUNT)
     robot.harness.remove(robot.node)
     assert robot.stored == COUNT + 1
+    (path,) = robot.folder.glob("*.dpm2map")
+    with MapStore.open(path) as store:
+        assert load_map(store).clouds.origin(COUNT).tolist() == [0.5, 0, 1.5]
 
 
 def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:

@@ -15,7 +15,7 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Fix
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_core.slam.store.cloud_codec import unpack_cloud
+from dpm2_core.slam.store.cloud_codec import origin_of, unpack_cloud
 from dpm2_ros.keyframe_messages import (
     BUDGET,
     descriptors_from_msg,
@@ -36,10 +36,12 @@ def keyframe(noise: np.random.Generator, fix: Fix | None, picture: bytes | None,
 
 @pytest.mark.parametrize("fixed", [True, False])
 @pytest.mark.parametrize("pictured", [True, False])
-def test_fix_and_thumbnail_travel_with_the_cloud(noise: np.random.Generator, fixed: bool, pictured: bool) -> None:
+def test_fix_thumbnail_and_origin_travel_with_the_cloud(
+    noise: np.random.Generator, fixed: bool, pictured: bool
+) -> None:
     """Within the budget, whatever of them there is: the cloud gives way."""
     picture = thumbnail(make_image(noise), 200) if pictured else None
-    sent = keyframe(noise, FIX if fixed else None, picture, 100_000)
+    sent = replace(keyframe(noise, FIX if fixed else None, picture, 100_000), origin=np.array([1.0, 0, 1.75]))
     payload = payload_from_msg(payload_to_msgs(sent, "a/3")[1])
     assert payload.thumbnail == picture
     assert (payload.fix is None) == (not fixed)
@@ -48,6 +50,7 @@ def test_fix_and_thumbnail_travel_with_the_cloud(noise: np.random.Generator, fix
         for name in ("geodetic", "covariance", "antenna"):
             np.testing.assert_array_equal(getattr(payload.fix, name), getattr(FIX, name))
     assert 1000 < len(unpack_cloud(payload.cloud)) < 100_000
+    assert origin_of(payload.cloud).tolist() == [1, 0, 1.75]
     assert len(payload.cloud) + len(picture or b"") < BUDGET
 
 

@@ -43,6 +43,8 @@ def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
         raise RejectedError("id", f"keyframe {keyframe.id}: want an id from 0 to {MAX_ID}")
     check_pose(keyframe.T_odom_kf)
     check_cloud(keyframe.cloud)
+    if not np.abs(keyframe.origin).max() <= _REACH:  # false for NaN
+        raise RejectedError("cloud", f"its cloud is seen from {keyframe.origin.tolist()} m")
     if keyframe.edge is not None:
         check_covariance(keyframe.edge.covariance)
     if keyframe.descriptors is not None:

@@ -181,12 +181,13 @@ class Mapper:
         """
         check_keyframe(keyframe, self._closer.channels)
         node, cloud, thumbnail, way = len(self.keyframes), keyframe.cloud, keyframe.thumbnail, keyframe.edge
+        origin = keyframe.origin
         robot = self._robot(keyframe.robot)
         follows = robot.last is not None and way is not None
         offset = robot.offset if follows else robot.ids
         keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
-        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None)
-        packed = pack_cloud(cloud)
+        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None, origin=np.zeros(3))
+        packed = pack_cloud(cloud, origin)
         to_before = self._add_node(keyframe, way, robot.last if follows else None)
         self._clouds.append(packed)
         self.keyframes.append(keyframe)
@@ -198,7 +199,7 @@ class Mapper:
             if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
                 self._mark_moving(robot.window.finish(self.poses))
                 robot.window = MovingWindow(self._settings.moving)
-            self._mark_moving(robot.window.add(node, cloud, self.poses))
+            self._mark_moving(robot.window.add(node, cloud, self.poses, origin))
         finally:
             self._store(node, thumbnail, [*to_before, *self.loops[before:]])
         return self.loops[before:]
@@ -238,7 +239,7 @@ class Mapper:
         """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
         if not self.keyframes:
             return True
-        return grid.update(self._clouds, self.poses, self._clouds.version, seconds, self.placed)
+        return grid.update(self._clouds, self.poses, self._clouds.version, seconds, self.placed, self._clouds.origin)
 
     def write_g2o(self, path: Path) -> None:
         """The pose graph as a g2o file."""

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
@@ -81,7 +81,7 @@ def find_moving(
     """Which of the (M, 4) points of a keyframe belong to moving things.
 
     Args:
-        cloud: in the keyframe's frame. T_map_kf: (4, 4).
+        cloud: in the keyframe's frame, whose origin is the LiDAR. T_map_kf: (4, 4).
         others: range image and T_map_kf of its witnesses.
 
     Returns:
@@ -115,16 +115,20 @@ class MovingWindow:
 
     def __init__(self, settings: MovingSettings) -> None:
         self._settings = settings
-        self._seen: deque[tuple[int, Points, RangeImage]] = deque(maxlen=2 * settings.window + 1)
+        self._seen: deque[tuple[int, Points, RangeImage, Array]] = deque(maxlen=2 * settings.window + 1)
         self._next = 0  # the first node that has not been checked
 
-    def add(self, node: int, cloud: Points, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    def add(
+        self, node: int, cloud: Points, poses: Array, origin: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Take in the whole cloud (M, 4) of the next node; yields the node that can be checked now, and its mask.
 
-        `poses` (N, 4, 4) are T_map_kf of all nodes so far.
+        `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is where in its frame the LiDAR was.
         """
         if self._settings.window:
-            self._seen.append((node, cloud, RangeImage(cloud)))
+            T_kf_lidar = se3.make(np.eye(3), origin)
+            cloud = se3.transform(se3.inverse(T_kf_lidar), cloud)
+            self._seen.append((node, cloud, RangeImage(cloud), T_kf_lidar))
             if len(self._seen) > self._settings.window:
                 yield from self._compare(self._seen[-1 - self._settings.window][0], poses)
 
@@ -134,10 +138,10 @@ class MovingWindow:
             yield from self._compare(self._seen[-1][0], poses)
 
     def _compare(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        for node, cloud, _ in self._seen:
+        for node, cloud, _, T_kf_lidar in self._seen:
             if self._next <= node <= last:
-                others = [(image, poses[n]) for n, _, image in self._seen if n != node]
-                yield node, find_moving(cloud, poses[node], others, self._settings)
+                others = [(image, poses[n] @ T) for n, _, image, T in self._seen if n != node]
+                yield node, find_moving(cloud, poses[node] @ T_kf_lidar, others, self._settings)
                 self._next = node + 1
 
 

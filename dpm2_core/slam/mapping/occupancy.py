@@ -7,7 +7,7 @@ occupied where more keyframes see something standing in it than see through it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,15 @@ _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that m
 _OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
 
 
-def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySettings) -> Grid:
+def occupancy_grid(
+    clouds: Sequence[Points],
+    poses: Array,
+    settings: OccupancySettings,
+    origin: Callable[[int], Array] = lambda node: np.zeros(3),
+) -> Grid:
     """The grid of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf.
+
+    `origin`: (3,) m, where in its own frame the LiDAR of each was.
 
     Raises:
         Dpm2Error: it would be too large.
@@ -36,7 +43,7 @@ def occupancy_grid(clouds: Sequence[Points], poses: Array, settings: OccupancySe
     if shape.prod() > _MOST:
         raise Dpm2Error(f"an occupancy grid of {shape[0]:.0f} by {shape[1]:.0f} cells: choose a larger --resolution")
     whole = OccupancyMap(settings, 2 * _MOST)
-    whole.update(clouds, poses)
+    whole.update(clouds, poses, origin=origin)
     return whole.grid()
 
 

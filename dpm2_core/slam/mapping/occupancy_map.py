@@ -39,7 +39,7 @@ class OccupancySettings(Settings):
     highest: float = 2.0
     """Points higher above the ground than this are no obstacle, m; above `lowest`."""
     reach: float = Field(30.0, gt=0, le=1000)
-    """Points farther from the sensor than this are not used, m."""
+    """Points farther from the robot than this are not used, m."""
 
     @model_validator(mode="after")
     def _ordered(self) -> OccupancySettings:
@@ -59,27 +59,32 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """What a keyframe sees around it, along the axes of the map while its heading is `yaw` (rad).
+    """What a keyframe sees around its LiDAR, along the axes of the map while its heading is `yaw` (rad).
 
     Attributes:
+        origin: (2,) m, where the LiDAR is beside the keyframe.
         free: (720,) m that each direction is free. stands: (K, 2) m, places where something stands.
     """
 
     yaw: float
+    origin: Array
     free: NDArray[np.float32]
     stands: NDArray[np.float32]
 
 
-def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings) -> Fan:
-    """Of a cloud (M, 4) in the keyframe's frame, at T_map_kf (4, 4)."""
+def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: Array) -> Fan:
+    """Of a cloud (M, 4) that was seen from `lidar` (3,), in the keyframe's frame, at T_map_kf (4, 4).
+
+    All of it is within `reach` of the keyframe: empty, if the LiDAR is not.
+    """
     near = np.einsum("ij,ij->i", cloud[:, :2], cloud[:, :2]) < settings.reach**2
     points = np.asarray(se3.transform(T_map_kf, cloud[near].astype(np.float64)), np.float64)
-    yaw, size = _yaw(T_map_kf), settings.resolution
-    if not len(points):
-        return Fan(yaw, np.zeros(_DIRECTIONS, np.float32), np.zeros((0, 2), np.float32))
+    yaw, size, origin = _yaw(T_map_kf), settings.resolution, T_map_kf[:2, :3] @ lidar
+    if not len(points) or np.linalg.norm(lidar[:2]) > settings.reach:
+        return Fan(yaw, np.zeros(2), np.zeros(_DIRECTIONS, np.float32), np.zeros((0, 2), np.float32))
     height = points[:, 2] - ground_below(points[:, :3])
     stands, ground = (height > settings.lowest) & (height < settings.highest), height < settings.lowest
-    away = points[:, :2] - T_map_kf[:2, 3]
+    away = points[:, :2] - T_map_kf[:2, 3] - origin
     distance = np.linalg.norm(away, axis=1)
     direction = ((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * _DIRECTIONS).astype(np.intp) % _DIRECTIONS
     blocked, seen = np.full(_DIRECTIONS, np.inf), np.zeros(_DIRECTIONS)
@@ -88,7 +93,7 @@ def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings) -> Fan:
     # To the farthest ground, but not beyond an obstacle; one is seen as well as the ground before it.
     seen = np.where(np.isfinite(blocked), np.minimum(np.maximum(seen, blocked), blocked - size), seen)
     cells = np.unique(np.floor(away[stands] / (size / 2)).astype(np.int64), axis=0)
-    return Fan(yaw, seen.astype(np.float32), ((cells + 0.5) * (size / 2)).astype(np.float32))
+    return Fan(yaw, origin, seen.astype(np.float32), ((cells + 0.5) * (size / 2)).astype(np.float32))
 
 
 @dataclass(eq=False)
@@ -122,6 +127,7 @@ class OccupancyMap:
         version: Callable[[int], object] = lambda node: None,
         seconds: float = np.inf,
         placed: NDArray[np.bool_] | None = None,
+        origin: Callable[[int], Array] = lambda node: np.zeros(3),
     ) -> bool:
         """Bring it up to date, the newest keyframes first; False if there is more to do than `seconds` allow.
 
@@ -129,6 +135,7 @@ class OccupancyMap:
             clouds: (M, 4) each, in its own frame, at `poses` (N, 4, 4) T_map_kf.
             version: another object once a cloud is another one.
             placed: (N,) which of them are drawn, at least one; None: all.
+            origin: (3,) m, where in its own frame the LiDAR of each was.
         """
         end = time.monotonic() + seconds
         placed = np.ones(len(poses), np.bool_) if placed is None else placed
@@ -143,7 +150,8 @@ class OccupancyMap:
                 return False
             self._take_back(node)
             if entry is None or entry.version is not now:
-                entry = self._entries[node] = _Entry(fan_of(clouds[node], poses[node], self._settings), now)
+                fan = fan_of(clouds[node], poses[node], self._settings, origin(node))
+                entry = self._entries[node] = _Entry(fan, now)
             entry.T = poses[node].copy()
             self._draw(entry.fan, entry.T, 1)
         self._before = None
@@ -216,8 +224,9 @@ class OccupancyMap:
         return meters + turn * self._settings.reach / 2 < self._size / 2
 
     def _draw(self, fan: Fan, T: Array, sign: int) -> None:
-        low, (x, y) = self._low * self._size, T[:2, 3].tolist()
         turn = _yaw(T) - fan.yaw
+        cos, sin = np.cos(turn), np.sin(turn)
+        low, (x, y) = self._low * self._size, (T[:2, 3] + [[cos, -sin], [sin, cos]] @ fan.origin).tolist()
         _draw_fan(self._hits, self._seen, x - low[0], y - low[1], turn, self._size, fan.free, fan.stands, sign)
 
 

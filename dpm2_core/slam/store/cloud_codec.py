@@ -4,6 +4,8 @@
 A keyframe cloud of 18 thousand points takes 64 kB instead of 280: 3.6 bytes per point. Points keep their order, in
 which neighbors of a LiDAR's beam follow each other; that is what makes the differences small.
 
+Where the LiDAR was goes with its cloud, unless that is the origin of the cloud's frame: rays are cast from there.
+
 What is unpacked comes from a file or over a network: its size is bounded before it is inflated.
 """
 
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Points
+from dpm2_core.frame import Array, Points
 
 QUANTUM = 0.01
 """Step of the coordinates, m: half the noise of a good LiDAR, so that the rounding (sigma 3 mm) is lost in it."""
@@ -26,6 +28,7 @@ _FINEST = 1e-4
 MAX_POINTS = 1 << 21
 """Of one cloud: eight sensors with 128 beams of 2,048 points together."""
 _HEADER = struct.Struct("<If")  # points, quantum
+_ORIGIN, _ELSEWHERE = struct.Struct("<3f"), 1 << 31  # behind the header, where this bit of the points says so
 _BYTES = 7  # of a point, inflated
 _LARGEST = 32767
 
@@ -34,11 +37,14 @@ class CodecError(UsageError, ValueError):
     """Bytes that are not what they should be, or a cloud that cannot be packed; one line."""
 
 
-def pack_cloud(points: Points) -> bytes:
+def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
     """(M, 4) [x, y, z in m, intensity 0..1] as bytes; what reaches beyond 327 m is rounded more coarsely.
 
+    Args:
+        origin: (3,) m, where in the same frame the LiDAR was; None: at its origin.
+
     Raises:
-        CodecError: values that are not finite, points beyond 32 km, or more than `MAX_POINTS`.
+        CodecError: values that are not finite, points or LiDAR beyond 32 km, or more than `MAX_POINTS`.
     """
     if not np.isfinite(points).all():
         raise CodecError("a cloud with coordinates that are not finite")
@@ -46,12 +52,18 @@ def pack_cloud(points: Points) -> bytes:
     quantum = float(np.float32(max(QUANTUM, reach * 1.0001 / _LARGEST)))
     if quantum > COARSEST or len(points) > MAX_POINTS:
         raise CodecError(f"a cloud of {len(points)} points that reaches {reach:.0f} m: too large")
+    seen_from = [0.0] * 3 if origin is None else origin.tolist()
+    if not np.abs(seen_from).max() <= _LARGEST:
+        raise CodecError(f"a cloud seen from {seen_from} m: too far away")
     steps = np.rint(points[:, :3].astype(np.float64) / quantum).astype(np.int64)
     # Differences wrap around at 16 bits, and unwrap when they are summed at 16 bits.
     delta = np.diff(steps, axis=0, prepend=0).astype("<i2")
     planes = np.ascontiguousarray(delta.T).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)  # low bytes, high bytes
     intensity = np.rint(np.clip(points[:, 3], 0, 1) * 255).astype(np.uint8)
-    return _HEADER.pack(len(points), quantum) + zlib.compress(planes.tobytes() + intensity.tobytes(), 4)
+    head = _HEADER.pack(len(points), quantum)
+    if any(seen_from):
+        head = _HEADER.pack(len(points) | _ELSEWHERE, quantum) + _ORIGIN.pack(*seen_from)
+    return head + zlib.compress(planes.tobytes() + intensity.tobytes(), 4)
 
 
 def unpack_cloud(data: bytes) -> Points:
@@ -60,20 +72,43 @@ def unpack_cloud(data: bytes) -> Points:
     Raises:
         CodecError: the bytes are not a packed cloud.
     """
-    if len(data) < _HEADER.size:
-        raise CodecError(f"not a packed cloud: {len(data)} bytes")
-    count, quantum = _HEADER.unpack_from(data)
+    count, quantum, _, deflated = _parts(data)
     if count > MAX_POINTS:
         raise CodecError(f"not a packed cloud: {count} points, at most {MAX_POINTS} are allowed")
     if not _FINEST <= quantum <= COARSEST:  # neither is NaN
         raise CodecError(f"not a packed cloud: a step of {quantum:g} m, {_FINEST:g} to {COARSEST:g} are allowed")
-    raw = _inflated(data[_HEADER.size :], _BYTES * count, f"packed cloud of {count} points")
+    raw = _inflated(deflated, _BYTES * count, f"packed cloud of {count} points")
     planes = np.frombuffer(raw, np.uint8, 6 * count).reshape(3, 2, count)
     delta = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i2")[..., 0]
     points = np.empty((count, 4), np.float32)
     points[:, :3] = np.cumsum(delta, axis=1, dtype=np.int16).T * np.float64(quantum)
     points[:, 3] = np.frombuffer(raw, np.uint8, count, 6 * count) * np.float32(1 / 255)
     return points
+
+
+def origin_of(data: bytes) -> Array:
+    """(3,) m, where the LiDAR of a packed cloud was, in the cloud's frame.
+
+    Raises:
+        CodecError: the bytes are not a packed cloud.
+    """
+    return _parts(data)[2]
+
+
+def _parts(data: bytes) -> tuple[int, float, Array, bytes]:
+    """How many points, their quantum, where the LiDAR was, and what is to be inflated."""
+    if len(data) < _HEADER.size:
+        raise CodecError(f"not a packed cloud: {len(data)} bytes")
+    count, quantum = _HEADER.unpack_from(data)
+    if not count & _ELSEWHERE:
+        return count, quantum, np.zeros(3), data[_HEADER.size :]
+    end = _HEADER.size + _ORIGIN.size
+    if len(data) < end:
+        raise CodecError(f"not a packed cloud: {len(data)} bytes")
+    origin = np.array(_ORIGIN.unpack_from(data, _HEADER.size))
+    if not np.abs(origin).max() <= _LARGEST:  # false for NaN
+        raise CodecError(f"not a packed cloud: seen from {origin.tolist()} m")
+    return count & ~_ELSEWHERE, quantum, origin, data[end:]
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> bytes:

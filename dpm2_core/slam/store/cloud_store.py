@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import NO_POINTS, Array, Points
 from dpm2_core.geometry import se3
-from dpm2_core.slam.store.cloud_codec import CodecError, pack_mask, unpack_cloud, unpack_mask
+from dpm2_core.slam.store.cloud_codec import CodecError, origin_of, pack_mask, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.lazy import LazySequence
 
 Reader = Callable[[int], bytes | None]
@@ -146,6 +146,18 @@ class CloudStore(LazySequence[Points]):
         data = self.packed(range(len(self))[index])
         with self._named(index):
             return NO_POINTS if data is None else unpack_cloud(data)
+
+    def origin(self, index: int) -> Array:
+        """(3,) m, where the LiDAR was, in the keyframe's frame; of a borrowed cloud the lender's.
+
+        Raises:
+            Dpm2Error: it is damaged.
+        """
+        if (loan := self._loans.get(index)) is not None:
+            return loan.T_kf_lender[:3, :3] @ self.origin(loan.lender) + loan.T_kf_lender[:3, 3]
+        data = self.packed(index)
+        with self._named(index):
+            return np.zeros(3) if data is None else origin_of(data)
 
     @contextmanager
     def _named(self, index: int) -> Iterator[None]:

@@ -17,8 +17,9 @@ from dpm2_core.errors import UsageError
 
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
-VERSION = 4
-"""In SQLite's user_version. Since 4 the features of descriptors are int8 (rows.py); the tables are those of 3."""
+VERSION = 5
+"""In SQLite's user_version. Since 4 the features of descriptors are int8 (rows.py), since 5 a cloud may say where the
+LiDAR was (cloud_codec.py); the tables are those of 3."""
 TABLES = 3
 """Version that introduced the tables as they are."""
 

@@ -21,10 +21,14 @@ from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
+from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.mapping.occupancy import occupancy_grid
 from dpm2_core.slam.mapping.occupancy_map import OCCUPIED, OccupancyMap, OccupancySettings
 from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.map_data import save_as
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_data import load_map, save_as, subset
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.fleets import fleet_maps
 
@@ -262,6 +266,37 @@ def test_a_robot_that_nothing_ties_is_not_drawn_into_the_map_of_another() -> Non
     assert mapper.placed.tolist() == [True, False, False]
     np.testing.assert_array_equal(grid.grid().cells, cells)
     np.testing.assert_array_equal(mapper.cloud(), cloud)
+
+
+def test_where_the_lidar_was_stays_with_its_cloud(tmp_path: Path) -> None:
+    """In the map file, and in what merging, copying in part and recovering make of it; the grid is seen from there."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-5, 5, 0.25), np.arange(-5, 5, 0.25)))
+    floor = np.column_stack([x + 2, y, np.full(len(x), -0.5), np.zeros(len(x))]).astype(np.float32)
+    off, mount = SlamSettings.model_validate({"loops": {"enabled": False}}), np.array([2.0, 0.0, 0.5])
+    with MapStore.create(tmp_path / "map") as store:
+        store.begin_session()
+        mapper, grid = make_mapper(off, store), OccupancyMap(OccupancySettings(), 10**7)
+        for number, keyframe in enumerate(drifting(circle(3), np.zeros(6), floor)):
+            mapper.add(replace(keyframe, origin=number * mount))
+        mapper.update_grid(grid, np.inf)
+        mapper.finish()
+        drawn = grid.grid()
+    assert check_map(tmp_path / "map", tmp_path / "recovered").problems == []
+    for path in (tmp_path / "map", tmp_path / "recovered"):
+        with MapStore.open(path) as store:
+            data = load_map(store)
+            for made in (data, merge_maps(data, data, np.eye(4)), subset(data, [0, 1, 2], data.edges, [])):
+                assert [made.clouds.origin(n).tolist() for n in range(3)] == [(n * mount).tolist() for n in range(3)]
+            seen = occupancy_grid(data.clouds, data.poses, OccupancySettings(), data.clouds.origin)
+            np.testing.assert_array_equal(seen.cells, drawn.cells)
+
+
+@pytest.mark.parametrize("origin", [[np.nan, 0.0, 0.0], [0.0, 0.0, 1e6]])
+def test_a_cloud_that_is_seen_from_nowhere_is_rejected(origin: list[float]) -> None:
+    mapper, keyframe = make_mapper(BY_POSE), drifting(circle(1), np.zeros(6), np.zeros((0, 4), np.float32))[0]
+    with pytest.raises(RejectedError, match="its cloud is seen from"):
+        mapper.add(replace(keyframe, origin=np.array(origin)))
+    assert not mapper.keyframes
 
 
 def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) -> None:

@@ -81,6 +81,40 @@ def test_each_keyframe_is_checked_once() -> None:
     assert list(off.add(0, scene(), poses)) == []
 
 
+def poles(at: float) -> Points:
+    """A yard of 20 m with rows of poles, nothing of which moves, as a LiDAR 2 m above ground sees it at x = `at`."""
+    angle, low = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), np.radians(np.arange(-40, 20, 1.0)))
+    ray = np.stack([np.cos(low) * np.cos(angle), np.cos(low) * np.sin(angle), np.sin(low)], -1).reshape(-1, 3)
+    level = np.hypot(ray[:, 0], ray[:, 1])
+    reach = np.where(ray[:, 2] < 0, 2 / np.maximum(-ray[:, 2], 1e-9), np.inf)
+    for x, y in [(x, y) for x in np.arange(-12, 13, 4.0) for y in (-5.0, -3.0, 3.0, 5.0)]:
+        along = ((x - at) * ray[:, 0] + y * ray[:, 1]) / level
+        beside = 0.3**2 - ((x - at) ** 2 + y**2 - along**2)
+        hit = (beside > 0) & (along > 0)
+        reach[hit] = np.minimum(reach[hit], (along[hit] - np.sqrt(beside[hit])) / level[hit])
+    wall = -at * ray[:, 0] / level + np.sqrt(20**2 - (at * ray[:, 1] / level) ** 2)
+    reach = np.minimum(reach, wall / level)
+    return np.column_stack([ray * reach[:, None], np.full(len(ray), 0.5)]).astype(np.float32)
+
+
+def test_what_stands_stays_wherever_on_the_vehicle_the_lidar_is() -> None:
+    """5 m ahead of the base and 2.5 m up: what it sees is seen from there, and not through poles beside the base."""
+    mount, taken = np.array([5.0, 0.0, 2.5]), np.arange(0, 4, 0.8)
+    clouds = [poles(x) for x in taken]
+    poses = se3.make(np.eye(3), np.column_stack([taken, 0 * taken, 0 * taken]))
+    assert not moved(clouds, poses, np.zeros(3)).any()
+    on_base = [cloud + np.append(mount, 0).astype(np.float32) for cloud in clouds]
+    assert not moved(on_base, poses, mount).any()
+    assert moved(on_base, poses, np.zeros(3)).sum() > 100  # as if the base had seen it
+
+
+def moved(clouds: list[Points], poses: Array, mount: Array) -> np.ndarray:
+    window, masks = MovingWindow(SETTINGS), list[np.ndarray]()
+    for node, cloud in enumerate(clouds):
+        masks += [mask for _, mask in window.add(node, cloud, poses[: node + 1], mount)]
+    return np.concatenate([*masks, *(mask for _, mask in window.finish(poses))])
+
+
 @pytest.fixture(scope="module")
 def labeled_scans() -> list[tuple[Points, np.ndarray, Array]]:
     """Keyframes of a city street with traffic: points, whether they move, true pose."""

@@ -124,6 +124,40 @@ def room(thing: bool = False) -> Points:
     return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
 
 
+@pytest.mark.parametrize("yaw", [0.3, 2.0])  # not 0: the rays to points of a grid lie between two directions
+def test_what_is_free_is_seen_from_the_lidar(yaw: float) -> None:
+    """The base 2 m behind it gives the grid that the LiDAR alone gives, at first and where the pose has changed; seen
+    from the base the room would be free behind the thing, and not before it."""
+    mount = se3.make(np.eye(3), [2.0, 0.0, 1.0])
+    T, T_later = se3.exp([0, 0, yaw, 0.32, 0.11, 0]), se3.exp([0, 0, yaw + 0.5, 3.34, 1.13, 0])
+    cloud = room(thing=True)
+    cloud = cloud[~((cloud[:, 0] > 1.6) & (np.abs(cloud[:, 1]) < 0.1))]  # its shadow
+
+    def grids(T_kf_lidar: Array, origin: Array) -> list[Grid]:
+        live, clouds = OccupancyMap(SETTINGS, 10**7), [se3.transform(T_kf_lidar, cloud)]
+        drawn = []
+        for T_map_lidar in (T, T_later):
+            live.update(clouds, (T_map_lidar @ se3.inverse(T_kf_lidar))[None], origin=lambda node: origin)
+            drawn.append(live.grid())
+        return drawn
+
+    expected, found = grids(np.eye(4), np.zeros(3)), grids(mount, mount[:3, 3])
+    assert differ(expected[0], found[0]) <= 0.002  # the floor's height is looked for in cells of the map
+    assert differ(expected[1], found[1]) <= 0.002
+    assert differ(expected[0], grids(mount, np.zeros(3))[0]) > 0.01
+
+
+def differ(a: Grid, b: Grid) -> float:
+    """Fraction of the cells known to one of two grids that are others in the other one."""
+    places = []
+    for grid in (a, b):
+        rows, columns = np.nonzero(grid.cells[::-1] != UNKNOWN)
+        low = np.round(np.array(grid.origin) / grid.resolution).astype(int)
+        values = grid.cells[::-1][rows, columns].tolist()
+        places.append(set(zip((columns + low[0]).tolist(), (rows + low[1]).tolist(), values, strict=True)))
+    return len(places[0] ^ places[1]) / len(places[0] | places[1])
+
+
 def at(grid: Grid, x: float, y: float) -> int:
     row, column = ((v - low) // grid.resolution for v, low in ((y, grid.origin[1]), (x, grid.origin[0])))
     return int(grid.cells[::-1][int(row), int(column)])

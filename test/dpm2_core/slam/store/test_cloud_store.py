@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
-from dpm2_core.slam.store.cloud_codec import QUANTUM, pack_cloud, pack_mask, unpack_cloud, unpack_mask
+from dpm2_core.slam.store.cloud_codec import QUANTUM, origin_of, pack_cloud, pack_mask, unpack_cloud, unpack_mask
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 
 
@@ -48,6 +48,26 @@ def test_what_is_no_cloud_is_rejected() -> None:
         with pytest.raises(UsageError, match=r"^not a packed cloud") as error:
             unpack_cloud(bad)
         assert "\n" not in str(error.value)
+
+
+def test_where_the_lidar_was_goes_with_its_cloud() -> None:
+    """Behind the header; a LiDAR at the origin takes no byte, as in maps of before."""
+    cloud, there = clouds()[0], np.array([5.0, -0.25, 2.5])
+    here, moved = pack_cloud(cloud), pack_cloud(cloud, there)
+    assert pack_cloud(cloud, np.zeros(3)) == here
+    assert len(moved) == len(here) + 12
+    assert origin_of(here).tolist() == [0, 0, 0]
+    assert origin_of(moved).tolist() == there.tolist()
+    np.testing.assert_array_equal(unpack_cloud(moved), unpack_cloud(here))
+    for bad in (np.array([np.nan, 0, 0]), np.array([0, 0, 1e5])):
+        with pytest.raises(UsageError, match=r"^a cloud seen from .*: too far away"):
+            pack_cloud(cloud, bad)
+        forged = moved[:8] + struct.pack("<3f", *bad) + moved[20:]
+        for read in (origin_of, unpack_cloud):
+            with pytest.raises(UsageError, match=r"^not a packed cloud: seen from "):
+                read(forged)
+    with pytest.raises(UsageError, match=r"^not a packed cloud: 12 bytes"):
+        origin_of(moved[:12])
 
 
 @pytest.mark.parametrize("quantum", [np.inf, -np.inf, np.nan, 0.0, -0.01, 1e-5, 1.1, 3e38])
@@ -107,15 +127,17 @@ def test_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_moving_points_are_left_out_and_a_borrowed_cloud_is_moved() -> None:
     store = CloudStore()
-    for cloud in clouds():
-        store.append(pack_cloud(cloud))
+    for number, cloud in enumerate(clouds()):
+        store.append(pack_cloud(cloud, np.array([1.0, 0, 2]) * number))
     moving = np.arange(100) % 3 == 0
     store.set_moving(0, moving)
     np.testing.assert_allclose(store[0], clouds()[0][~moving], atol=0.0051)
     assert len(store.whole(0)) == 100
     T = se3.exp([0, 0, 0.3, 1, 2, 3])
+    assert [store.origin(n).tolist() for n in range(3)] == [[0, 0, 0], [1, 0, 2], [2, 0, 4]]
     store.borrow(2, Loan(0, T))
     np.testing.assert_allclose(store[2], se3.transform(T, store[0]), atol=1e-5)
+    np.testing.assert_allclose(store.origin(2), T[:3, 3])  # where the lender's LiDAR was
     assert store.packed(2) is None
 
 

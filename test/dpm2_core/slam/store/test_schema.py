@@ -7,6 +7,7 @@ import sqlite3
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.store import schema
@@ -39,14 +40,17 @@ def version_1(path: Path, keyframes: list[Keyframe]) -> None:
     sql.close()
 
 
-def test_a_map_of_version_3_has_the_same_tables(map_file: Path) -> None:
-    """It is read where it is, and written on after its number has been raised."""
+@pytest.mark.parametrize("before", [3, 4])
+def test_a_map_of_version_3_or_4_has_the_same_tables(map_file: Path, before: int) -> None:
+    """It is read where it is, and written on after its number has been raised; its LiDARs were at the origin."""
     with sqlite3.connect(map_file) as sql:
-        sql.execute("PRAGMA user_version = 3")
+        sql.execute(f"PRAGMA user_version = {before}")
     sql.close()
-    for read_only, version in ((True, 3), (False, schema.VERSION)):
+    for read_only, version in ((True, before), (False, schema.VERSION)):
         with MapStore.open(map_file, read_only=read_only) as store:
-            assert len(load_map(store)) == 12
+            data = load_map(store)
+            assert len(data) == 12
+            assert not any(data.clouds.origin(node).any() for node in range(12))
         with sqlite3.connect(map_file) as sql:
             assert sql.execute("PRAGMA user_version").fetchone() == (version,)
         sql.close()
