@@ -197,6 +197,9 @@ class Frame:
         fix: the last one before the stamp that no frame before had; None where there is none.
         dropped: scans since the frame before that came, but were left out for want of time.
         stepped: whether less time may have passed since the frame before than the stamps say: a clock was set.
+        up: (3,) unit vector along the LiDAR's axes, by its mounting upwards: so is the odometry's frame level where a
+            drive begins with this frame; None: it has the LiDAR's axes, as where the mounting is not known or counts
+            elsewhere.
     """
 
     stamp: int
@@ -210,6 +213,7 @@ class Frame:
     fix: Fix | None = None
     dropped: int = 0
     stepped: bool = False
+    up: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4 or self.points.dtype != np.float32:

@@ -20,7 +20,7 @@ from dpm2_core.data.bag_topics import CLOUDS, IMAGES, PATH, TopicChoice
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.messages import MessageError, serialized_stamp, stamp_ns
+from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, SWEEP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.time_order import in_order
@@ -28,9 +28,13 @@ from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError, printable
-from dpm2_core.frame import Array, Camera, Frame
+from dpm2_core.frame import Array, Camera, Frame, Points
+from dpm2_core.geometry.scale import is_room
+from dpm2_core.geometry.tilt import up_of
 
 Stamps = NDArray[np.int64]
+_NO_BASE = ("map", "odom")  # frames that a base moves in
+_LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a tilt of more is said; the ground agrees with it to so much
 
 
 class BagSource:
@@ -64,7 +68,9 @@ class BagSource:
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
         self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
+        self._up = self._mounted(first)
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
+        self._frames.up = self._up
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
         self.camera = self._choose_cameras() if self._settings.images else None
 
@@ -83,7 +89,7 @@ class BagSource:
                 continue
             if before is not None and stamp <= before:
                 self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
-            frame = self._frames.frame(stamp, cloud, index, beside)
+            frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._up)
             if before is not None and (stamp - before) - (recorded - recorded_before) > JUMP:
                 frame = replace(frame, stepped=True)
             before, recorded_before, count = stamp, recorded, count + 1
@@ -172,6 +178,34 @@ class BagSource:
         if problems:
             what = f"{topics.TF_STATIC}: {len(problems)} transforms left out"
             self._note_once(what, f"the first: {printable(problems[0])}")
+
+    def _mounted(self, first: Any) -> tuple[float, float, float]:
+        """Which way (3,) along the LiDAR's axes is up in the base: as for slam_node the root above it in /tf_static.
+
+        Its own z without one, and where the first cloud shows that the root is none, as the frame of a camera.
+        """
+        base = self.transforms.root(self.lidar_frame, _NO_BASE)
+        if first is None or base == self.lidar_frame.lstrip("/"):
+            return (0.0, 0.0, 1.0)
+        x, y, z = self.transforms.lookup(base, self.lidar_frame)[2, :3].tolist()
+        if z > _LEVEL:
+            return x, y, z
+        angle = float(np.degrees(np.arccos(max(z, -1.0))))
+        tilted = f"{topics.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
+        seen = self._ground(first)
+        if seen is not None and seen @ (x, y, z) < _LIKE:
+            self._note_once(tilted, "which is no base: the ground is not level in it")
+            return (0.0, 0.0, 1.0)
+        self._note_once(tilted, "and the map is level by that")
+        return x, y, z
+
+    def _ground(self, cloud: Any) -> Points | None:
+        """Which way (3,) is up by the ground that a cloud shows; rooms have ceilings, which look alike."""
+        try:
+            points, _ = decode_points(cloud)
+        except MessageError:
+            return None
+        return up_of(points) if is_room(points) is False else None
 
     def _recorded_correction(self) -> float | None:
         topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"

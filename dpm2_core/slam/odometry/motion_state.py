@@ -11,6 +11,7 @@ from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
+from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
@@ -49,6 +50,13 @@ class MotionState:
         self.inertial: InertialMotion | None = None
         self.other: OtherMotion | None = None
         self._open = 0.0  # s, for which the scene has left a direction open
+        self._started = False
+
+    def start(self, up: tuple[float, float, float] | None) -> None:
+        """Of the first frame: its pose has `up` (3,), of `Frame`, upwards. Later ones change nothing."""
+        if not self._started and up is not None:
+            self.T = self.T_registered = se3.make(leveled(up), np.zeros(3))
+        self._started = True
 
     def begin(self, T: Array) -> None:
         """A map begins at T (4, 4), to which no motion has led."""

@@ -43,7 +43,7 @@ class Tools:
 
 
 class Odometry:
-    """The pose of the LiDAR in the odometry frame, which is that of the first usable scan."""
+    """The pose of the LiDAR in the odometry frame, which is that of the first usable scan, level by its `Frame.up`."""
 
     def __init__(self, tools: Tools, robot: str = "") -> None:
         """`robot`: namespace of its keyframes."""
@@ -112,6 +112,7 @@ class Odometry:
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
         clock, motion = [perf_counter()], self._motion
+        motion.start(frame.up)
         given = self._part.new(frame)
         is_part, frame = given is not frame, self._sweep.centered(given)
         dt = self._clock.advance(frame.stamp)

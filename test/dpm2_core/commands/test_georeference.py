@@ -20,7 +20,10 @@ from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig
+from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.mapping.occupancy import tilt_of
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import RemovedKeyframe
@@ -101,6 +104,22 @@ def test_a_bag_with_fixes_makes_a_map_that_knows_its_place(drive: Path, tmp_path
     assert max(info["position_sigma_m"]) < 2 * SIGMA  # in height the fixes err by twice as much
     shown = " ".join(dpm2("map", "info", tmp_path / "a.dpm2map").stdout.split())
     assert f"{info['fixes']} of {info['fixes']} fixes used" in shown
+
+
+@pytest.mark.slow
+def test_a_lidar_that_hangs_has_a_level_map_with_its_place_on_earth(drive: Path) -> None:
+    """Where its mounting is known; upside down the fixes of a way with bends fit to no map."""
+    T_hanging = np.diag([1.0, -1.0, -1.0, 1.0])
+    settings = {"registration": "geometric", "loops": {"descriptors": False}, "keyframes": {"distance": 1.5}}
+    slam = make_slam(SlamSettings.model_validate(settings))
+    for frame in KittiSource(drive).frames():
+        fix = None if frame.fix is None else frame.fix.moved(T_hanging)
+        points = se3.transform(T_hanging, frame.points)
+        slam.process(replace(frame, points=points, fix=fix, images=(), up=(0.0, 0.0, -1.0)))
+    slam.finish()
+    assert tilt_of(slam.mapper.clouds, slam.mapper.poses) < 5
+    assert slam.mapper.georeference is not None
+    assert slam.mapper.georeference.T_enu_map[2, 2] > 0.99
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from dpm2_core.data.corrupt import in_dust
 from dpm2_core.estimates import State
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
@@ -51,6 +54,23 @@ def test_a_street_is_as_if_there_were_no_rooms() -> None:
     for frame in drive:
         np.testing.assert_array_equal(auto.process(frame).T_odom_lidar, outdoor.process(frame).T_odom_lidar)
     assert auto.scale == "outdoor"
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, -1.0), (-0.5, 0.0, 0.75**0.5)])
+def test_the_frame_is_level_by_how_the_lidar_is_mounted(up: tuple[float, float, float]) -> None:
+    """All poses are those of the LiDAR's own frame, turned once."""
+    poses = se3.exp(np.outer(np.arange(8), [0, 0, 0.01, 0.6, 0, 0])) @ se3.make(np.eye(3), [0, 0, 1.7])
+    T_mount = se3.make(leveled((0, 0, 1), up), np.zeros(3))  # level axes in those of the LiDAR
+    street = [replace(f, points=se3.transform(T_mount, f.points)) for f in frames(poses, street=True)]
+    own, level = make_odometry(geometric("auto")), make_odometry(geometric("auto"))
+    for count, frame in enumerate(street):
+        T_own = own.process(frame).T_odom_lidar
+        T = level.process(replace(frame, up=up)).T_odom_lidar
+        np.testing.assert_allclose(T[:3, :3] @ up, [0, 0, 1], atol=1e-9 if not count else 0.01)
+        # The voxels lie otherwise: as far off as the noise of 1 cm lets them.
+        np.testing.assert_allclose(T, se3.make(leveled(up), np.zeros(3)) @ T_own, atol=0.02)
+    level.reset()
+    np.testing.assert_array_equal(level.process(street[0]).T_odom_lidar, np.eye(4))
 
 
 def test_a_start_that_may_be_of_either_is_decided_without_a_jump() -> None:

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag says by /tf_static which way is up for its LiDAR, as it does to the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.data.bags import BagSource
+from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.geometry import se3
+
+from ...helpers.rooms import boxes, scan
+
+Roll = tuple[float, float]
+"""Of a frame in its parent, with its pitch, degrees."""
+
+
+def placed(bags: Any, parent: str, child: str, turn: Roll) -> Any:
+    message = bags.transform(parent, child, (0.5, 0, 1.7))
+    x, y, z, w = Rotation.from_euler("xy", turn, degrees=True).as_quat().tolist()
+    message.transforms[0].transform.rotation = bags.new("geometry_msgs/Quaternion", x, y, z, w)
+    return message
+
+
+def read(bags: Any, folder: Path, links: Sequence[tuple[str, str, Roll]], turn: Roll = (0, 0)) -> BagSource:
+    """A bag of two clouds of a street, of a LiDAR that is mounted with a turn."""
+    hull, things = np.array([[-60, -12, 0], [60, 12, 30.0]]), boxes((-40, -8), (40, 8), 20, np.array([4.0, 2.0, 2.0]))
+    points = scan(se3.make(np.eye(3), [0, 0, 1.7]), hull, things, 0)
+    T = se3.make(Rotation.from_euler("xy", turn, degrees=True).as_matrix().T, np.zeros(3))
+    fields = cloud_fields(point_columns(se3.transform(T, points)), bags.store.types["sensor_msgs/msg/PointField"])
+    clouds = [bags.new("sensor_msgs/PointCloud2", header=bags.header(t, "velo_link"), **fields) for t in (1.0, 1.1)]
+    messages = [(t, "/points", cloud) for t, cloud in zip((1.0, 1.1), clouds, strict=True)]
+    return BagSource(
+        bags.write(folder / "b", [*((0.5, "/tf_static", placed(bags, *link)) for link in links), *messages])
+    )
+
+
+def ups(source: BagSource) -> NDArray[np.float64]:
+    return np.array([frame.up for frame in source.frames()])
+
+
+def said(source: BagSource) -> list[str]:
+    return [note for note in source.notes if note.startswith("/tf_static")]
+
+
+@pytest.mark.parametrize(("turn", "up"), [((180, 0), (0, 0, -1)), ((0, 30), (-0.5, 0, 0.75**0.5))])
+def test_up_is_that_of_the_root_above_the_lidar(bags: Any, tmp_path: Path, turn: Roll, up: tuple[float, ...]) -> None:
+    """And not of what the base moves in; a tilt is said, since the map turns by it."""
+    links = [("odom", "base_link", (90.0, 0.0)), ("base_link", "velo_link", turn)]
+    source = read(bags, tmp_path, links, turn)
+    np.testing.assert_allclose(ups(source), [up, up], atol=1e-9)
+    angle = round(np.degrees(np.arccos(up[2])))
+    assert said(source) == [
+        f"/tf_static has the LiDAR tilted by {angle} degrees in base_link (and the map is level by that)"
+    ]
+
+
+@pytest.mark.parametrize("links", [[], [("velo_link", "cam", (90, 0))], [("base_link", "velo_link", (0, 0))]])
+def test_a_lidar_that_stands_or_of_which_nothing_is_known_has_its_own_z(
+    bags: Any, tmp_path: Path, links: list[tuple[str, str, Roll]]
+) -> None:
+    source = read(bags, tmp_path, links)
+    assert ups(source).tolist() == [[0, 0, 1]] * 2
+    assert said(source) == []
+
+
+def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path: Path) -> None:
+    """A camera, of which the extrinsics are often told the other way: its z looks ahead."""
+    source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))])
+    assert ups(source).tolist() == [[0, 0, 1]] * 2
+    (note,) = said(source)
+    assert note.startswith("/tf_static has the LiDAR tilted by 90 degrees in camera_optical (which is no base")
