@@ -47,14 +47,15 @@ def occupancy_grid(
     return whole.grid()
 
 
-def tilt_of(clouds: Sequence[Points], poses: Array) -> float:
+def tilt_of(clouds: Sequence[Points], poses: Array, origin: Callable[[int], Array] = lambda node: np.zeros(3)) -> float:
     """How far the ground that keyframes show is tilted against the map's x and y, degrees; 0 where they show none.
 
-    Of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf, some are looked at. Upside down is known
-    outdoors only: rooms have ceilings.
+    Of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf, some are looked at, as seen from `origin`
+    (3,), where the LiDAR of each was. Upside down is known outdoors only: rooms have ceilings.
     """
     some = np.unique(np.linspace(0, len(poses) - 1, _LOOKED_AT).astype(int)).tolist()
-    found = [(node, up) for node in some if (up := _up(clouds[node])) is not None]
+    seen = ((node, clouds[node][:, :3] - origin(node).astype(np.float32)) for node in some)
+    found = [(node, up) for node, cloud in seen if (up := _up(cloud)) is not None]
     if len(found) < _SHOW_GROUND * len(some):
         return 0.0
     x, y, z = np.median([poses[node, :3, :3] @ up for node, up in found], axis=0)

@@ -289,6 +289,9 @@ def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: floa
         [T_tilted_level @ se3.exp([0, 0, 0.1 * n, n, 0, 0]) @ se3.inverse(T_tilted_level) for n in range(9)]
     )
     assert tilt_of([cloud] * 9, poses) == pytest.approx(degrees, abs=2.0)
+    mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground, by which there is no sensor over the ground
+    on_base = [cloud + np.append(mount, 0).astype(np.float32)] * 9
+    assert tilt_of(on_base, poses, lambda node: mount) == pytest.approx(degrees, abs=2.0)
 
 
 def test_of_a_level_building_and_of_clouds_without_ground_no_tilt_is_known(drive: tuple[list[Points], Array]) -> None:
