@@ -18,6 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from dpm2_core.data import bag_messages, topics
 from dpm2_core.data.kitti import KittiSource
+from dpm2_core.data.pairing import SWEEP
+from dpm2_core.data.point_times import last_point
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
 from dpm2_core.errors import UsageError
@@ -88,6 +90,7 @@ class _Bag:
         self._connections: dict[str, Any] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._first: int | None = None  # ns
+        self._last = 0  # ns, when the last cloud would have been recorded at its stamp
         self._later = self._shift = 0  # ns, added to stamps, and besides to the times of recording
         self._recorded: dict[str, int] = {}  # ns, of the last message of each topic
         self._names = topics.OTHER
@@ -107,7 +110,8 @@ class _Bag:
             self._links[topics.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
 
     def write(self, frame: Frame, position: int) -> None:
-        """IMU, fix and image first: who waits for the cloud then has them already."""
+        """IMU, fix and image first: who waits for the cloud then has them already. The cloud is recorded when its last
+        point was measured, as drivers send it: who plays the bag has the samples of the sweep by then."""
         stamp = self._begin(frame)
         self._link(stamp, frame)
         if frame.imu is not None:
@@ -122,7 +126,9 @@ class _Bag:
         if T is not None and np.isfinite(T).all():
             self._path.append((stamp, T))
             self._put(f"{self._names.truth}/odom", stamp, bag_messages.odometry(stamp, self._names.lidar, T))
-        self._put(self._names.points, stamp, bag_messages.cloud(stamp, self._names.lidar, frame))
+        points, end = self._names.points, stamp + min(last_point(frame.time_offset), SWEEP)
+        end = max(end, self._recorded.get(points, end) - self._shift)  # in their order, whatever a point says
+        self._put(points, end, bag_messages.cloud(stamp, self._names.lidar, frame))
 
     def write_path(self) -> None:
         """In the place of the first message, where players look for it."""
@@ -135,16 +141,16 @@ class _Bag:
         self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0  # of each, since a clock may be set during a drive
         stamp = frame.stamp + self._later
         if self._first is None:
-            self._first = stamp
+            self._first = self._last = stamp
             if self._correction_deg is not None:
                 correction = bag_messages.number(self._correction_deg)
                 self._put(topics.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
-        last = self._recorded.get(self._names.points, stamp)
-        if frame.stepped or stamp + self._shift < last:
-            self._shift = last + _PERIOD - stamp
+        if frame.stepped or stamp + self._shift < self._last:
+            self._shift = self._last + _PERIOD - stamp
             if frame.imu and topics.IMU in self._recorded:  # the sweep may take longer than that
                 first = int(frame.imu.stamps[0]) + self._later
                 self._shift = max(self._shift, self._recorded[topics.IMU] + 1 - first)
+        self._last = stamp + self._shift
         return stamp
 
     def _is_new(self, topic: str, stamp: int) -> bool:

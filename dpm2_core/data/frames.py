@@ -13,6 +13,7 @@ from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, returned, why_untimed
+from dpm2_core.data.point_times import last_point
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
@@ -176,8 +177,7 @@ class FrameBuilder:
         """The samples up to the last point of a scan, along the LiDAR's axes."""
         if buffer.last == -float("inf"):
             return None
-        sweep = 0.0 if offset is None or not len(offset) else max(float(np.nanmax(offset)), 0.0)
-        found, topic = buffer.take(stamp, stamp + round(sweep * 1e9)), self._calibration.imu_topic
+        found, topic = buffer.take(stamp, stamp + last_point(offset)), self._calibration.imu_topic
         try:
             if found is None:
                 raise UsageError("no samples at the time of the scan")

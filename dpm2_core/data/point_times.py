@@ -85,6 +85,11 @@ def time_offsets(time: NDArray[Any], returned: NDArray[np.bool_], stamp: int, un
     return np.where(valid, offset, 0.0).astype(np.float32) if 2 * valid.sum() > seen.sum() else None
 
 
+def last_point(offset: Points | None) -> int:
+    """ns from the stamp of a cloud to its last point, by (N,) s after it; 0 where that is not known, or before it."""
+    return 0 if offset is None else round(float(offset.max(initial=0.0)) * 1e9)
+
+
 def _away(first: float, last: float, time: float) -> float:
     """How far a time is from the times of a scan."""
     return max(first - time, time - last, 0.0)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert
+from dpm2_core.data.messages import serialized_stamp
 from dpm2_core.frame import Frame, Inertial
 
 STAMP = 1_700_000_000_000_000_000  # ns
@@ -31,6 +33,25 @@ class Recording:
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """All of them."""
         yield from self.all
+
+
+def test_clouds_are_recorded_at_the_end_of_their_sweeps(tmp_path: Path) -> None:
+    """As drivers send them, so that who plays the bag has the samples of a sweep by then. One point far from the others
+    changes no order, and sweeps that overlap a little are no clock that was set."""
+    drive = [frame_of(STAMP + i * 10**8, i, STAMP + i * 10**8 + np.arange(1, 11) * 10**7) for i in range(10)]
+    ends = [0.101] * 5 + [1.5] + [0.1] * 4
+    drive = [replace(f, time_offset=np.float32([0, end / 2, end])) for f, end in zip(drive, ends, strict=True)]
+    convert(Recording(drive), tmp_path / "bag")
+    clouds, samples = list[tuple[int, int]](), 0
+    for topic, time, data in open_bag(tmp_path / "bag").messages(["/points", "/imu"]):
+        samples += topic == "/imu"
+        if topic == "/points":
+            clouds.append((time - serialized_stamp(data, 0), samples))
+    late = np.array([late for late, _ in clouds]) * 1e-9
+    np.testing.assert_allclose(late, [0.101] * 5 + [0.25, 0.15] + [0.1] * 3, atol=1e-6)
+    assert [seen >= 10 * (i + 1) for i, (_, seen) in enumerate(clouds)] == [True] * 10
+    frames = list(BagSource(tmp_path / "bag").frames())
+    assert [(f.stamp, f.stepped, f.points[0, 0]) for f in frames] == [(f.stamp, False, i) for i, f in enumerate(drive)]
 
 
 def frame_of(stamp: int, index: int, samples: np.ndarray, stepped: bool = False) -> Frame:
