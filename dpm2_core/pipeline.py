@@ -11,6 +11,7 @@ from time import perf_counter
 from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
+from dpm2_core.data.time_order import frames_in_order, note_corrected
 from dpm2_core.data.trajectory import Trajectory
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import read_ground_truth
@@ -117,7 +118,8 @@ class OfflineRun:
         began, problems = perf_counter(), list[str]()
         with interrupt_deferred() as interrupted:
             try:
-                for frame in prefetch(self.source.frames(self._start, self._stop)):
+                frames = self.source.frames(self._start, self._stop)
+                for frame in prefetch(frames_in_order(frames, self._corrected)):
                     if frame.problem is None:
                         self._begun = None
                     else:
@@ -136,6 +138,9 @@ class OfflineRun:
         if problems and len(problems) == len(result) and not result.interrupted:
             raise Dpm2Error(f"{self.source.name}: none of {len(result)} scans could be read; the first: {problems[0]}")
         return result
+
+    def _corrected(self, number: int, stamp: int) -> None:
+        note_corrected(self.source.notes, self._start + number, stamp)
 
 
 def open_recording(path: Path | str, config: Config, images: bool) -> Source:

@@ -23,7 +23,7 @@ from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, SWEEP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.time_order import in_order
+from dpm2_core.data.time_order import in_order, note_corrected
 from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.data.vertical_angle import checked_correction
@@ -240,8 +240,7 @@ class BagSource:
         return in_order(messages, self.points_topic, self._corrected)
 
     def _corrected(self, index: int, stamp: int) -> None:
-        what = f"{self.points_topic}: stamps that are not between their neighbors are taken to be"
-        self._note_once(what, f"the first at frame {index}: {stamp * 1e-9:.3f} s")
+        note_corrected(self.notes, index, stamp, f"{self.points_topic}: ")
 
     def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
         buffer = self._imu if topic == self.imu_topic else self._gnss

@@ -6,14 +6,18 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import STAMP_END, restamped, serialized_stamp
 from dpm2_core.data.pairing import RawMessage
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Frame
+
+Item = TypeVar("Item")
 
 _FEW = 3  # in a row; more are a clock that was set
 _AROUND = 2 * _FEW + 1  # clouds on either side that show which of the stamps between them are off: more than may be
@@ -40,36 +44,61 @@ def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[in
         messages: in recorded order; up to seven clouds, and what came between them, are held back.
         corrected: is told the number of each such cloud, and the stamp that it had, ns.
     """
-    held, stamps, decided, number = deque[RawMessage](), deque[int](), 0, 0
 
-    def decide() -> Iterator[RawMessage]:
+    def stamp_of(message: RawMessage) -> int | None:
+        return serialized_stamp(message[2], message[1]) if message[0] == topic else None
+
+    return _in_order(messages, stamp_of, lambda m, stamp: (m[0], m[1], restamped(m[2], stamp)), corrected)
+
+
+def frames_in_order(frames: Iterable[Frame], corrected: Callable[[int, int], None]) -> Iterator[Frame]:
+    """The same for the frames of a drive."""
+    return _in_order(frames, lambda frame: frame.stamp, lambda frame, stamp: replace(frame, stamp=stamp), corrected)
+
+
+def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -> None:
+    """Add to the notes, once, that there are such stamps (ns): the first one, and its frame's number."""
+    what = f"{whose}stamps that are not between their neighbors are taken to be"
+    if not any(note.startswith(what) for note in notes):
+        notes.append(f"{what} (the first at frame {number}: {stamp * 1e-9:.3f} s)")
+
+
+def _in_order(
+    items: Iterable[Item],
+    stamp_of: Callable[[Item], int | None],
+    restamp: Callable[[Item, int], Item],
+    corrected: Callable[[int, int], None],
+) -> Iterator[Item]:
+    """`stamp_of`: ns, None of what is between the clouds."""
+    held, stamps, decided, number = deque[tuple[Item, int | None]](), deque[int](), 0, 0
+
+    def decide() -> Iterator[Item]:
         """All up to the first cloud that is held."""
         nonlocal decided, number
-        while held[0][0] != topic:
-            yield held.popleft()
-        _, time, data = held.popleft()
-        stamp = _in_place(stamps, decided)
+        while held[0][1] is None:
+            yield held.popleft()[0]
+        item, stamp = held.popleft()[0], _in_place(stamps, decided)
         if stamp != stamps[decided]:
             corrected(number, stamps[decided])
-            stamps[decided], data = stamp, restamped(data, stamp)
-        yield topic, time, data
+            stamps[decided], item = stamp, restamp(item, stamp)
+        yield item
         decided, number = decided + 1, number + 1
         if decided > _AROUND:
             stamps.popleft()
             decided -= 1
 
-    for message in messages:
-        if not held and message[0] != topic:
-            yield message
+    for item in items:
+        if (said := stamp_of(item)) is None and not held:
+            yield item
             continue
-        held.append(message)
-        if message[0] == topic:
-            stamps.append(serialized_stamp(message[2], message[1]))
+        held.append((item, said))
+        if said is not None:
+            stamps.append(said)
             if len(stamps) - decided > _AROUND:
                 yield from decide()
     while decided < len(stamps):
         yield from decide()
-    yield from held
+    yield from (item for item, _ in held)
 
 
 def _in_place(stamps: Sequence[int], which: int) -> int:
