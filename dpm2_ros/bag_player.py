@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
-from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD
+from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUDS
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError, printable
@@ -126,7 +126,10 @@ class BagPlayer:
                 continue
             kind = self._bag.types[topic]
             if (known := message_type(kind)) is None:
-                self._node.get_logger().warning(f"{printable(topic)} is left out: no message type {printable(kind)}")
+                hint = "; dpm2 convert drive makes a recording with PointCloud2 of it" if kind in CLOUDS else ""
+                self._node.get_logger().warning(
+                    f"{printable(topic)} is left out: no message type {printable(kind)}{hint}"
+                )
                 continue
             durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in self._latched else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
@@ -173,7 +176,7 @@ class BagPlayer:
     def _await_subscribers(self) -> None:
         """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
         options, log = self._options, self._node.get_logger()
-        clouds = [topic for topic in self._publishers if self._bag.types[topic] == CLOUD] or list(self._publishers)
+        clouds = [topic for topic in self._publishers if self._bag.types[topic] in CLOUDS] or list(self._publishers)
         awaited = "a subscriber" if options.subscribers == 1 else f"{options.subscribers} subscribers"
         awaited += f" named {options.listener}" * bool(options.listener) + f" to {', '.join(clouds)}"
         began, info = time.monotonic(), False
@@ -204,8 +207,8 @@ class BagPlayer:
         A receipt for the last message, if it is small, may come only seconds after the message.
         """
         began = time.monotonic()
-        for topic in sorted(self._publishers, key=lambda topic: self._bag.types[topic] != CLOUD):
-            cloud = self._bag.types[topic] == CLOUD
+        for topic in sorted(self._publishers, key=lambda topic: self._bag.types[topic] not in CLOUDS):
+            cloud = self._bag.types[topic] in CLOUDS
             end = began + (DELIVERY if cloud else 1.0)
             while not STOP.is_set() and not self._publishers[topic].wait_for_all_acked(Duration(seconds=0.1)):
                 if time.monotonic() >= end:
@@ -231,7 +234,7 @@ class BagPlayer:
             published = time.monotonic_ns()
             self._publishers[topic].publish(data)
             count += 1
-            self._clouds += self._bag.types[topic] == CLOUD
+            self._clouds += self._bag.types[topic] in CLOUDS
             if self._options.log is not None:
                 self._published.append(f"{topic},{log_time},{published}\n")
         return count

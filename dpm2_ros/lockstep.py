@@ -18,7 +18,7 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
-from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUD, FIX, IMAGES, IMU
+from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUDS, FIX, IMAGES, IMU
 from dpm2_core.data.messages import serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import SWEEP, RawMessage, clouds_after_others, passed
 from dpm2_core.errors import Dpm2Error
@@ -61,7 +61,7 @@ class Lockstep:
         Raises:
             Dpm2Error: there is none.
         """
-        topic, clouds = self._odometry.topic_name, [t for t in self._publishers if self._bag.types[t] == CLOUD]
+        topic, clouds = self._odometry.topic_name, [t for t in self._publishers if self._bag.types[t] in CLOUDS]
         while not STOP.wait(0.02):
             nodes = {_node(info) for info in self._node.get_publishers_info_by_topic(topic)}
             takers = {

@@ -5,25 +5,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rosbags.rosbag2 import StoragePlugin, Writer
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.frames import FrameBuilder
+from dpm2_core.data.livox import cloud_of_custom
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import UsageError
+from dpm2_ros import bag_player
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import Inputs
 from test.dpm2_ros.test_subscriptions import node  # noqa: F401
-from test.helpers.livox import custom_message
+from test.helpers.livox import custom_message, livox_store
+from test.helpers.lockstep import play
 
 CUSTOM = "livox_ros_driver2/msg/CustomMsg"
 POINTS = np.random.default_rng(0).uniform(-20, 20, (50, 3)).astype(np.float32)
@@ -74,3 +81,44 @@ def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  
     np.testing.assert_array_equal(frame.points[:, :3], POINTS)
     np.testing.assert_allclose(frame.time_offset, SECONDS, atol=1e-8)
     assert cloud_to_msg(frame.points, 1, "lidar").width == 50
+
+
+def recorded(folder: Path) -> Path:
+    """Five clouds of a CustomMsg."""
+    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/livox/lidar", CUSTOM, typestore=livox_store())
+        for stamp in range(10**9, 15 * 10**8, 10**8):
+            writer.write(connection, stamp + 10**8, custom_message(stamp, POINTS, SECONDS))
+    return folder
+
+
+def test_a_recording_is_played_in_lockstep(
+    ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was refused: no node turned its clouds into an odometry. Where the package is not installed, the bytes go out
+    under another type."""
+    monkeypatch.setattr(bag_player, "message_type", lambda kind: message_type(kind) or PointCloud2)
+    kind, n, seen = message_type(CUSTOM) or PointCloud2, ros().node, list[int]()
+    odometry = n.create_publisher(Odometry, "dpm2/odom", 10)
+
+    def answer(data: bytes) -> None:
+        cloud = cloud_of_custom(data)
+        seen.append(cloud.header.stamp.nanosec)
+        message = Odometry()
+        message.header.stamp.sec, message.header.stamp.nanosec = cloud.header.stamp.sec, cloud.header.stamp.nanosec
+        odometry.publish(message)
+
+    n.create_subscription(kind, "/livox/lidar", answer, 10, raw=True)
+    play(recorded(tmp_path / "bag"))  # an error, where a cloud has no odometry
+    assert seen == [0, 10**8, 2 * 10**8, 3 * 10**8, 4 * 10**8]
+
+
+def test_the_player_says_what_to_do_without_the_package(
+    ros: Callable[..., Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if message_type(CUSTOM) is not None:
+        pytest.skip("the package is installed")
+    ros()
+    with pytest.raises(UsageError, match="nothing to publish"):
+        play(recorded(tmp_path / "bag"))
+    assert f"no message type {CUSTOM}; dpm2 convert drive makes a recording with PointCloud2" in capfd.readouterr().err
