@@ -36,6 +36,9 @@ Stamps = NDArray[np.int64]
 _NO_BASE = ("map", "odom")  # frames that a base moves in
 _LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a tilt of more is said; the ground agrees with it to so much
 
+_CLOCKS = 0.15
+"""s: drivers that stamp the start of a sweep, or its end, send clouds later than that after their stamps alike."""
+
 
 class BagSource:
     """A rosbag2 folder, or a .mcap, .db3 or .bag file. See `Source`; `Frame.index` is the message count.
@@ -66,6 +69,7 @@ class BagSource:
         self.imu_topic = self._calibration.imu_topic = self._topics.imu()
         self._calibration.gnss_topic = self._topics.gnss()
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
+        self._delays: dict[str, list[int]] = {}  # ns from the stamp to the time of recording, of the clouds of a topic
         self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
         self._up = self._mounted(first)
@@ -113,6 +117,11 @@ class BagSource:
             missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
             self._note_once(f"{count - found[topic]} of {count} frames have no {what} of {topic}", within)
+        if found[known.second_topic]:
+            first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
+            if abs(apart := (second - first) * 1e-9) > _CLOCKS:
+                what = f"{known.second_topic}: clouds are recorded {apart:+.2f} s later after their stamps than others"
+                self._note_once(what, "a clock that is off? They join those of the same stamps")
 
     @cached_property
     def stamps(self) -> Stamps:
@@ -223,8 +232,11 @@ class BagSource:
         gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
         messages = self._in_order(self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])]))
         waiting: deque[tuple[int, RawMessage]] = deque()
+        delays = self._delays = {topic: [] for topic in (self.points_topic, known.second_topic)}
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others, waiting):
             stamp = serialized_stamp(data, time)
+            if topic in delays:
+                delays[topic].append(time - stamp)
             if topic == self.points_topic:
                 found = ((other, sensor.nearest(stamp)) for other, sensor in beside.items())
                 yield stamp, time, data, {other: message for other, message in found if message is not None}

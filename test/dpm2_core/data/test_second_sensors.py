@@ -65,6 +65,21 @@ def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
     assert said == ["4 of 4 frames have no cloud of /second (within 0.05 s)"] * bool(missing)
 
 
+@pytest.mark.parametrize(("clock", "later"), [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.7, 0.0), (0.0, 0.1)])
+def test_a_second_lidar_with_another_clock_is_named(bags: Any, tmp_path: Path, clock: float, later: float) -> None:
+    """By some periods: its clouds join others than those that they were measured with. A sweep's length between the
+    times of recording says nothing of a clock: one driver may stamp the start, the other one the end."""
+    times = np.arange(10, 13, 0.1).round(1)
+    second = [(t + 0.05 + later, "/second", bags.cloud(t + clock, frame="left")) for t in times]
+    first = [(t + 0.05, POINTS, bags.cloud(t)) for t in times]
+    tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
+    bag = bags.write(tmp_path / "b", by_time([tree, *first, *second]))
+    source = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second"))
+    assert [len(frame.points) for frame in source.frames()].count(120) >= 20
+    said = [note for note in source.notes if "later after their stamps" in note]
+    assert [note[:42] for note in said] == [f"/second: clouds are recorded {-clock:+.2f} s later"] * (clock != 0)
+
+
 def test_a_second_lidar_in_the_frame_of_the_first_needs_no_transform(bags: Any, tmp_path: Path) -> None:
     second = (1, "/second", bags.cloud(1, x=7, frame="/velo_link"))
     bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), second])
