@@ -145,13 +145,16 @@ class InertialMotion:
             )
 
     def _join(self, frame: Frame) -> None:
-        """The samples with those of a frame; from anew where time has gone back."""
+        """The samples with those of a frame that it does not share with the one before; from anew where time has gone
+        back."""
         old, new = self._samples, frame.imu
         if new is None or not len(new):
             return
-        if len(old) and new.stamps[0] <= old.stamps[-1]:
+        later = new.stamps > old.stamps.max(initial=new.stamps[0] - 1)
+        if not later.any():
             self._before, self._samples = None, new
             return
+        new = replace(new, stamps=new.stamps[later], rates=new.rates[later], forces=new.forces[later])
         keep = (old.stamps > new.stamps[-1] - _KEPT) & (np.arange(len(old), 0, -1) < _MOST)
         stamps, rates, forces = (
             np.concatenate([before[keep], after])
