@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -65,7 +66,8 @@ def own_part(name: str, sequence: str, request: Request, settings: Sequence[str]
     """Our SLAM on a sequence; `settings` count for less than the user's."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     asked = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
-    files = [Path(setting.partition("=")[2]) for setting in asked if setting.endswith(".safetensors")]
+    named = [setting.partition("=")[2] for setting in asked if setting.endswith(".safetensors")]
+    files = [Path(os.path.expanduser(path)) for path in named]
     arguments, content = {"drive": _drive(request, asked), **more}, drive_content(request.data, asked)
     return Part(f"{_folder(name)}/{sequence}", OWN, arguments, files, content=content)
 

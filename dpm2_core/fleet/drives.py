@@ -14,9 +14,10 @@ from dpm2_core.config import Settings, load_settings, read_yaml, settings_from
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.fleet.part import Advance, Figures, Part, counted
-from dpm2_core.network.pretrained import weights_path
+from dpm2_core.network.pretrained import pretrained_names, weights_path
 from dpm2_core.pipeline import OfflineRun
-from dpm2_core.slam.settings import Config
+from dpm2_core.slam.filters import filter_weights
+from dpm2_core.slam.settings import Config, SlamSettings
 
 MAP = "drive.dpm2map"
 """In the folder of a drive: its map file."""
@@ -88,19 +89,31 @@ def parts_of(
 
 
 def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
-    slam, inputs = config.slam, []
-    if slam.uses_descriptors:
-        inputs.append(weights_path(slam.neural.weights).resolve())
-        if Path(slam.neural.weights).is_file():  # a worker has another working directory
-            neural = slam.neural.model_copy(update={"weights": str(inputs[0])})
-            config = config.model_copy(update={"slam": slam.model_copy(update={"neural": neural})})
+    slam, inputs = _from_any_folder(config.slam)
+    config = config.model_copy(update={"slam": slam})
     arguments = {
         "path": drive.path,
         "frames": parse_range(drive.frames),
         "gt": drive.gt,
         "config": config.model_dump(mode="json"),
     }
+    if drive.gt:
+        inputs.append(Path(drive.gt))
     return Part(prefix + drive.name, _WORK, arguments, inputs, fresh=True, cores=slam.threads)
+
+
+def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
+    """The settings with whole paths of weights, as a worker has another working directory; and what they run with."""
+    files, changes = [], dict[str, Any]()
+    if slam.uses_descriptors:
+        files.append(weights_path(slam.neural.weights).resolve())
+        if slam.neural.weights not in pretrained_names():
+            changes["neural"] = slam.neural.model_copy(update={"weights": str(files[-1])})
+    if slam.filter.kind != "none":
+        files.append(filter_weights(slam.filter).resolve())
+        if slam.filter.weights is not None:
+            changes["filter"] = slam.filter.model_copy(update={"weights": files[-1]})
+    return slam.model_copy(update=changes), files
 
 
 def run_drive(

@@ -88,6 +88,22 @@ def in_level_axes(point_filter: PointFilter, points: Points) -> NDArray[np.bool_
     return point_filter(np.column_stack([points[:, :3] @ levelling(up).T, points[:, 3]]))
 
 
+def filter_weights(settings: FilterSettings) -> Path:
+    """The file with the weights of a filter.
+
+    Raises:
+        UsageError: there is none.
+    """
+    shipped = PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
+    path = Path(os.path.expanduser(str(settings.weights or shipped)))
+    if not path.is_file():
+        why = "no such file" if settings.weights else "none come with this dpm2"
+        raise UsageError(
+            f"slam.filter.weights: {why} ({path}); `dpm2 train {PERCEPTION_WEIGHTS[settings.kind]}` makes some"
+        )
+    return path
+
+
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """What the settings name; None for `none`. `threads` are torch's, of which there is one number for a process.
 
@@ -96,14 +112,7 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """
     if settings.kind == "none":
         return None
-    shipped = PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
-    path = Path(os.path.expanduser(str(settings.weights or shipped)))
-    if not path.is_file():
-        why = "no such file" if settings.weights else "none come with this dpm2"
-        raise UsageError(
-            f"slam.filter.weights: {why} ({path}); `dpm2 train {PERCEPTION_WEIGHTS[settings.kind]}` makes some"
-        )
-    return partial(in_level_axes, _named(settings, path, threads))
+    return partial(in_level_axes, _named(settings, filter_weights(settings), threads))
 
 
 def _named(settings: FilterSettings, path: Path, threads: int) -> PointFilter:

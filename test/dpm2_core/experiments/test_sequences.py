@@ -199,6 +199,18 @@ def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_pat
     assert len(found[0]) == 3  # ours, a program and a file
 
 
+def test_weights_in_the_home_folder_are_an_input_of_the_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they changed, the figures of those before stayed."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "sequences" / "06" / "velodyne").mkdir(parents=True)
+    np.zeros(4, "<f4").tofile(tmp_path / "sequences" / "06" / "velodyne" / "000000.bin")
+    (tmp_path / "poses").mkdir()
+    write_kitti(tmp_path / "poses" / "06.txt", np.eye(4)[None])
+    request = Request(tmp_path, tmp_path / "out", overrides=("slam.neural.weights=~/mine.safetensors",))
+    ((part,),) = KITTI.parts(request)
+    assert part.inputs == [tmp_path / "mine.safetensors"]
+
+
 def test_the_list_has_every_experiment() -> None:
     done = dpm2("experiment", "--list", "--json", "-")
     assert done.returncode == 0

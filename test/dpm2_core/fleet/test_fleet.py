@@ -257,6 +257,19 @@ def test_weights_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.M
     assert part.inputs == [tmp_path / "own.safetensors"]
 
 
+def test_a_drive_is_done_again_when_the_weights_of_its_filter_or_its_truth_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(Path(__file__), "own.safetensors")
+    Path("fleet.yaml").write_text("drives: [{path: a, gt: poses.txt}]")
+    of_filter = ["slam.filter.kind=movers", "slam.filter.weights=own.safetensors"]
+    (part,) = parts_of(read_drives([Path("fleet.yaml")]), None, [*FAST, *of_filter])
+    config: Any = part.arguments["config"]
+    assert config["slam"]["filter"]["weights"] == str(tmp_path / "own.safetensors")
+    assert part.inputs == [tmp_path / "own.safetensors", tmp_path / "poses.txt"]
+
+
 @pytest.mark.long
 def test_a_cluster_of_this_machine_is_not_reached_from_others(tmp_path: Path) -> None:
     """In a process of its own, as a command is: Ray reads once, when it is imported, where it is to listen."""
