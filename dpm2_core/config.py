@@ -69,7 +69,7 @@ def _kinds(annotation: Any) -> Iterator[Any]:
         yield from _kinds(part)
 
 
-def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[str] = ()) -> T:
+def load_settings(kind: type[T], path: Path | str | None = None, overrides: Sequence[str] = ()) -> T:
     """Defaults, then the YAML file, then `dotted.key=value` settings, each overriding the one before.
 
     A mapping as the value of a part changes the keys that it has; where keys are free, it replaces the one before.
@@ -77,7 +77,7 @@ def load_settings(kind: type[T], path: Path | None = None, overrides: Sequence[s
     Raises:
         UsageError: the file is missing or no YAML mapping, or a key or value is not allowed.
     """
-    tree = {} if path is None else read_settings(kind, path)
+    tree = {} if path is None else read_settings(kind, Path(path))
     origin: dict[str, str] = {}
     for setting in overrides:
         key, equals, text = setting.partition("=")

@@ -41,8 +41,8 @@ class OfflineRun:
         source: Source | Path | str,
         config: Config | None = None,
         frames: Span = (0, None),
-        ground_truth: Path | None = None,
-        map_file: Path | None = None,
+        ground_truth: Path | str | None = None,
+        map_file: Path | str | None = None,
         map_mode: MapMode = "create",
     ) -> None:
         """Open everything that the run needs; nothing is written yet but the beginning of the map file.
@@ -60,6 +60,7 @@ class OfflineRun:
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
         self._ran = False
+        map_file = None if map_file is None else Path(map_file)
         self._begun = None if map_file is None or map_file.exists() else map_file  # a map file without a frame yet
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:

@@ -15,7 +15,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 
-def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) -> Array | Trajectory | None:
+def read_ground_truth(source: Source, path: Path | str | None, start: int, stop: int) -> Array | Trajectory | None:
     """Of frames start..stop-1: LiDAR poses (N, 4, 4), or a trajectory to be matched by stamp or number, or None.
 
     Args:
@@ -43,7 +43,7 @@ def read_ground_truth(source: Source, path: Path | None, start: int, stop: int) 
     return poses if source.T_cam_lidar is None else in_other_frame(poses, se3.inverse(source.T_cam_lidar))
 
 
-def _check_overlap(truth: Trajectory, path: Path, source: Source, start: int, stop: int) -> None:
+def _check_overlap(truth: Trajectory, path: Path | str, source: Source, start: int, stop: int) -> None:
     """Before the run: at its end the error would cost all its time.
 
     Raises:

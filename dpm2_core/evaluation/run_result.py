@@ -177,7 +177,7 @@ class Result:
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 
-    def save(self, out: Path, cloud: bool = True) -> list[str]:
+    def save(self, out: Path | str, cloud: bool = True) -> list[str]:
         """Write all files, each whole or not at all; returns what could not be done, in words.
 
         Files of a run before, of which this one has none, are removed.
@@ -189,6 +189,7 @@ class Result:
             Dpm2Error: a file could not be written; the old one survives. UsageError: no folder can be made there, or,
                 when all other files are written, see `metrics`.
         """
+        out = Path(out)
         make_folder(out)
         remove_results(out, METRICS, TRUTH, PICTURE, LOCALIZATION)  # also where the truth turns out not to fit
         save_config(self.config, out)

@@ -39,7 +39,7 @@ def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:
     return open_session(path, config.slam, dump_settings(config), mode != "create")
 
 
-def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) -> MapStore:
+def open_session(path: Path | str, settings: SlamSettings, config: str, resume: bool) -> MapStore:
     """The map file to write to, with a new session begun.
 
     Args:
@@ -49,7 +49,7 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     Raises:
         UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
     """
-    weights = settings.weights_id()
+    path, weights = Path(path), settings.weights_id()
     if path.exists() and not resume:
         raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
     # Not whether it exists now: another node may have made one of that name since.
@@ -66,12 +66,13 @@ def open_session(path: Path, settings: SlamSettings, config: str, resume: bool) 
     return store
 
 
-def open_for_localization(path: Path, settings: SlamSettings) -> MapStore | TiledMap:
+def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore | TiledMap:
     """The map file, or folder of tiles, to find oneself in, open for reading only.
 
     Raises:
         UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
     """
+    path = Path(path)
     if path.is_dir():
         tiles = TiledMap(path)
         _check_same(path, tiles.weights, weights_id(settings.neural.weights))

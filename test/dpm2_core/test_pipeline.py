@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.config import load_settings
+from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import Trajectory, interpolate, read_trajectory, write_kitti, write_tum
@@ -21,6 +21,7 @@ from dpm2_core.frame import Frame
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.session import open_for_localization
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import load_map, trajectory
 from dpm2_core.slam.store.map_store import MapStore
@@ -47,6 +48,20 @@ def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def result(recording: Path) -> Result:
     """Of the whole drive."""
     return OfflineRun(recording, CONFIG).run()
+
+
+@pytest.mark.slow
+def test_a_path_may_be_a_text(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a notebook: `save` ended with an AttributeError, when the drive was over."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(dump_settings(CONFIG))
+    config = load_settings(Config, "mine.yaml")
+    truth = str(next(recording.rglob("poses.txt")))
+    with OfflineRun(str(recording), config, (0, 2), ground_truth=truth, map_file="drive.dpm2map") as drive:
+        drive.run().save("out", cloud=False)
+    assert Path("out/trajectory.tum").is_file()
+    with pytest.raises(UsageError, match="no keyframe has descriptors"):
+        open_for_localization("drive.dpm2map", config.slam)
 
 
 @pytest.mark.slow
