@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry of a recording: python examples/odometry_of_a_folder.py RECORDING POSES.txt"""
+"""Odometry of a recording: python examples/odometry_of_a_folder.py RECORDING POSES.txt
+
+The poses are of the LiDAR: `dpm2 eval --gt RECORDING --est POSES.txt` needs `--calib CALIB.txt` where the truth is of
+KITTI's left camera.
+"""
 
 import sys
 

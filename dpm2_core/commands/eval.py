@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from dpm2_core.commands.options import JsonFile, parse_lengths, show
+from dpm2_core.commands.options import JsonFile, note, parse_lengths, show
 from dpm2_core.config import load_settings
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import is_drive, open_source
@@ -18,12 +18,16 @@ from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stam
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
-from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.evaluation.metrics import evaluate, have_other_axes
 from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.geometry import se3
 
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
 FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
+OTHER_AXES = (
+    "the two run alike, but along other axes, as those of LiDAR and left camera do (--calib takes the estimate "
+    "from one to the other), or poses without rotations: then only APE means something"
+)
 FRAME_OF_DRIVE = "{}, as in the files of this kind that dpm2 run writes"
 
 
@@ -65,6 +69,9 @@ def eval_(
     stamps = keys if "tum" in (truth.kind, estimate.kind) else stamps_of(keys)
     metrics = evaluate(true, est_poses, chosen, stamps=stamps).model_copy(update={"truth": str(gt)})
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
+    both = known(true) & known(est_poses)
+    if have_other_axes(true[both], est_poses[both]):
+        note(OTHER_AXES)
     show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)
 
 

@@ -148,6 +148,19 @@ def align(source: Array, target: Array) -> Array:
     return se3.make(U @ Vt, target_mean - U @ Vt @ source_mean)
 
 
+def have_other_axes(gt: Array, est: Array) -> bool:
+    """Whether (N, 4, 4) poses run as others do, but along other axes: of LiDAR and camera, or without rotations.
+
+    Then what aligns the first pose turns the way from where what aligns all positions has it: by 0.3 (17 degrees) or
+    more of its extent, far more than an odometry errs on a way that fits to a tenth.
+    """
+    T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
+    turn = gt[0, :3, :3] @ est[0, :3, :3].T - T_gt_est[:3, :3]
+    centered = est[:, :3, 3] - est[:, :3, 3].mean(0)
+    extent = _rms(np.linalg.norm(centered, axis=1))
+    return ape_rmse(gt, est) < 0.1 * extent and _rms(np.linalg.norm(centered @ turn.T, axis=1)) > 0.3 * extent
+
+
 def ape_rmse(gt: Array, est: Array) -> float:
     """Root mean square position error, m, of (N, 4, 4) poses after alignment of all positions."""
     return _rms(_position_errors(gt, est))
