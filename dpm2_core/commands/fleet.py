@@ -32,7 +32,9 @@ Out = Annotated[Path, typer.Option(help="Folder for the results, which all worke
 Address = Annotated[
     str | None, typer.Option("--ray", metavar="ADDRESS", help="Of a cluster, HOST:PORT or auto; else this machine.")
 ]
-Workers = Annotated[int | None, typer.Option(min=1, help="Drives at a time [as many as there are processors for].")]
+Workers = Annotated[
+    int | None, typer.Option(min=1, show_default="as many as there are processors for", help="Tasks at a time.")
+]
 
 
 @app.command()

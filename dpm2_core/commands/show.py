@@ -24,7 +24,8 @@ def show(
     weights: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name of shipped weights, or a .safetensors file; several are drawn below each other. [small]"
+            show_default="small",
+            help="Name of shipped weights, or a .safetensors file; several are drawn below each other.",
         ),
     ] = None,
     corrupt: Annotated[str | None, typer.Option(help="Let sensors fail, as `dpm2 run --corrupt` does.")] = None,

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
 from dpm2_core.cli import COMMANDS, GROUPS, load_command
@@ -46,6 +47,13 @@ def straight(tmp_path: Path) -> Path:
     poses = np.array([se3.make(np.eye(3), [0, 0, 1.3 * i]) for i in range(101)])
     write_kitti(tmp_path / "poses.txt", poses)
     return tmp_path / "poses.txt"
+
+
+@pytest.mark.parametrize(("name", "command"), all_commands(), ids=[name for name, _ in all_commands()])
+def test_no_word_of_a_help_is_taken_for_markup(name: str, command: TyperCommand) -> None:
+    """`--workers` of `dpm2 fleet` had lost its default, which stood in square brackets."""
+    texts = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
+    assert [text for text in texts if text and Text.from_markup(text).plain != text] == []
 
 
 def test_without_arguments_there_is_the_help_in_groups() -> None:
