@@ -16,9 +16,7 @@ from dpm2_core.tables import FigureTable
 
 
 def finetune(
-    src: Annotated[
-        list[Path], typer.Argument(help="Drives: KITTI sequences or roots, rosbag2 folders, .mcap or .db3.")
-    ],
+    src: Annotated[list[Path], typer.Argument(help="Any recordings that `dpm2 run` reads.")],
     out: OutOption = Path("out/finetune"),
     config: ConfigOption = None,
     settings: SetOption = None,

@@ -30,7 +30,7 @@ from dpm2_core.slam.system import SlamResult
 
 def run(
     src: Annotated[
-        Path, typer.Argument(help="KITTI odometry sequence or root, or a bag: rosbag2 folder, .mcap, .db3, .bag.")
+        Path, typer.Argument(help="KITTI, a bag of ROS 2 or ROS 1, PCD or PLY files, ...: docs/recordings.md.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,

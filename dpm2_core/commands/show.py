@@ -18,7 +18,7 @@ from dpm2_core.frame import Frame
 
 
 def show(
-    src: Annotated[Path, typer.Argument(help="KITTI sequence or root, or a bag: rosbag2 folder, .mcap, .db3, .bag.")],
+    src: Annotated[Path, typer.Argument(help="Any recording that `dpm2 run` reads.")],
     frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[
