@@ -49,7 +49,7 @@ def straight(tmp_path: Path) -> Path:
     return tmp_path / "poses.txt"
 
 
-@pytest.mark.parametrize(("name", "command"), all_commands(), ids=[name for name, _ in all_commands()])
+@pytest.mark.parametrize(("name", "command"), [*all_commands()], ids=[name for name, _ in all_commands()])
 def test_no_word_of_a_help_is_taken_for_markup(name: str, command: TyperCommand) -> None:
     """`--workers` of `dpm2 fleet` had lost its default, which stood in square brackets."""
     texts = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
