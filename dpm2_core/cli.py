@@ -7,6 +7,7 @@ A command's module is imported when it is called, not to list it: numpy, gtsam a
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 from dpm2_core._version import __version__
 from dpm2_core.console import QUIET
 from dpm2_core.errors import exit_code
+from dpm2_core.imports import importing
 from dpm2_core.interrupt import terminate_as_interrupt
 from dpm2_core.openmp import wait_passively
 
@@ -101,7 +103,8 @@ class Commands(TyperGroup):
 def load_command(name: str) -> TyperCommand | TyperGroup:
     """Import a command of `COMMANDS`; it and its subcommands take `--quiet`."""
     module, attribute = COMMANDS[name][0].split(":")
-    found = getattr(import_module(f"dpm2_core.commands.{module}"), attribute)
+    with importing():
+        found = getattr(import_module(f"dpm2_core.commands.{module}"), attribute)
     command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _command(name, found)
     for single in command.commands.values() if isinstance(command, TyperGroup) else (command,):
         single.params.extend(_command("quiet", _quiet).params)
@@ -151,7 +154,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
     wait_passively()
     terminate_as_interrupt()
-    sys.exit(_status(arguments))
+    try:
+        sys.exit(_status(arguments))
+    finally:
+        if arguments is None:  # the process ends: Python need not look through all that was imported once more
+            gc.freeze()
 
 
 def _status(arguments: Sequence[str] | None) -> int:

@@ -6,6 +6,7 @@ Signals are caught before the slow imports, so that a process that is stopped wh
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,6 +15,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from dpm2_core.errors import UsageError, exit_code
+from dpm2_core.imports import importing
 from dpm2_core.openmp import wait_passively
 from dpm2_ros.runtime import catch_signals, ignore_signals, spin_node
 
@@ -34,7 +36,8 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
     """Plays a recording."""
 
     def work(arguments: Sequence[str]) -> int:
-        from dpm2_ros.bag_player import main
+        with importing():
+            from dpm2_ros.bag_player import main
 
         return main(arguments)
 
@@ -53,7 +56,9 @@ def _spin(name: str, kind: str, arguments: Sequence[str]) -> int:
 
         if unknown := remove_ros_args(["", *of_ros])[1:]:
             raise UsageError(f"unknown argument {unknown[0]}; those of ROS, such as -p, come after --ros-args")
-        return partial(getattr(import_module(f"dpm2_ros.{name}"), kind), len(of_ros) < len(arguments))
+        with importing():
+            node = getattr(import_module(f"dpm2_ros.{name}"), kind)
+        return partial(node, len(of_ros) < len(arguments))
 
     return spin_node(load, of_ros)
 
@@ -74,6 +79,7 @@ def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) 
         return exit_code(with_ros)
     finally:
         ignore_signals()
+        gc.freeze()  # Python looks through everything once more when it ends, for half a second
 
 
 if __name__ == "__main__":

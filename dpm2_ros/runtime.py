@@ -7,6 +7,7 @@ rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, an
 from __future__ import annotations
 
 import faulthandler
+import gc
 import math
 import os
 import re
@@ -129,6 +130,7 @@ def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -
     nodes = list[Any]()
     try:
         make = load()
+        gc.freeze()  # each search for garbage through what was imported would take longer than a frame
         if not STOP.is_set():  # else no map is opened, no network loaded
             sys.setswitchinterval(_SWITCH)
             nodes.append(make())

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from safetensors import SafetensorError, deserialize, safe_open
 
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.imports import importing
 from dpm2_core.openmp import allowed
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -98,7 +99,8 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
     Raises:
         UsageError: as `load`, and for a file that is not there.
     """
-    import torch
+    with importing():
+        import torch
 
     torch.set_num_threads(allowed(threads))
     try:
@@ -135,7 +137,8 @@ def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
 
 
 def _load(path: Path) -> DeepPointMap2:
-    from dpm2_core.network.weights import load_model_and_metadata
+    with importing():
+        from dpm2_core.network.weights import load_model_and_metadata
 
     model, metadata = load_model_and_metadata(path)
     if metadata.get("images") != "true":
