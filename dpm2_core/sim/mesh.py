@@ -60,18 +60,34 @@ def make(
     return Mesh(
         vertices,
         faces,
-        np.broadcast_to(np.asarray(label, np.uint8), n).copy(),
-        np.broadcast_to(np.asarray(material, np.uint8), n).copy(),
-        np.broadcast_to(np.asarray(color, np.uint8), (n, 3)).copy(),
+        _bytes(label, (n,)),
+        _bytes(material, (n,)),
+        _bytes(color, (n, 3)),
         _box_uv(vertices[faces]) if uv is None else np.asarray(uv, np.float32),
         np.zeros(n, np.uint16),
     )
 
 
+# A world is made of thousands of small meshes: what numpy's functions of many arguments do before they compute took
+# a quarter of the time that it takes.
+
+
+def _bytes(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    out = np.empty(shape, np.uint8)
+    out[...] = np.asarray(values, np.uint8)
+    return out
+
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+_ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the axes across each axis
+_CORNER = np.arange(3)[:, None]
+
+
 def _box_uv(corners: Float) -> Float:
-    normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(-1)]
-    return np.take_along_axis(corners, axes[:, None, :], axis=-1)
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.abs(a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT])
+    axes = _ACROSS[normal.argmax(-1)]
+    return corners[np.arange(len(corners))[:, None, None], _CORNER, axes[:, None, :]]
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,12 +45,19 @@ def rod(start: ArrayLike, end: ArrayLike, radii: tuple[float, float], sides: int
 
 def blob(center: ArrayLike, radii: ArrayLike, rough: float, rng: np.random.Generator, surface: Surface) -> Mesh:
     """An ellipsoid of 80 triangles with its vertices moved in and out by the fraction `rough`."""
+    vertices, faces = _sphere()
+    points = vertices * (1 + rng.normal(0, rough, (len(vertices), 1))) * np.asarray(radii)
+    return make(points + np.asarray(center), faces, *surface)
+
+
+@cache
+def _sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (42, 3) on the unit sphere and faces (80, 3)."""
     with needs("sim", "the synthetic city"):
         import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=1)
-    points = sphere.vertices * (1 + rng.normal(0, rough, (len(sphere.vertices), 1))) * np.asarray(radii)
-    return make(points + np.asarray(center), sphere.faces, *surface)
+    return np.array(sphere.vertices), np.array(sphere.faces)
 
 
 def leaves(centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike) -> Mesh:
@@ -94,18 +102,20 @@ def relief(x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, co
     d = depth.ravel()
     front = _quads(x[i], d, z[j], x[i + 1], d, z[j], x[i + 1], d, z[j + 1], x[i], d, z[j + 1])
     quads, materials, colors = [front], [material.reshape(-1)], [color.reshape(-1, 3)]
-    ring = np.pad(depth, ((1, 1), (0, 0)))  # jambs; at the ends down to the plane
-    i, j = np.nonzero(np.diff(ring, axis=0))
+    ring = np.zeros((depth.shape[0] + 2, depth.shape[1]))  # jambs; at the ends down to the plane
+    ring[1:-1] = depth
+    i, j = np.nonzero(ring[1:] - ring[:-1])
     near, far = ring[i, j], ring[i + 1, j]
     quads.append(_quads(x[i], near, z[j], x[i], far, z[j], x[i], far, z[j + 1], x[i], near, z[j + 1]))
-    shallow = np.where(ring[i, j] < ring[i + 1, j], np.clip(i - 1, 0, None), np.clip(i, None, len(depth) - 1))
+    shallow = np.where(ring[i, j] < ring[i + 1, j], np.maximum(i - 1, 0), np.minimum(i, len(depth) - 1))
     materials.append(np.full(len(i), Material.PLASTER))
     colors.append(color[shallow, j])
-    ring = np.pad(depth, ((0, 0), (1, 1)))  # sills and lintels
-    i, j = np.nonzero(np.diff(ring, axis=1))
+    ring = np.zeros((depth.shape[0], depth.shape[1] + 2))  # sills and lintels
+    ring[:, 1:-1] = depth
+    i, j = np.nonzero(ring[:, 1:] - ring[:, :-1])
     near, far = ring[i, j], ring[i, j + 1]
     quads.append(_quads(x[i], near, z[j], x[i + 1], near, z[j], x[i + 1], far, z[j], x[i], far, z[j]))
-    shallow = np.where(ring[i, j] < ring[i, j + 1], np.clip(j - 1, 0, None), np.clip(j, None, depth.shape[1] - 1))
+    shallow = np.where(ring[i, j] < ring[i, j + 1], np.maximum(j - 1, 0), np.minimum(j, depth.shape[1] - 1))
     materials.append(np.full(len(i), Material.CONCRETE))
     colors.append(color[i, shallow])
     points = np.concatenate(quads).reshape(-1, 3)

@@ -7,8 +7,9 @@ crossings, loops and streets that are driven twice alike: nothing can stand on a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import cv2
@@ -171,12 +172,7 @@ class Terrain:
 
     def contour(self, level: float) -> Iterator[Kerbline]:
         """The lines `level` m outside the kerb (negative: on the road), streets' ends included."""
-        with needs("sim", "the synthetic city"):
-            import contourpy
-
-        x = self.origin[0] + np.arange(self.edge.shape[1]) * RESOLUTION
-        y = self.origin[1] + np.arange(self.edge.shape[0]) * RESOLUTION
-        for line in cast("list[Array]", contourpy.contour_generator(x, y, self.edge).lines(level)):
+        for line in self._lines(level):
             length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
             if length[-1] < 6:
                 continue
@@ -189,6 +185,16 @@ class Terrain:
             away = np.einsum("ij,ij->i", outward, xy - self.center[sample])
             outward *= np.sign(away + 1e-9)[:, None]
             yield Kerbline(xy, outward, self.junction[sample])
+
+    @cached_property
+    def _lines(self) -> Callable[[float], list[Array]]:
+        """(N, 2) lines at which `edge` has a value, m."""
+        with needs("sim", "the synthetic city"):
+            import contourpy
+
+        x = self.origin[0] + np.arange(self.edge.shape[1]) * RESOLUTION
+        y = self.origin[1] + np.arange(self.edge.shape[0]) * RESOLUTION
+        return cast("Callable[[float], list[Array]]", contourpy.contour_generator(x, y, self.edge).lines)
 
     def ground(self) -> Mesh:
         """The mesh of the ground, roads and sidewalks included."""
