@@ -311,14 +311,18 @@ def ros() -> Iterator[Callable[..., Harness]]:
 
 
 @pytest.fixture
-def mapper(ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes."""
+def mapper(
+    ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Any:
+    """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes; with the network
+    where its parameter says so."""
     from dpm2_ros.keyframe_messages import payload_to_msgs  # these import the whole SLAM
     from dpm2_ros.mapper_node import MapperNode
     from dpm2_ros.mapping import KEEP_ALL
 
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    harness = ros(f"ros.map_directory:={tmp_path / 'map'}", "slam.loops.descriptors:=true")
+    described = str(getattr(request, "param", False)).lower()
+    harness = ros(f"ros.map_directory:={tmp_path / 'map'}", f"slam.loops.descriptors:={described}")
     harness.mapper = harness.add(MapperNode())
     kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
     wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]

@@ -174,6 +174,7 @@ def hostile_parts(id: int) -> list[Any]:
     return [*poses, *clouds, short, wide]
 
 
+@pytest.mark.parametrize("mapper", [True], ids=["descriptors"], indirect=True)
 def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
     """Unsound messages are rejected one by one, and counted by their reason; the robot's own then make its map."""
     wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires, strict=True))
@@ -199,6 +200,7 @@ def test_no_name_ends_the_mapper(mapper: Any, name: str) -> None:
     mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe after it")
 
 
+@pytest.mark.parametrize("mapper", [True], ids=["descriptors"], indirect=True)
 def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     """The keyframe is used, and what is compared with others comes from the mapper's own network."""
     name, cloud = keyframe_name("", 0, S), points(0)
