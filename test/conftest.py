@@ -27,6 +27,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # where a test does not ask for m
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # some hundred processes are started: compile their modules once
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
 
+gc.disable()  # until all is imported: a quarter of the time of collecting went into the search for garbage
+
 ROS = Path(__file__).resolve().parent / "dpm2_ros"
 
 # The same examples in every run, however slow the machine is.
@@ -47,6 +49,7 @@ def pytest_collection_finish() -> None:
     """What is imported by now stays: the garbage collector need not look through it in every test."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def of_all_workers(tmp_path_factory: pytest.TempPathFactory) -> Path:
