@@ -19,9 +19,14 @@ Drive = tuple[list[Frame], Array]
 
 
 @cache
+def street(preset: PresetName, seed: int, length: float = 160.0) -> World:
+    """A straight road of so many meters; building one takes seconds."""
+    return build_world("straight", preset, seed=seed, length=length)
+
+
 def straight(preset: PresetName) -> World:
     """200 m of a straight road."""
-    return build_world("straight", preset, seed=11, length=200.0)
+    return street(preset, 11, 200.0)
 
 
 def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start: float = 2.0) -> Drive:

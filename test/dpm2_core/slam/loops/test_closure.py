@@ -32,19 +32,20 @@ from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, m
 from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
+from ....helpers.drives import street
+
 FIRM, OFF = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.diag([0.01] * 3 + [0.7] * 3) ** 2
 STREET = np.arange(40.0, 105.0, 5.0)
 ONE_PART = np.zeros(100, np.intp)  # all keyframes are tied together
 
 
-@cache
 def suburb() -> World:
-    return build_world("straight", "suburb", seed=8, length=160.0)
+    return street("suburb", 8)
 
 
 @cache
 def network() -> DeepPointMap2:
-    return load_network("small", 2)
+    return load_network("small", 1)
 
 
 @cache
@@ -138,7 +139,7 @@ def test_places_that_agree_on_no_motion_are_not_correlated(monkeypatch: pytest.M
 @pytest.mark.slow
 @pytest.mark.weights
 def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -> None:
-    world = build_world("straight", "city", seed=5, length=160.0)
+    world = street("city", 5)
     lidar, rng, search = Lidar(LidarConfig()), np.random.default_rng(0), closer(gap=30.0)
     keyframes, clouds, loops = [], [], []
     poses = np.array([where(s) for s in STREET] + [where(s) for s in (60.0, 65.0)])
@@ -268,18 +269,26 @@ def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.M
     assert "the overlap head of these weights is not trained" in {loop.registration.reason for loop in loops}
 
 
+@cache
+def in_the_car_park(s: float) -> tuple[Array, Points, Descriptors | None]:
+    """Pose at `s` m of the way, what a robot there sees, and its descriptors."""
+    world = build_world("loop", "car_park", seed=902, length=120.0)
+    lidar, T = Lidar(real_sensor(LidarConfig(beams=16, height=0.8))), world.pose_at(s, height=0.8)
+    points = lidar.scan(world, T, 0.5 * s, np.random.default_rng(int(s))).points
+    cloud = points[voxel_first(points, 0.3, far=40.0)]
+    return T, cloud, closer().described(Keyframe(0, 0, 0, np.eye(4), cloud)).descriptors
+
+
 def joined(*ways: tuple[float, float]) -> tuple[list[Edge], Array]:
     """Loops between two robots in a car park that looks alike everywhere, each of which drives a part of one way, m."""
-    world = build_world("loop", "car_park", seed=902, length=120.0)
-    lidar = Lidar(real_sensor(LidarConfig(beams=16, height=0.8)))
     search, keyframes, clouds, truth, loops = closer(), list[Keyframe](), list[Points](), list[Array](), list[Edge]()
     for robot, (start, stop) in zip("ab", ways, strict=True):
         for s in np.arange(start, stop, 4.0):
-            truth.append(world.pose_at(s, height=0.8))
-            points = lidar.scan(world, truth[-1], 0.5 * s, np.random.default_rng(int(s))).points
-            clouds.append(points[voxel_first(points, 0.3, far=40.0)])
+            T, cloud, known = in_the_car_park(float(s))
+            truth.append(T)
+            clouds.append(cloud)
             edge = Registration(np.eye(4), FIRM, 1.0, 0.1, "test") if s > start else None
-            keyframes.append(search.described(Keyframe(len(truth), 0, 0, truth[-1], clouds[-1], edge, robot)))
+            keyframes.append(Keyframe(len(truth), 0, 0, T, cloud, edge, robot, known))
             of_robots = np.array([keyframe.robot == "b" for keyframe in keyframes], np.intp)
             loops += search.close(keyframes, clouds, np.array(truth), of_robots)
     return loops, np.array(truth)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,10 +33,19 @@ PAINT = random_paint()
 
 
 def keyframe(x: float, paint: Paint, index: int, pictured: bool = True) -> Keyframe:
+    whole = with_picture(x, paint, index)
+    return whole if pictured else replace(whole, thumbnail=None)
+
+
+@cache
+def with_picture(x: float, paint: Paint, index: int) -> Keyframe:
+    """Not to be written to: the tests have maps of the same keyframes."""
     seen = frame(x, paint, index, gain=0.8)
-    picture = thumbnail(seen.images[0], PLACE_WIDTH) if pictured else None
     describe = PlaceRecognition(load_network("small", 1)).describe
-    return Keyframe(index, index * 10**9, index, place(x), seen.points, None, "", describe(seen.points), picture)
+    return Keyframe(
+        index, index * 10**9, index, place(x), seen.points, None, "", describe(seen.points),
+        thumbnail(seen.images[0], PLACE_WIDTH),
+    )  # fmt: skip
 
 
 def place(x: float) -> Array:

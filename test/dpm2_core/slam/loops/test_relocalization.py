@@ -10,14 +10,15 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe, Registration, State
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.settings import LidarConfig
-from dpm2_core.sim.world import World, build_world
+from dpm2_core.sim.settings import LidarConfig, PresetName
+from dpm2_core.sim.world import World
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
@@ -26,18 +27,21 @@ from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.texture import VisualSettings
 
+from ....helpers.drives import street
+
 pytestmark = pytest.mark.weights
 
 FIRM, LOST = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.eye(6)
 LIDAR = Lidar(LidarConfig(columns=1024))
 
 
+def world(preset: PresetName = "suburb", seed: int = 8) -> World:
+    return street(preset, seed)
+
+
 @cache
-def world(preset: str = "suburb", seed: int = 8) -> World:
-    return build_world("straight", preset, seed=seed, length=160.0)
-
-
 def seen(s: float, lateral: float = 0.0, heading: float = 0.0, time: float = 0.0, of: World | None = None) -> Points:
+    """Not to be written to."""
     place = of or world()
     return LIDAR.scan(place, place.pose_at(s, lateral, heading), time, np.random.default_rng(int(10 * s))).points
 
@@ -51,10 +55,13 @@ def relocalizer() -> Relocalizer:
 
 def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) -> Relocalizer:
     """`looks`: what the descriptors are of; the clouds."""
-    network = load_network("small", 2)
-    describe = PlaceRecognition(network).describe
+    network, described = load_network("small", 1), dict[int, Descriptors | None]()
+    for cloud in looks or clouds:  # some look alike
+        if id(cloud) not in described:
+            described[id(cloud)] = PlaceRecognition(network).describe(cloud)
     keyframes = [
-        Keyframe(i, i, i, poses[i], cloud[:0], None, "", describe(cloud)) for i, cloud in enumerate(looks or clouds)
+        Keyframe(i, i, i, poses[i], cloud[:0], None, "", described[id(cloud)])
+        for i, cloud in enumerate(looks or clouds)
     ]
     settings = RelocalizationSettings()
     verifier = Verifier(settings.verification, GeometricSettings())

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,7 @@ def test_a_place_must_fit_clearly_better_than_others(best: float, others: list[f
     assert objection_of_others(fits[0], fits[1:]) == objection
 
 
+@cache
 def scans_along(preset: PresetName) -> tuple[list[Points], Array]:
     """Scans every 5 m along a street of 60 m."""
     world = build_world("straight", preset, seed=6, length=120.0)
@@ -45,7 +48,7 @@ def scans_along(preset: PresetName) -> tuple[list[Points], Array]:
     return [lidar.scan(world, T, 0.0, rng).points for T in poses], poses
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def suburb_scans() -> tuple[list[Points], Array]:
     return scans_along("suburb")
 
