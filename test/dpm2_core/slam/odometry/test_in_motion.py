@@ -15,7 +15,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.simulated_drive import RIDES, TurningRobot
-from dpm2_core.sim.world import build_world
+from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 
@@ -24,10 +24,16 @@ FRAMES = 40  # it stands during the first ten, and shakes from the 20th on
 
 
 @cache
+def block() -> World:
+    """What all of them go round."""
+    return build_world("loop", "suburb", seed=1, length=300.0)
+
+
+@cache
 def sweeps(name: str) -> tuple[TurningRobot, list[Frame]]:
     """Stamped in their middle, with the time of each point."""
     lidar = LidarConfig(beams=32, columns=512, height=1.4, car_body=False)
-    robot = TurningRobot(build_world("loop", "suburb", seed=1, length=300.0), FRAMES, RIDES[name], lidar)
+    robot = TurningRobot(block(), FRAMES, RIDES[name], lidar)
     return robot, list(robot.frames())
 
 

@@ -100,10 +100,16 @@ def test_few_scans_a_second_are_enough(robot: tuple[list[Frame], Array]) -> None
     assert error(inertial, truth) < 0.01 < 10 * error(inertial, truth) < error(plain, truth)
 
 
+@pytest.fixture(scope="module")
+def plain(robot: tuple[list[Frame], Array]) -> list[OdometryResult]:
+    """Its odometry without the IMU."""
+    return run(without(robot[0]))
+
+
 @pytest.mark.slow
-def test_fast_turns_cost_millimeters(robot: tuple[list[Frame], Array]) -> None:
+def test_fast_turns_cost_millimeters(robot: tuple[list[Frame], Array], plain: list[OdometryResult]) -> None:
     frames, truth = robot
-    plain, inertial = run(without(frames)), run(frames)
+    inertial = run(frames)
     assert all(t.registration.ok for t in inertial)
     assert max(error(inertial, truth), error(plain, truth)) < 0.01
     assert {t.imu for t in plain} == {None}
@@ -126,7 +132,7 @@ def test_one_that_stops_is_missed_and_one_that_comes_late_is_used(robot: tuple[l
 
 
 @pytest.mark.slow
-def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array]) -> None:
+def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array], plain: list[OdometryResult]) -> None:
     """/tf_static says that it is upside down: it turns the other way."""
     frames, truth = robot
     upside_down = np.diag([1.0, -1.0, -1.0])
@@ -134,7 +140,7 @@ def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array]) -> Non
     assert lies[-1].imu is not None
     assert lies[-1].imu.startswith("its turns are not those of the scans")
     assert sum(t.imu == "" for t in lies) < 25  # while it stands nothing shows it
-    assert error(lies, truth) < 3 * error(run(without(frames)), truth)
+    assert error(lies, truth) < 3 * error(plain, truth)
 
 
 @pytest.mark.slow
@@ -198,7 +204,7 @@ def test_indoors_scans_know_the_heading_better(
 
 @pytest.mark.slow
 def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lost(
-    robot: tuple[list[Frame], Array],
+    robot: tuple[list[Frame], Array], plain: list[OdometryResult]
 ) -> None:
     """In a bend of 100 deg/s, which ends; the scan that shows it is not to be bent by those rates."""
     frames, truth = robot
@@ -209,7 +215,7 @@ def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lo
     assert all(t.registration.ok for t in repeats)
     assert repeats[-1].imu is not None
     assert repeats[-1].imu.startswith("its turns are not those of the scans")
-    assert error(repeats, truth) < 2 * error(run(without(frames)), truth)
+    assert error(repeats, truth) < 2 * error(plain, truth)
 
 
 @pytest.mark.slow
