@@ -77,7 +77,9 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
 
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
     """Nothing is there; then it looks everywhere, after a second although it has hardly moved."""
-    done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0")
+    done = dpm2(
+        "run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0", *QUICK
+    )
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert report["frames_until_found"] == 6  # the next keyframe, 5 m on
@@ -94,7 +96,7 @@ def test_kidnapping_is_noticed_and_answered(recording: Path, made: Path, tmp_pat
         target = recording / "sequences" / "00" / "velodyne" / f"{frame:06d}.bin"
         (sequence / "velodyne" / f"{n:06d}.bin").symlink_to(target)
     (sequence / "times.txt").write_text("".join(f"{0.1 * n:.1f}\n" for n in range(len(order))))
-    done = dpm2("run", sequence, "--out", tmp_path / "o", "--localise", made)
+    done = dpm2("run", sequence, "--out", tmp_path / "o", "--localise", made, *QUICK)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert [event["event"] for event in report["events"]].count("found") + report["kidnappings"] == 2
