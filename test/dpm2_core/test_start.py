@@ -71,3 +71,14 @@ def test_what_the_user_chose_stays() -> None:
         "print(os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'])"
     )
     assert output == "active 2\n"
+
+
+@pytest.mark.slow
+def test_the_compiled_loops_need_no_folder_to_write_to() -> None:
+    """They are compiled anew then, and give the same."""
+    output = python(
+        "import numba.core.caching as caching; caching.CacheImpl._locator_classes = []\n"
+        "import numpy as np; from dpm2_core.geometry.voxel import voxel_first\n"
+        "print(voxel_first(np.array([[0, 0, 0], [0.1, 0, 0], [1, 0, 0.]]), 0.5))"
+    )
+    assert "[0 2]" in output
