@@ -201,6 +201,9 @@ def check_new(path: Path) -> None:
 def append_map(store: MapStore, data: MapData) -> None:
     """Write a map behind what is in the file; its nodes and sessions count on. Clouds pass through one at a time.
 
+    An edge goes into the file with the later of its keyframes, as a drive writes it: of a file that was cut off, what
+    is left then hangs together.
+
     Raises:
         Dpm2Error: it could not be written.
     """
@@ -208,6 +211,9 @@ def append_map(store: MapStore, data: MapData) -> None:
     data = numbered_behind(data, first, max((row[0] for row in store.rows("sessions", "session")), default=0))
     store.add_sessions(data.sessions)
     sessions = {first + node: number for node, number in enumerate(data.session)}
+    ending: dict[int, list[Edge]] = {}
+    for edge in data.edges:
+        ending.setdefault(max(edge.from_node, edge.to_node), []).append(edge)
     for node, keyframe in enumerate(data.keyframes):
         loan, mask = data.clouds.loan(node), data.clouds.moving(node)
         packed = data.clouds.packed(node) if loan is None else replace(loan, lender=loan.lender + first)
@@ -215,11 +221,12 @@ def append_map(store: MapStore, data: MapData) -> None:
             keyframe = replace(keyframe, descriptors=data.describe(node))
         change = Change(
             keyframes=[(first + node, keyframe, packed, data.thumbnail(node))],
+            edges=ending.get(first + node, []),
             poses={first + node: data.poses[node]},
             moving={} if mask is None else {first + node: mask},
         )
         store.write(change, sessions)
-    store.write(Change(edges=data.edges, trail=data.trail, georeference=None if first else data.georeference))
+    store.write(Change(trail=data.trail, georeference=None if first else data.georeference))
 
 
 def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:

@@ -21,7 +21,9 @@ import pytest
 
 from dpm2_core.data.thumbnail import thumbnail
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Keyframe
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.slam.mapping.merge import merge_maps
+from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
@@ -145,6 +147,20 @@ def test_a_map_that_was_cut_off(map_file: Path) -> None:
     map_file.write_bytes(content[: len(content) * 3 // 5])
     assert check_map(map_file).problems
     assert len(recovered(map_file)) >= 1
+
+
+def test_joined_maps_that_were_cut_off_hang_together(tmp_path: Path) -> None:
+    """All edges lay behind the last keyframe: one percent less, and no loop tied the second map to the first."""
+    path, data = tmp_path / "map", ring(40, 300)
+    tie = Edge("loop", 0, 1, Registration(data.poses[1], np.eye(6) * 1e-4))
+    save_as(merge_maps(data, data, np.eye(4), [tie]), path)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 97 // 100])
+    left = recovered(path)
+    assert len(left) > 70
+    assert set(parts_of(left)) == {0}
+    bridges = [edge.to_node for edge in left.edges if edge.registration.method == "bridge"]
+    assert all(node > 60 for node in bridges)  # where the cut is; all other odometry is as it was measured
 
 
 def test_a_map_without_its_last_pages_keeps_all_before_them(tmp_path: Path) -> None:
