@@ -23,6 +23,7 @@ from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySe
 
 _MOST = 400_000_000  # cells
 _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
+_SQUARE = 5.0  # m: the steepest ramp rises by less than a storey within one
 _OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
 
 
@@ -60,6 +61,15 @@ def tilt_of(clouds: Sequence[Points], poses: Array, origin: Callable[[int], Arra
         return 0.0
     x, y, z = np.median([poses[node, :3, :3] @ up for node, up in found], axis=0)
     return float(np.degrees(np.arctan2(np.hypot(x, y), z)))
+
+
+def height_over_each_other(poses: Array) -> float:
+    """The most by which keyframes at (N, 4, 4) T_map_kf, N > 0, in one square of 5 m differ in height, m."""
+    _, square = np.unique(np.floor(poses[:, :2, 3] / _SQUARE), axis=0, return_inverse=True)
+    lowest, highest = np.full((2, len(poses)), [[np.inf], [-np.inf]])
+    np.minimum.at(lowest, square, poses[:, 2, 3])
+    np.maximum.at(highest, square, poses[:, 2, 3])
+    return float((highest - lowest).max())
 
 
 def _up(cloud: Points) -> NDArray[np.float32] | None:

@@ -106,6 +106,20 @@ def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Pat
         assert (tmp_path / f"{name}.pgm").is_file()
 
 
+def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(tmp_path: Path) -> None:
+    """What stands on one is free where the other one is seen through: both are one grid. A steep hill is none."""
+    data = ring(40, 100)  # around 200 m
+    for name, slope, laps, words in (("hill", 0.2, 1, ""), ("house", 0.0, 2, "up to 2.8 m over each other")):
+        poses = np.repeat(data.poses[None], laps, 0)
+        poses[..., 2, 3] += slope * poses[..., 0, 3] + 2.8 * np.arange(laps)[:, None]
+        both = data if laps == 1 else merge_maps(data, data, np.eye(4), [data.edges[0]])
+        save_as(replace(both, poses=poses.reshape(-1, 4, 4)), tmp_path / f"{name}.dpm2map")
+        done = dpm2("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
+        assert done.returncode == 0, done.stderr
+        assert ("not to be used" in done.stderr, words in done.stderr) == (bool(words), True), done.stderr
+        assert (tmp_path / f"{name}.pgm").is_file()
+
+
 def test_an_export_replaces_neither_the_map_nor_another_grid(tmp_path: Path, map_file: Path) -> None:
     before = map_file.read_bytes()
     done = dpm2("map", "export", map_file, map_file, "--format", "ply")
