@@ -14,8 +14,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe, State
 from dpm2_core.frame import Array
 from dpm2_core.slam.build import make_map, make_slam
-from dpm2_core.slam.loops.localizer import LOST, LocalizationResult, Localizer
-from dpm2_core.slam.loops.relocalization import nowhere
+from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.output import save_map
@@ -279,15 +278,11 @@ class ActiveMap:
     def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
         """Where it is in a map that stays as it is; one that cannot be read does not show it."""
         before = localizer.state
-        try:
-            located = self.slam.map_step(keyframe).located
-        except Dpm2Error as error:
-            if not self._unreadable:  # once a map, not with each keyframe
-                self._log.error(str(error))
-            self._unreadable = True
-            T_map_kf = localizer.T_map_odom @ keyframe.T_odom_kf
-            located = LocalizationResult(T_map_kf, LOST, localizer.state, nowhere(str(error)))
+        located = self.slam.map_step(keyframe).located
         assert located is not None
+        if located.unreadable and not self._unreadable:  # once a map, not with each keyframe
+            self._log.error(located.registration.reason)
+            self._unreadable = True
         self._tell(before, located)
 
     def _tell(self, before: State, located: LocalizationResult) -> None:

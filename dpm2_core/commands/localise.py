@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.commands.options import note
 from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
@@ -55,6 +56,7 @@ class LocalizationReport:
         self._first: int | None = None
         self._events: list[dict[str, Any]] = []
         self._reason = ""  # why the last keyframe was not found, where none has been
+        self._unreadable = ""  # why the map could not be read, the first time
 
     def add(self, result: SlamResult) -> str:
         """Take in the result of the next frame; returns the event that it is, or an empty text."""
@@ -66,6 +68,8 @@ class LocalizationReport:
         if state.located and result.T_map_lidar is not None:
             self.stamps.append(tracked.stamp)
             self.poses.append(result.T_map_lidar)
+        if located is not None and located.unreadable:
+            self._unreadable = self._unreadable or located.registration.reason
         if located is not None and self._first is None and not located.registration.ok:
             self._reason = located.registration.reason
         if located is None or located.state is before or located.state is State.TRACKING:
@@ -86,11 +90,13 @@ class LocalizationReport:
         return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
 
     def summary(self) -> dict[str, Any]:
-        """Counts of frames by state, how many passed until the first result (None: there was none, and why), events."""
+        """Counts of frames by state, how many passed until the first result (None: there was none, and why), events;
+        why the map could not be read where it could not."""
         return {
             "frames": self._frames.total(),
             "frames_until_found": self._first,
             "not_found": self._reason if self._first is None else "",
+            "map_unreadable": self._unreadable,
             "frames_located": len(self.stamps),
             "frames_by_state": {str(state): count for state, count in sorted(self._frames.items())},
             "kidnappings": sum(event["event"] == "kidnapped" for event in self._events),
@@ -130,5 +136,7 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     until = summary["frames_until_found"]
     why = f" ({summary['not_found']})" if summary["not_found"] else ""
     found = f"not found{why}" if until is None else f"found after {until} frames"
+    if summary["map_unreadable"]:
+        note(f"the map cannot be read everywhere: {summary['map_unreadable']}")
     located = f"place known in {len(report.stamps)} of {summary['frames']} frames"
     return f"{name}: {found}, {located}; results in {out}", summary

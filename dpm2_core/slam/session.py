@@ -26,6 +26,7 @@ from dpm2_core.slam.store.rows import Session
 
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
+_NO_DESCRIPTORS = "no keyframe has descriptors (made with slam.loops.descriptors off?)"
 _COMPARED = 500  # points of a cloud
 _APART = 0.75
 """m, of three in four of them: its own frame is at 0.01, or as far as it was de-skewed; another one from 1.1 on."""
@@ -75,6 +76,8 @@ def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore 
     path = Path(path)
     if path.is_dir():
         tiles = TiledMap(path)
+        if not tiles.described:
+            raise UsageError(f"{path}: {_NO_DESCRIPTORS}")
         _check_same(path, tiles.weights, weights_id(settings.neural.weights))
         return tiles
     store = MapStore.open(path)
@@ -94,7 +97,7 @@ def check_for_localization(store: MapStore, settings: SlamSettings) -> None:
     """
     _check_weights(store, weights_id(settings.neural.weights))
     if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
-        raise UsageError(f"{store.path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
+        raise UsageError(f"{store.path}: {_NO_DESCRIPTORS}")
 
 
 def _check_weights(store: MapStore, weights: str) -> None:

@@ -29,12 +29,15 @@ class LocalizationResult:
         covariance: (6, 6) of it, as in `Registration`; huge while lost.
         state: RELOCALISED: it was somewhere else than thought, after being lost, or kidnapped.
         registration: how it was found, or why not.
+        unreadable: the map could not be read there, `registration.reason` says why. It does not confirm the odometry
+            then, as where nothing fits.
     """
 
     T_map_kf: Array
     covariance: Array
     state: State
     registration: Registration
+    unreadable: bool = False
 
 
 class Localizer:
@@ -89,11 +92,7 @@ class Localizer:
         self._hint, self._state = T_map_lidar, State.RELOCALIZING
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:
-        """Find a keyframe, which has its cloud, in the map.
-
-        Raises:
-            Dpm2Error: the map cannot be read. It does not confirm the odometry then, as where nothing fits.
-        """
+        """Find a keyframe, which has its cloud, in the map."""
         broken = self._last < self._broken <= keyframe.id
         if broken or (keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN):
             self._state = State.LOST if self._state.located else self._state  # its odometry may have been
@@ -106,10 +105,11 @@ class Localizer:
             if self._state.located:
                 return self._track(keyframe, picture)
             return self._find(keyframe, picture, nowhere("lost"))
-        except Dpm2Error:
+        except Dpm2Error as error:
             self._failures += 1
             self._doubt()
-            raise
+            T_predicted, why = self.T_map_odom @ keyframe.T_odom_kf, nowhere(str(error))
+            return LocalizationResult(T_predicted, LOST, self.state, why, unreadable=True)
 
     def _track(self, keyframe: Keyframe, picture: Image | None) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""

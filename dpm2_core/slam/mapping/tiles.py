@@ -124,6 +124,11 @@ class TiledMap:
         self._keep(())
 
     @property
+    def described(self) -> bool:
+        """Whether any keyframe has descriptors."""
+        return bool(self.weights) or bool(self._vectors.any())
+
+    @property
     def open(self) -> set[Tile]:
         """The squares whose keyframes are in memory."""
         return set(self._files)

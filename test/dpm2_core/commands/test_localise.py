@@ -75,6 +75,18 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     assert {path.name for path in out.iterdir()} == {"localisation.json", "trajectory.tum", "config.yaml"}
 
 
+def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tmp_path: Path) -> None:
+    """The drive ended where it was needed, with nothing in the folder."""
+    assert dpm2("map", "export", made, tmp_path / "tiles", "--tiles", "100").returncode == 0
+    missing = tmp_path / "tiles" / "0_0.dpm2map"
+    missing.unlink()
+    done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", ":3", "--localise", tmp_path / "tiles", *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert f"the map cannot be read everywhere: {missing}: no such map file" in done.stderr
+    report = json.loads((tmp_path / "o" / "localisation.json").read_text())
+    assert (report["frames"], report["map_unreadable"]) == (3, f"{missing}: no such map file")
+
+
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
     """Nothing is there; then it looks everywhere, after a second although it has hardly moved."""
     done = dpm2(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe, Registration, State
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
@@ -49,6 +50,26 @@ def at(x: float) -> Array:
 
 def halt(node: int) -> Keyframe:
     return Keyframe(node, node * 10**9, node, at(0.0), np.zeros((0, 4), np.float32))
+
+
+def test_where_the_map_cannot_be_read_nothing_is_found_and_the_drive_goes_on() -> None:
+    """As with a tile that is missing: the run ended there, without what it had found until then."""
+
+    class Torn(Places):
+        def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+            if self._found:
+                raise Dpm2Error("tile 1_0: no such map file")
+            return super().verify(cloud, T_map_lidar, picture)
+
+    places = Torn(0.0, 0.0, confirms=True)
+    localizer = Localizer(places)
+    assert localizer.add(halt(0)).state is State.RELOCALIZED
+    result = localizer.add(halt(1))
+    assert (result.unreadable, result.registration.ok, result.state) == (True, False, State.DEGRADED)
+    assert result.registration.reason == "tile 1_0: no such map file"
+    places.find(halt(1).cloud)  # from here on it can be read
+    result = localizer.add(halt(2))
+    assert (result.unreadable, result.state) == (False, State.TRACKING)
 
 
 def test_at_a_halt_a_second_keyframe_confirms_the_place() -> None:

@@ -14,6 +14,8 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.slam.loops.retrieval import pooled
 from dpm2_core.slam.mapping.tiles import INDEX, VECTORS, TiledMap, write_tiles
+from dpm2_core.slam.session import open_for_localization
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
@@ -113,6 +115,14 @@ def test_what_is_wrong_is_named(tmp_path: Path, folder: Path, data: MapData) -> 
     with TiledMap(folder) as tiles, pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such"):
         tiles.read([(0, 0)])
     assert not list(tmp_path.glob(".*"))
+
+
+def test_nobody_is_looked_for_in_tiles_without_descriptors(tmp_path: Path, folder: Path) -> None:
+    """As in such a map; the drive went on to its end, and was found nowhere."""
+    write_tiles(ring(20, points=50), tmp_path / "bare", SIZE)
+    with pytest.raises(UsageError, match="bare: no keyframe has descriptors"):
+        open_for_localization(tmp_path / "bare", SlamSettings())
+    open_for_localization(folder, SlamSettings()).close()
 
 
 @pytest.mark.parametrize(
