@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.map_info import MapFile, graph_of, info, unplaced
+from dpm2_core.commands.map_info import MapFile, graph_of, info, say_what_is_missing, unplaced
 from dpm2_core.commands.options import ConfigFile, Overrides, note
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -232,6 +232,7 @@ def _loaded(store: MapStore) -> MapData:
     Raises:
         UsageError: it is empty.
     """
+    say_what_is_missing(store)
     data = load_map(store, descriptors=False)
     if not len(data):
         raise UsageError(f"{store.path}: no keyframe in it yet")

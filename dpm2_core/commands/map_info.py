@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.commands.options import JsonFile, note, show
 from dpm2_core.database import size_with_log
 from dpm2_core.frame import Array
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.map_data import MapData, load_map, ways
+from dpm2_core.slam.store.map_file import missing_log
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
@@ -28,6 +29,7 @@ MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2
 def info(path: MapFile, json_file: JsonFile = None) -> None:
     """What is in a map."""
     with MapStore.open(path) as store:
+        say_what_is_missing(store)
         data = load_map(store, descriptors=False)
         figures = _figures(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
     f = figures
@@ -53,6 +55,12 @@ def info(path: MapFile, json_file: JsonFile = None) -> None:
         )
         table.add_row(f"session {s['session']}", info)
     show(table, figures, json_file)
+
+
+def say_what_is_missing(store: MapStore) -> None:
+    """Say that the last keyframes of a map may be in a file that is no longer beside it."""
+    if missing := missing_log(store.path):
+        note(f"{store.path}: {missing}")
 
 
 def _figures(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from pathlib import Path
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.slam.store import schema
+from dpm2_core.slam.store.map_connection import explained
 from dpm2_core.slam.store.map_data import save_as
-from dpm2_core.slam.store.map_file import copy_with_log
+from dpm2_core.slam.store.map_file import copy_with_log, missing_log
 from dpm2_core.slam.store.salvage import Findings, Salvage
 
 
@@ -26,6 +27,9 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
     findings = Findings()
+    with explained(path):
+        if missing := missing_log(path):
+            findings.problems.append(missing)
     with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
         copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
         _copy(path, copy)

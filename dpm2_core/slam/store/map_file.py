@@ -23,6 +23,23 @@ def copy_with_log(path: Path, copy: Path) -> None:
             shutil.copyfile(f"{source}{suffix}", f"{copy}{suffix}")
 
 
+def missing_log(path: Path) -> str:
+    """Why the last keyframes of a map file may not be there, in words; empty where nothing says so.
+
+    Who closes a map leaves one file, whose header says that there is no other. Where it says that there is, the writer
+    was killed, and FILE-wal is needed; a map that is moved or copied without it opens as if nothing were missing.
+
+    Raises:
+        OSError: it could not be read.
+    """
+    wal = Path(f"{path.resolve()}-wal")
+    with path.open("rb") as file:
+        logged = file.read(20)[18:19] == b"\x02"  # see the SQLite file format: the write version
+    if not logged or wal.exists():
+        return ""
+    return f"who wrote it was killed, and {wal.name}, where the last 4 MB or all of it may be, is not beside it"
+
+
 def move_map(source: Path, target: Path) -> None:
     """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
 

@@ -237,6 +237,8 @@ class MapStore:
             try:
                 with closing(sqlite3.connect(part)) as copy:
                     self._connection.backup(copy)
+                    copy.execute("PRAGMA locking_mode = EXCLUSIVE")  # without shared memory, which no share has
+                    copy.execute("PRAGMA journal_mode = DELETE")  # it is one file, and says so
                 move_map(part, path)
             finally:
                 remove_map(part)

@@ -240,6 +240,19 @@ os._exit(0)
     assert [s.config for s in recovered(map_file).sessions] == ["slam: {}", "second"]
 
 
+def test_the_map_of_a_killed_drive_that_was_moved_without_its_log_is_not_sound(map_file: Path, tmp_path: Path) -> None:
+    """All of a short drive is in FILE-wal: "0 keyframes, sound". Copies that `~/save_map` makes have none."""
+    moved, copy = tmp_path / "moved.dpm2map", tmp_path / "copy.dpm2map"
+    with MapStore.open(map_file, read_only=False) as store:
+        store.begin_session()
+        assert check_map(map_file).problems == []  # its writer lives
+        shutil.copy(map_file, moved)
+        store.copy_to(copy)
+    words = "who wrote it was killed, and moved.dpm2map-wal, where the last 4 MB or all of it may be, is not beside it"
+    assert check_map(moved).problems == [words]
+    assert check_map(copy).problems == check_map(map_file).problems == []
+
+
 def test_a_map_that_is_written_meanwhile_is_of_one_instant(
     tmp_path: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
