@@ -19,6 +19,7 @@ from dpm2_core.slam.registration.spacing import Spacing
 
 _SAME = np.eye(4)
 _TRACE = 30  # frames that a fix may be older than the one that it comes with
+_FAR = 1e5  # m: farther off than so no way is
 
 
 class KeyframeSettings(Settings):
@@ -58,6 +59,7 @@ class KeyframeSelector:
         self.use(self._settings)
         self._last: Keyframe | None = None
         self._uncertainty = np.zeros((6, 6))
+        self._left_open = np.zeros((3, 3))  # root of the covariance, m, of the way since along what scenes left open
         self._weakest: Registration | None = None  # the least certain one since the last keyframe
         self._requested = False
         self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # of the frames before, without a break
@@ -75,6 +77,15 @@ class KeyframeSelector:
     def add_uncertainty(self, covariance: Array) -> None:
         """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
         self._uncertainty = self._uncertainty + covariance
+
+    def leave_open(self, step: Array) -> None:
+        """A step was registered whose covariance (3, 3), m, is this much along what the scene leaves open.
+
+        It is the velocity that is not known there, and lasts: errors of steps add up, not their squares.
+        """
+        variances, axes = np.linalg.eigh(step)
+        if np.trace(self._left_open) < _FAR:
+            self._left_open = self._left_open + (axes * np.sqrt(np.maximum(variances, 0))) @ axes.T
 
     def select(
         self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration, T_scan_lidar: Array = _SAME
@@ -103,6 +114,7 @@ class KeyframeSelector:
                 return None
             sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
             covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
+            covariance[3:, 3:] += self._left_open @ self._left_open
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]
         known = scan.descriptors if scan.description is not None and scan.description.made else None
@@ -115,7 +127,7 @@ class KeyframeSelector:
             fix, T_odom_then = self._fix
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
-        self._weakest = None
+        self._weakest, self._left_open = None, np.zeros((3, 3))
         return keyframe
 
     def _trace_fix(self, frame: Frame, T_odom_lidar: Array) -> None:

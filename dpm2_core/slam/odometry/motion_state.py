@@ -35,6 +35,7 @@ class MotionState:
         sweep: the motion during the sweep of the last registered frame, where its points have shown it.
         change: (6,) of the twist, from one registered frame to the next.
         of_velocity: covariance (3, 3) of the twist's velocity, m/s.
+        left_open: covariance (3, 3), m, of the last step along what the scene leaves open; zeros if that is nothing.
         T_registered, seconds: the last registered pose (4, 4), and the time from then to the last frame.
         inertial: the IMU, since a frame came with samples. other: another odometry, since a frame came with a guess.
     """
@@ -45,7 +46,7 @@ class MotionState:
         self.twist: Array | None = None
         self.sweep: Swept | None = None
         self.change = np.zeros(6)
-        self.of_velocity = ANY_VELOCITY
+        self.of_velocity, self.left_open = ANY_VELOCITY, np.zeros((3, 3))
         self.T_registered, self.seconds = np.eye(4), 0.0
         self.inertial: InertialMotion | None = None
         self.other: OtherMotion | None = None
@@ -153,9 +154,12 @@ class MotionState:
         self.register(registration, stamp, moved)
         self.sweep = swept
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
+        self.left_open = np.zeros((3, 3))
         if moved and self._open:
             # What the scene leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
-            self.covariance[3:, 3:] += along_open(registration.of_scene[3:, 3:], self.of_velocity) * self._open**2
+            of_velocity = along_open(registration.of_scene[3:, 3:], self.of_velocity)
+            self.covariance[3:, 3:] += of_velocity * self._open**2
+            self.left_open = of_velocity * seconds**2
 
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""

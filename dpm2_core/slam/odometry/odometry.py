@@ -319,6 +319,7 @@ class Odometry:
         if self._bridge is None:
             self._failures = 0
         motion.advance(result, dt, self._clock.stamp, match.led, match.swept)
+        self._keyframes.leave_open(motion.left_open)
         self._registration.update(match.scan, motion.T)
 
     def _state(self, registration: Registration, enclosed: bool) -> State:

@@ -49,6 +49,20 @@ def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
     assert worst == pytest.approx([1.0, 1.0, 0.05], abs=0.01)  # the last one: 1 % of 5 m, and 0.02 m
 
 
+def test_an_edge_is_as_uncertain_as_the_way_that_scenes_have_left_open() -> None:
+    """0.5 m in each of five steps are 2.5 m, as it is the velocity that is not known; the next edge begins anew."""
+    selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
+    edges = []
+    for meter in range(11):
+        T = se3.make(np.eye(3), [float(meter), 0, 0])
+        selector.leave_open(np.diag([0.25, 0, 0]) * (1 <= meter <= 5))
+        keyframe = selector.select(Frame(meter, scan.points), scan, T, Registration(T, np.eye(6) * 1e-4))
+        if keyframe is not None and keyframe.edge is not None:
+            edges.append(np.sqrt(np.diag(keyframe.edge.covariance)[3:]))
+    assert edges[0] == pytest.approx([2.5, 0.05, 0.05], abs=0.01)
+    assert edges[1] == pytest.approx([0.05, 0.05, 0.05], abs=0.01)
+
+
 def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None, start: float = 0.0) -> dict[int, Fix]:
     """Those of keyframes, by their frame; the robot goes 1 m a second forward, turned by 90 degrees to the left.
 

@@ -100,6 +100,21 @@ def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
     assert abs(worst[0]) > 0.95
 
 
+def test_the_edge_between_keyframes_along_a_tunnel_covers_its_error(tunnel_drive: Drive) -> None:
+    """A start at speed is taken for one at rest: 14 m are missing after a second, and 1 m was stated."""
+    frames, truth = tunnel_drive
+    odometry = make_odometry(SlamSettings(registration="geometric"))
+    for frame in frames[:-1]:
+        odometry.process(frame)
+    odometry.request_keyframe()
+    keyframe = odometry.process(frames[-1]).keyframe
+    assert keyframe is not None
+    assert keyframe.edge is not None
+    off = se3.log(se3.inverse(keyframe.edge.T_target_source) @ se3.inverse(truth[0]) @ truth[-1])[3]
+    assert abs(off) > 3.0  # as it is: nothing in the scans tells
+    assert abs(off) < 3 * keyframe.edge.worst_sigma
+
+
 @pytest.mark.slow
 def test_follows_a_drive_with_skewed_scans(skewed_drive: Drive) -> None:
     """Also right at the start, where the first scan is taken before any velocity is known."""
