@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from dpm2_core.frame import Points
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.scatter import scattered
 from dpm2_core.geometry.voxel import voxel_first
 
@@ -41,19 +41,30 @@ def is_room(points: Points) -> bool | None:
     Args:
         points: (N, 4) a scan in the LiDAR frame, or a keyframe's cloud; NaN and zeros are passed over.
     """
-    some = points[:: max(1, len(points) // _FEW)]
+    return look(points)[0]
+
+
+def look(points: Points) -> tuple[bool | None, int]:
+    """As `is_room`; and about how many of the points are of what does not float in the air."""
+    step = max(1, len(points) // _FEW)
+    some = points[::step]
     away = np.linalg.norm(some[:, :3], axis=1)
     valid = (away > _NEAREST) & (away < 1e4)  # False for NaN
     some, away = some[valid], away[valid]
     fixed = ~scattered(some)
     some, away = some[fixed], away[fixed]
     cells = voxel_first(some, _CELL) if len(some) else np.zeros(0, int)
-    if len(cells) < _LEAST:
+    return _room_of(away[cells]), len(some) * step
+
+
+def _room_of(away: Array) -> bool | None:
+    """Of the distances (C,), m, of the cells that are seen."""
+    if len(away) < _LEAST:
         return None
-    reach = float(np.percentile(away[cells], 75))
-    if len(cells) >= _OPEN[0] or reach >= _OPEN[1]:
+    reach = float(np.percentile(away, 75))
+    if len(away) >= _OPEN[0] or reach >= _OPEN[1]:
         return False
-    return True if reach <= _HALL or (len(cells) <= _ROOM[0] and reach <= _ROOM[1]) else None
+    return True if reach <= _HALL or (len(away) <= _ROOM[0] and reach <= _ROOM[1]) else None
 
 
 @dataclass(frozen=True)

@@ -3,18 +3,21 @@
 
 The first scan that shows what it is decides. Later every fifth is looked at, and only several in a row that are clearly
 of the other kind change it. Then the odometry goes on with the other tools from the same pose and motion, with the last
-scan as its map.
+scan as its map. In fog or dust all that is seen is near, too, but less is seen: that is no room.
 """
 
 from __future__ import annotations
 
 from dpm2_core.estimates import OdometryResult
 from dpm2_core.frame import Frame
-from dpm2_core.geometry.scale import ByScale, is_room
+from dpm2_core.geometry.scale import ByScale, look
 from dpm2_core.slam.odometry.odometry import Odometry, Tools
 
 _EVERY = 5  # scans: a look takes a tenth of the time of a registration
 _SURE = 4  # looks in a row
+_CLEAR = 2 / 3
+"""Of the most points that a scan in the open had: a room has more. Measured, 16 and 64 beams: 0.63 to 0.93 of the
+pulses come back in the open, 0.65 to 0.90 in rooms; where one sees no farther than 10 m, 0.12 to 0.55 on roads."""
 
 
 class ScaledOdometry(Odometry):
@@ -35,13 +38,14 @@ class ScaledOdometry(Odometry):
         super().reset()
         self._undecided, self._others, self._scans = True, 0, 0
         self._begun = False  # a scan has been registered while it was undecided
+        self._most = 0  # points of a scan in the open
 
     def process(self, frame: Frame) -> OdometryResult:
         """As of `Odometry`."""
         self._scans += 1
         if not self._undecided and self._scans % _EVERY:
             return super().process(frame)
-        found = is_room(frame.points) if frame.problem is None else None
+        found = self._found(frame) if frame.problem is None else None
         decides = self._undecided and found is not None
         if decides and found and not self._begun:
             self._use(self._choice.indoor)
@@ -55,3 +59,10 @@ class ScaledOdometry(Odometry):
             self._go_on_with(self._choice.indoor if found else self._choice.outdoor, frame)
             self._others = 0
         return result
+
+    def _found(self, frame: Frame) -> bool | None:
+        """Whether a scan shows a room, see `is_room`."""
+        found, points = look(frame.points)
+        if found is False:
+            self._most = max(self._most, points)
+        return None if found and points < _CLEAR * self._most else found

@@ -12,6 +12,7 @@ from dpm2_core.data.corrupt import in_dust
 from dpm2_core.estimates import State
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
@@ -141,6 +142,20 @@ def test_a_glance_changes_nothing() -> None:
     assert odometry.scale == "outdoor"
     odometry.reset()
     assert odometry.scale == ""
+
+
+def test_short_sight_on_a_street_is_no_room() -> None:
+    """10 m, as in fog or dust: all that is left is as near as in a room, but less than a room has."""
+    poses = np.tile(np.eye(4), (31, 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = 0.6 * np.arange(31), 1.7
+    clear, odometry = frames(poses, street=True), make_odometry(geometric("auto"))
+    for frame in clear[:6]:
+        odometry.process(frame)
+    for frame in clear[6:]:
+        near = np.linalg.norm(frame.points[:, :3], axis=1) < 10
+        assert is_room(frame.points[near])
+        odometry.process(replace(frame, points=frame.points[near]))
+    assert odometry.scale == "outdoor"
 
 
 def test_frames_that_say_nothing_decide_nothing() -> None:
