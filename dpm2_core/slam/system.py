@@ -71,18 +71,19 @@ class Slam:
         self,
         odometry: Odometry,
         mapper: Mapper,
-        localizer: Localizer | None,
-        thumbnail_width: int,
-        visual: VisualSettings,
+        localizer: Localizer | None = None,
+        thumbnail_width: int = 0,
+        visual: VisualSettings | None = None,
     ) -> None:
         """Put the parts together.
 
         Args:
             thumbnail_width: of the image that every keyframe carries into a map file, pixels; 0: none.
-            visual: which keyframes carry one by which their place is found again.
+            visual: which keyframes carry one by which their place is found again; None: none.
         """
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
-        self._thumbnail_width, self._visual = thumbnail_width, visual
+        self._thumbnail_width = thumbnail_width
+        self._visual = visual if visual is not None and visual.enabled else None
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
 
@@ -128,7 +129,7 @@ class Slam:
     def _asks_pictures(self, result: OdometryResult) -> bool:
         """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""
         registration = result.registration
-        return self._visual.enabled and (
+        return self._visual is not None and (
             self.localizer is not None
             or registration.method in ("first", "visual")
             or registration.worst_sigma > self._visual.sigma
