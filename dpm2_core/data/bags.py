@@ -23,6 +23,7 @@ from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import JUMP, SWEEP, Beside, RawMessage, clouds_after_others
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import note_once
 from dpm2_core.data.time_order import in_order, note_corrected
 from dpm2_core.data.trajectory import interpolate
 from dpm2_core.data.transforms import transform_matrix
@@ -72,9 +73,9 @@ class BagSource:
         self._delays: dict[str, list[int]] = {}  # ns from the stamp to the time of recording, of the clouds of a topic
         self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
-        self._up = self._mounted(first)
+        up = self._mounted(first)
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
-        self._frames.up = self._up
+        self._frames.up = up
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
         self.camera = self._choose_cameras() if self._settings.images else None
 
@@ -92,19 +93,20 @@ class BagSource:
             if index < start:
                 continue
             if before is not None and stamp <= before:
-                self._note_once("time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s")
-            frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._up)
-            if before is not None and (stamp - before) - (recorded - recorded_before) > JUMP:
-                frame = replace(frame, stepped=True)
+                note_once(
+                    self.notes, "time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s"
+                )
+            stepped = before is not None and (stamp - before) - (recorded - recorded_before) > JUMP
+            frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._frames.up, stepped=stepped)
             before, recorded_before, count = stamp, recorded, count + 1
             found.update(image.camera.name for image in frame.images)
             found.update(beside.keys() & {known.second_topic})
             found[known.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
             if self._frames.time_problem:
-                self._note_once(f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
+                note_once(self.notes, f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
         for topic, (left_out, why) in self._unsound.items():
-            self._note_once(f"{topic}: {left_out} samples left out", f"the first: {why}")
+            note_once(self.notes, f"{topic}: {left_out} samples left out", f"the first: {why}")
         self._note_missing(found, count)
 
     def _note_missing(self, found: Counter[str], count: int) -> None:
@@ -116,12 +118,12 @@ class BagSource:
         if known.gnss_topic and not found[known.gnss_topic] and count:  # fixes are rarer than clouds
             missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
-            self._note_once(f"{count - found[topic]} of {count} frames have no {what} of {topic}", within)
+            note_once(self.notes, f"{count - found[topic]} of {count} frames have no {what} of {topic}", within)
         if found[known.second_topic]:
             first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
             if abs(apart := (second - first) * 1e-9) > _CLOCKS:
                 what = f"{known.second_topic}: clouds are recorded {apart:+.2f} s later after their stamps than others"
-                self._note_once(what, "a clock that is off? They join those of the same stamps")
+                note_once(self.notes, what, "a clock that is off? They join those of the same stamps")
 
     @cached_property
     def stamps(self) -> Stamps:
@@ -143,12 +145,12 @@ class BagSource:
         except UsageError as error:
             if self._settings.ground_truth_topic:
                 raise UsageError(f"{self.path}: {self.truth}: {error}") from None
-            self._note_once(f"{self.truth} is not used as ground truth", str(error))
+            note_once(self.notes, f"{self.truth} is not used as ground truth", str(error))
             return None
         poses = interpolate(stamps, T, self.stamps)
         if missing := int(np.isnan(poses[:, 0, 0]).sum()):
             times = f"poses from {_span(stamps)}, clouds from {_span(self.stamps)}"
-            self._note_once(f"{self.truth}: {missing} of {len(poses)} frames have no pose", times)
+            note_once(self.notes, f"{self.truth}: {missing} of {len(poses)} frames have no pose", times)
         return poses
 
     @cached_property
@@ -186,7 +188,7 @@ class BagSource:
                 problems.append(str(error))
         if problems:
             what = f"{topics.TF_STATIC}: {len(problems)} transforms left out"
-            self._note_once(what, f"the first: {printable(problems[0])}")
+            note_once(self.notes, what, f"the first: {printable(problems[0])}")
 
     def _mounted(self, first: Any) -> tuple[float, float, float]:
         """Which way (3,) along the LiDAR's axes is up in the base: as for slam_node the root above it in /tf_static.
@@ -203,9 +205,9 @@ class BagSource:
         tilted = f"{topics.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
         seen = self._ground(first)
         if seen is not None and seen @ (x, y, z) < _LIKE:
-            self._note_once(tilted, "which is no base: the ground is not level in it")
+            note_once(self.notes, tilted, "which is no base: the ground is not level in it")
             return (0.0, 0.0, 1.0)
-        self._note_once(tilted, "and the map is level by that")
+        note_once(self.notes, tilted, "and the map is level by that")
         return x, y, z
 
     def _ground(self, cloud: Any) -> Points | None:
@@ -287,16 +289,12 @@ class BagSource:
                 problems.append(f"at {stamp * 1e-9:.3f} s: {error}")
         if problems:
             what = f"{topic}: {len(problems)} poses left out"
-            self._note_once(what, f"the first: {printable(problems[0])}")
+            note_once(self.notes, what, f"the first: {printable(problems[0])}")
         T_world_lidar = np.array(T).reshape(-1, 4, 4)
         child = "" if is_path or not decoded else decoded[0][1].child_frame_id
         if child:
             T_world_lidar = T_world_lidar @ self.transforms.between(child, self.lidar_frame)
         return np.array(stamps, np.int64), T_world_lidar
-
-    def _note_once(self, what: str, detail: str) -> None:
-        if not any(note.startswith(what) for note in self.notes):
-            self.notes.append(f"{what} ({detail})")
 
 
 def _span(stamps: Stamps) -> str:

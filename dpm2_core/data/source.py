@@ -53,6 +53,12 @@ def frame_at(source: Source, position: int) -> Frame:
     return next(iter(source.frames(position, position + 1)))
 
 
+def note_once(notes: list[str], what: str, detail: str) -> None:
+    """Add to the notes of a drive what is to be said of it, with a detail, unless it is there with any."""
+    if not any(note.startswith(what) for note in notes):
+        notes.append(f"{what} ({detail})")
+
+
 def digest_of(source: Source) -> str:
     """What a drive holds, in 16 characters: how many frames, their true poses, the calibration, and the points and
     images of the first: more frames that were downloaded since, or another truth, make another one."""

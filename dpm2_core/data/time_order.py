@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.messages import STAMP_END, restamped, serialized_stamp
 from dpm2_core.data.pairing import RawMessage
+from dpm2_core.data.source import note_once
 from dpm2_core.frame import Array, Frame
 
 Item = TypeVar("Item")
@@ -59,8 +60,7 @@ def frames_in_order(frames: Iterable[Frame], corrected: Callable[[int, int], Non
 def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -> None:
     """Add to the notes, once, that there are such stamps (ns): the first one, and its frame's number."""
     what = f"{whose}stamps that are not between their neighbors are taken to be"
-    if not any(note.startswith(what) for note in notes):
-        notes.append(f"{what} (the first at frame {number}: {stamp * 1e-9:.3f} s)")
+    note_once(notes, what, f"the first at frame {number}: {stamp * 1e-9:.3f} s")
 
 
 def _in_order(
