@@ -290,13 +290,13 @@ def _export_page(data: MapData, out: Path, voxel: float) -> None:
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.mapping.occupancy import height_over_each_other, occupancy_grid, tilt_of, write_grid
+    from dpm2_core.slam.mapping.occupancy import ground_tilt, height_over_each_other, occupancy_grid, write_grid
     from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
     tied = _tied(data, out)
     settings = OccupancySettings(resolution=resolution)
     write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings, tied.clouds.origin))
-    if (tilt := tilt_of(tied.clouds, tied.poses, tied.clouds.origin)) > _STEEP:
+    if (tilt := ground_tilt(tied.clouds, tied.poses, tied.clouds.origin)) > _STEEP:
         why = "as of a LiDAR mounted at an angle: an IMU, or its mounting in /tf_static, makes a level one"
         note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
     if (height := height_over_each_other(tied.poses)) > _STOREY:

@@ -19,7 +19,7 @@ from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.tilt import up_of
-from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings
+from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings, at_keyframes
 
 _MOST = 400_000_000  # cells
 _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
@@ -31,7 +31,7 @@ def occupancy_grid(
     clouds: Sequence[Points],
     poses: Array,
     settings: OccupancySettings,
-    origin: Callable[[int], Array] = lambda node: np.zeros(3),
+    origin: Callable[[int], Array] = at_keyframes,
 ) -> Grid:
     """The grid of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf.
 
@@ -48,7 +48,7 @@ def occupancy_grid(
     return whole.grid()
 
 
-def tilt_of(clouds: Sequence[Points], poses: Array, origin: Callable[[int], Array] = lambda node: np.zeros(3)) -> float:
+def ground_tilt(clouds: Sequence[Points], poses: Array, origin: Callable[[int], Array] = at_keyframes) -> float:
     """How far the ground that keyframes show is tilted against the map's x and y, degrees; 0 where they show none.
 
     Of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf, some are looked at, as seen from `origin`

@@ -57,6 +57,11 @@ class Grid:
     resolution: float
 
 
+def at_keyframes(node: int) -> Array:
+    """(3,) m, where in its own frame the LiDAR of a keyframe was: at the origin, where nothing says otherwise."""
+    return np.zeros(3)
+
+
 @dataclass(frozen=True, eq=False)
 class Fan:
     """What a keyframe sees around its LiDAR, along the axes of the map while its heading is `yaw` (rad).
@@ -127,7 +132,7 @@ class OccupancyMap:
         version: Callable[[int], object] = lambda node: None,
         seconds: float = np.inf,
         placed: NDArray[np.bool_] | None = None,
-        origin: Callable[[int], Array] = lambda node: np.zeros(3),
+        origin: Callable[[int], Array] = at_keyframes,
     ) -> bool:
         """Bring it up to date, the newest keyframes first; False if there is more to do than `seconds` allow.
 

@@ -22,7 +22,7 @@ from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.merge import merge_maps
-from dpm2_core.slam.mapping.occupancy import tilt_of
+from dpm2_core.slam.mapping.occupancy import ground_tilt
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
@@ -117,7 +117,7 @@ def test_a_lidar_that_hangs_has_a_level_map_with_its_place_on_earth(drive: Path)
         points = se3.transform(T_hanging, frame.points)
         slam.process(replace(frame, points=points, fix=fix, images=(), up=(0.0, 0.0, -1.0)))
     slam.finish()
-    assert tilt_of(slam.mapper.clouds, slam.mapper.poses) < 5
+    assert ground_tilt(slam.mapper.clouds, slam.mapper.poses) < 5
     assert slam.mapper.georeference is not None
     assert slam.mapper.georeference.T_enu_map[2, 2] > 0.99
 

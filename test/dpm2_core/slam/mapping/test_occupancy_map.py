@@ -19,7 +19,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.mapping.occupancy import occupancy_grid, tilt_of
+from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, UNKNOWN, Grid, OccupancyMap, OccupancySettings
 
 SENSOR = 0.6  # m above the floor
@@ -288,15 +288,15 @@ def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: floa
     poses = np.array(
         [T_tilted_level @ se3.exp([0, 0, 0.1 * n, n, 0, 0]) @ se3.inverse(T_tilted_level) for n in range(9)]
     )
-    assert tilt_of([cloud] * 9, poses) == pytest.approx(degrees, abs=2.0)
+    assert ground_tilt([cloud] * 9, poses) == pytest.approx(degrees, abs=2.0)
     mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground, by which there is no sensor over the ground
     on_base = [cloud + np.append(mount, 0).astype(np.float32)] * 9
-    assert tilt_of(on_base, poses, lambda node: mount) == pytest.approx(degrees, abs=2.0)
+    assert ground_tilt(on_base, poses, lambda node: mount) == pytest.approx(degrees, abs=2.0)
 
 
 def test_of_a_level_building_and_of_clouds_without_ground_no_tilt_is_known(drive: tuple[list[Points], Array]) -> None:
     """Ceilings are no ground, and a wall is none."""
     clouds, poses = drive
-    assert tilt_of(clouds, poses) < 2.0
+    assert ground_tilt(clouds, poses) < 2.0
     wall = np.random.default_rng(0).uniform([5, -20, -1, 0], [5.1, 20, 8, 1], (5000, 4)).astype(np.float32)
-    assert tilt_of([wall], np.eye(4)[None]) == 0.0
+    assert ground_tilt([wall], np.eye(4)[None]) == 0.0
