@@ -95,7 +95,7 @@ class GeometricRegistration:
             prior: (6, 6) information [rad, m] of the prediction. Along a tunnel nothing else says how far the car went;
                 anywhere else the points outweigh it. It is no part of the covariance of the result.
         """
-        s = self.settings
+        s, source = self.settings, target.in_sight(source)
         if len(source) < s.min_points or len(target) < s.min_points:
             reason = f"{len(source)} points against a map of {len(target)}; {s.min_points} needed"
             return Registration.failed("geometric", reason, T_guess)

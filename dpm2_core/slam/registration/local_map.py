@@ -17,6 +17,7 @@ from dpm2_core.slam.registration.occupied_voxels import OccupiedVoxels
 from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
+_SIGHT = (0.99, 1.1)  # quantile of the distances of a scan's points, and times that: farther away it shows nothing
 _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
@@ -45,6 +46,7 @@ class LocalMap:
         self._inserted = 0
         self._T_last: Array | None = None
         self._taken = np.zeros((0, 4, 4))
+        self._sights = np.zeros(0)  # m, of the scans that have entered
         self._voxels: OccupiedVoxels | None = None  # made when it is needed
 
     def fresh(self) -> LocalMap:
@@ -66,6 +68,14 @@ class LocalMap:
         meters, degrees = se3.magnitude(se3.inverse(self._T_last) @ T_odom_lidar)
         return meters > self._settings.spacing or degrees > 10
 
+    def in_sight(self, source: Array) -> Array:
+        """Of a scan (N, 3) the points no farther away than scans of the map could see.
+
+        Where fog lifts, or a door opens, most of what a scan shows is farther away, and says nothing about its pose.
+        """
+        squared, sight = np.einsum("ij,ij->i", source, source), _SIGHT[1] * self._sights.max(initial=0.0)
+        return source if squared.max(initial=0.0) <= sight * sight else source[squared <= sight * sight]
+
     def from_nearest_scan(self, T_odom_lidar: Array) -> Array:
         """A pose (4, 4) as seen from the nearest one that a scan of the map was taken at."""
         away = self._taken[:, :3, 3] - T_odom_lidar[:3, 3]
@@ -77,6 +87,9 @@ class LocalMap:
         Args:
             taken: (K, 4, 4) where the scans were taken that the points are merged from, as seen from T_odom_lidar.
         """
+        away = np.linalg.norm(points[:, :3], axis=1)
+        sight = np.quantile(away, _SIGHT[0]) if len(away) else 0.0
+        self._sights = np.append(self._sights, sight)[-self._settings.scans :]
         taken = T_odom_lidar @ (np.eye(4)[None] if taken is None else taken)
         self._taken = np.concatenate([self._taken, taken])[-max(self._settings.scans, len(taken)) :]
         new = points[:, :3].astype(np.float64) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3]
