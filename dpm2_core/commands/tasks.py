@@ -52,7 +52,7 @@ ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure 
 
 
 def _add(name: str, help_: str) -> None:
-    """`dpm2 train NAME`, the same for every task that the SLAM loss can be added to."""
+    """`dpm2 train NAME`, the same for every task."""
 
     def run(
         src: SourceArgument,
@@ -63,19 +63,10 @@ def _add(name: str, help_: str) -> None:
         val: ValOption = None,
         sequences: SequencesOption = None,
         val_sequences: SequencesOption = None,
-        slam_weight: Annotated[
-            float | None,
-            typer.Option(min=0, help="gamma: weight of the SLAM loss; 0 without. Same as slam.gamma."),
-        ] = None,
-        slam_every: Annotated[
-            int | None, typer.Option(min=1, help="The SLAM loss counts in every K-th epoch. Same as slam.every.")
-        ] = None,
     ) -> None:
         from dpm2_core.tasks.task import task_type  # torch is slow to import
 
-        short = {"slam.gamma": slam_weight, "slam.every": slam_every}
-        overrides = [*(settings or []), *(f"{key}={value}" for key, value in short.items() if value is not None)]
-        chosen = load_settings(task_type(name).training_type, config, overrides)
+        chosen = load_settings(task_type(name).training_type, config, settings or [])
         sets = (src, parse_names(sequences)), None if val is None else (val, parse_names(val_sequences))
         if val is None and val_sequences is not None:
             raise UsageError("--val-sequences: of which folder? give --val")
@@ -89,23 +80,7 @@ def _add(name: str, help_: str) -> None:
 _add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
 _add("dslr", "DSLR: a scan without what moves, from one with it.")
 _add("ae_lidar", "AE_lidar: a scan as a short code and back.")
-
-
-@train.command()
-def movers(
-    src: SourceArgument,
-    config: ConfigOption = None,
-    settings: SetOption = None,
-    out: OutOption = Path("out/movers"),
-    resume: ResumeOption = False,
-    val: ValOption = None,
-    sequences: SequencesOption = None,
-) -> None:
-    """Movers: which points are of things that move or could. It has no SLAM loss."""
-    from dpm2_core.tasks.task import task_type  # torch is slow to import
-
-    chosen = load_settings(task_type("movers").training_type, config, settings or [])
-    _train("movers", chosen, out, resume, ((src, parse_names(sequences)), None if val is None else (val, ())))
+_add("movers", "Movers: which points are of things that move or could. It has no SLAM loss.")
 
 
 Scans = tuple[Path, Sequence[str]]

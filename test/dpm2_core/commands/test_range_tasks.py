@@ -43,7 +43,7 @@ def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[
     """The SLAM loss in the last of three epochs; weights of one task are rejected by the other; SLAM needs poses."""
     out = tmp_path / "out"
     settings = [word for setting in [*SMALL, *stages, "epochs=3"] for word in ("--set", setting)]
-    slam = ["--slam-weight", "0.5", "--slam-every", "3"]
+    slam = ["--set", "slam.gamma=0.5", "--set", "slam.every=3"]
     assert dpm2("train", name, pairs, "--out", out, *settings, *slam).returncode == 0
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]

@@ -12,6 +12,7 @@ import pytest
 from ...helpers.command import Done, dpm2
 
 SMALL = ["network.cells=32", "network.cell=2", "network.channels=4", "window=3", "every=1", "slam_loss.points=300"]
+SLAM = ["--set", "slam.gamma=0.5"]
 
 
 @pytest.fixture
@@ -40,8 +41,8 @@ def train(recording: Path, out: Path, *more: object) -> Done:
 @pytest.mark.slow
 def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
-    out = tmp_path / "out"
-    first = train(recording, out, "--slam-weight", "0.5", "--slam-every", "3", "--val", recording)
+    out, third = tmp_path / "out", ("--set", "slam.every=3")
+    first = train(recording, out, *SLAM, *third, "--val", recording)
     assert first.returncode == 0
     assert f"--val {recording} is what the task learns from" in first.stderr
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
@@ -50,9 +51,8 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     again = train(recording, out)
     assert again.returncode == 2
     assert "--resume continues it" in again.stderr
-    same = ("--resume", "--slam-weight", "0.5", "--slam-every", "3")
-    assert train(recording, out, *same).returncode == 0  # nothing is left to do
-    other = train(recording, out, "--resume", "--slam-weight", "0.5")
+    assert train(recording, out, "--resume", *SLAM, *third).returncode == 0  # nothing is left to do
+    other = train(recording, out, "--resume", *SLAM)
     assert (other.returncode, other.stderr.count("\n")) == (2, 1)
     assert "began with slam.every 3, not " in other.stderr
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
@@ -68,7 +68,7 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
 
     scan = recording / "sequences" / "00" / "velodyne" / "000000.bin"
     scan.write_bytes(scan.read_bytes()[::-1])  # another drive of as many scans
-    replaced = train(recording, out, *same)
+    replaced = train(recording, out, "--resume", *SLAM, *third)
     assert (replaced.returncode, replaced.stderr.count("\n")) == (2, 1)
     assert "began with content " in replaced.stderr
 
@@ -88,7 +88,7 @@ def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
     assert "unknown key network.cellz" in error("train", "gndnet", recording, "--out", out, "--set", "network.cellz=3")
     assert "no checkpoint.pt to resume" in error("train", "gndnet", recording, "--out", out, "--resume")
     assert "no sequence has the 9 scans" in error("train", "gndnet", recording, "--out", out)  # 5 of every second
-    assert "--slam-weight" in error("train", "gndnet", recording, "--out", out, "--slam-weight", "-1")
+    assert "slam.gamma=-1" in error("train", "gndnet", recording, "--out", out, "--set", "slam.gamma=-1")
     assert not (out / "checkpoint.pt").exists()
     assert "no such weights" in error("eval-task", "gndnet", tmp_path / "none.safetensors", recording)
     assert "nonsense: no such task" in error("eval-task", "nonsense", tmp_path / "none.safetensors", recording)
