@@ -32,7 +32,7 @@ GROUPS = {
             "show:show",
             "Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.",
         ),
-        "convert": ("convert:app", "Convert a recording to a rosbag2 (MCAP) folder."),
+        "convert": ("convert:convert", "Convert a recording to a rosbag2 (MCAP) folder."),
         "sim": (
             "sim:sim",
             "Simulate a drive: scans, images, poses, point labels, scans without moving objects, "

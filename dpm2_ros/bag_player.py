@@ -126,7 +126,7 @@ class BagPlayer:
                 continue
             kind = self._bag.types[topic]
             if (known := message_type(kind)) is None:
-                hint = "; dpm2 convert drive makes a recording with PointCloud2 of it" if kind in CLOUDS else ""
+                hint = "; dpm2 convert makes a recording with PointCloud2 of it" if kind in CLOUDS else ""
                 self._node.get_logger().warning(
                     f"{printable(topic)} is left out: no message type {printable(kind)}{hint}"
                 )

@@ -121,4 +121,4 @@ def test_the_player_says_what_to_do_without_the_package(
     ros()
     with pytest.raises(UsageError, match="nothing to publish"):
         play(recorded(tmp_path / "bag"))
-    assert f"no message type {CUSTOM}; dpm2 convert drive makes a recording with PointCloud2" in capfd.readouterr().err
+    assert f"no message type {CUSTOM}; dpm2 convert makes a recording with PointCloud2" in capfd.readouterr().err

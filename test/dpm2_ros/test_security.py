@@ -84,7 +84,7 @@ def test_nodes_do_what_the_policy_allows(
 
 
 def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
-    """With a bag of `dpm2 convert kitti`."""
+    """With a bag that `dpm2 convert` makes of KITTI."""
     harness = ros()
     environment = ros_environment(harness.node.context.get_domain_id())
     player = start("bag_player", [str(bag), "--wait", "180", "--lockstep"], environment, tmp_path / "log")

@@ -182,7 +182,7 @@ def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> N
 
 def test_a_drive_that_is_one_file_is_its_own_ground_truth(tmp_path: Path) -> None:
     folder, poses = drive_with_truth(tmp_path)
-    made = CliRunner().invoke(app, ["convert", "kitti", str(folder), str(tmp_path / "bag")])
+    made = CliRunner().invoke(app, ["convert", str(folder), str(tmp_path / "bag")])
     assert made.exit_code == 0, made.output
     write_kitti(tmp_path / "est.txt", poses)
     (bag,) = (tmp_path / "bag").glob("*.mcap")

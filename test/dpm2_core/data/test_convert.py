@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import dpm2_core
-from dpm2_core.commands.convert import app
+from dpm2_core.cli import app
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
@@ -251,13 +251,13 @@ def test_a_place_that_cannot_be_written_is_named(kitti_folder: MakeFolder, tmp_p
 
 def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
-    arguments = ["kitti", str(folder), str(out), "--start", "1", "--end", "4", "--no-images", "--zstd"]
+    arguments = ["convert", str(folder), str(out), "--frames", "1:4", "--set", "input.images=false", "--zstd"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert len(BagSource(out)) == 3
-    result = CliRunner().invoke(app, ["kitti", str(folder), str(out)])
+    result = CliRunner().invoke(app, ["convert", str(folder), str(out)])
     assert isinstance(result.exception, UsageError)
-    assert CliRunner().invoke(app, ["kitti", str(folder), str(out), "--overwrite"]).exit_code == 0
+    assert CliRunner().invoke(app, ["convert", str(folder), str(out), "--overwrite"]).exit_code == 0
     assert len(BagSource(out)) == 5
 
 
@@ -343,7 +343,7 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
     (tmp_path / "clouds").mkdir()
     for n in range(3):
         write_ply(tmp_path / "clouds" / f"{n}.ply", np.full((5, 4), n, np.float32))
-    result = CliRunner().invoke(app, ["drive", str(tmp_path / "clouds"), str(tmp_path / "bag"), "--frames", "1:"])
+    result = CliRunner().invoke(app, ["convert", str(tmp_path / "clouds"), str(tmp_path / "bag"), "--frames", "1:"])
     assert result.exit_code == 0, result.output
     source = BagSource(tmp_path / "bag")
     assert [(frame.stamp - EPOCH_NS, frame.points[0, 0]) for frame in source.frames()] == [(10**8, 1), (2 * 10**8, 2)]
@@ -364,5 +364,5 @@ def test_what_lies_beside_the_scans_does_not_hide_them(kitti_folder: MakeFolder,
     write_ply(folder / "map.ply", np.zeros((5, 4), np.float32))
     (folder / "metadata.yaml").write_text("notes: mine")
     assert isinstance(open_source(folder), KittiSource)
-    result = CliRunner().invoke(app, ["kitti", str(tmp_path), str(tmp_path / "bag")])
+    result = CliRunner().invoke(app, ["convert", str(tmp_path), str(tmp_path / "bag")])
     assert "no KITTI sequence" in str(result.exception)

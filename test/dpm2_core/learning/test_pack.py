@@ -204,7 +204,7 @@ def test_a_bag_with_poses_packs_like_its_drive(kitti: Path, tmp_path: Path) -> N
         "bag": ["train", "pack", str(bag), str(tmp_path / "of_bag")],
         "drive": ["train", "pack", drive, str(tmp_path / "of_drive"), "--set", "sequence=03"],
     }
-    made = runner.invoke(app, ["convert", "kitti", drive, str(bag), "--sequence", "03"])
+    made = runner.invoke(app, ["convert", drive, str(bag), "--set", "input.sequence=03"])
     assert made.exit_code == 0, made.output
     for command in arguments.values():
         done = runner.invoke(app, command)
