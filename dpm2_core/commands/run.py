@@ -35,7 +35,6 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,
     frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
-    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the camera out.")] = False,
     corrupt: Annotated[
         str | None,
         typer.Option(
@@ -58,9 +57,6 @@ def run(
     ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
-    preset: Annotated[
-        str | None, typer.Option(help="slam.preset: auto (by what the scans show), outdoor, indoor or highway.")
-    ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show the run as it goes on, in rerun's viewer.")] = False,
     record: Annotated[
         Path | None, typer.Option(help="The same to a file, such as run.rrd: `rerun run.rrd` shows it.")
@@ -68,9 +64,7 @@ def run(
     json_file: JsonFile = None,
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
-    overrides = [*(settings or []), *(["input.images=false"] if no_image else [])]
-    overrides += [] if preset is None else [f"slam.preset={preset}"]
-    chosen = load_settings(Config, config, overrides)
+    chosen = load_settings(Config, config, settings or [])
     corruption = None if corrupt is None else parse_corruption(corrupt)
     span = parse_range(frames)
     if resume and extend:
