@@ -9,11 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from dpm2_core.commands.options import JsonFile, note, parse_lengths, show
-from dpm2_core.config import load_settings
+from dpm2_core.commands.options import InputOverrides, JsonFile, note, parse_lengths, show
 from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import is_drive, open_source
-from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.settings import input_settings
 from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stamps_of
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame
@@ -48,9 +47,7 @@ def eval_(
         Path | None,
         typer.Option(help="KITTI calib.txt: the estimate holds LiDAR poses, the ground truth camera poses."),
     ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of input where --gt is a drive, such as sequence=04.")
-    ] = None,
+    settings: InputOverrides = None,
 ) -> None:
     """Evaluate a trajectory: KITTI metric, APE, RPE and final drift."""
     if settings and not is_drive(gt):
@@ -78,7 +75,7 @@ def eval_(
 def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
     """True poses of all frames of a drive, NaN where there is none, as `dpm2 run` writes its own: by stamp, or by frame
     number; of the LiDAR, or of the left camera where its place is known. And which of these, in words."""
-    source = open_source(path, load_settings(InputSettings, None, [*settings, "images=false"]))
+    source = open_source(path, input_settings([*settings, "input.images=false"]))
     if source.poses is None:
         raise UsageError(f"{path}: the drive has no ground truth")
     if not known(source.poses).any():

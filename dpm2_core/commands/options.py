@@ -18,6 +18,9 @@ from dpm2_core.files import atomic_write, json_text
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
+InputOverrides = Annotated[
+    list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as input.sequence=04.")
+]
 Workers = Annotated[int, typer.Option(min=1, help="At a time; they do not change the result.")]
 PROCESSORS = processors()
 """The default."""

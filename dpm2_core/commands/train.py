@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, Workers, note
+from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, note
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.source import parse_range
@@ -50,27 +50,24 @@ def pack(
     out: Annotated[Path, typer.Argument(help="Folder of the packed drive; name it under data.packed to train on it.")],
     frames: Annotated[str, typer.Option(help="Positions a:b to pack, from 0.")] = ":",
     preset: Annotated[str, typer.Option(help="Network preset: its crop and image size are stored.")] = "small",
-    no_image: Annotated[bool, typer.Option("--no-image", help="Leave the images out.")] = False,
     every: Annotated[
         bool, typer.Option("--all", help="Every drive below SRC, each to OUT/NAME; those that are there already stay.")
     ] = False,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as sequence=04.")
-    ] = None,
+    settings: InputOverrides = None,
 ) -> None:
     """A recorded drive with ground truth, or all of a data set, packed for training frame by frame."""
     from dpm2_core.data.open import sequences_below
     from dpm2_core.learning.generate import check_same  # torch and embree are slow to import
 
-    overrides = [*(settings or []), *(["images=false"] if no_image else [])]
+    overrides = settings or []
     _check_packing(frames, preset, overrides)
     if not every:
         if out.exists():
             raise UsageError(f"{out}: is there already; remove it, or choose another folder")
         _pack_one(src, out, frames, preset, overrides)
         return
-    if any(setting.startswith("sequence=") for setting in overrides):
-        raise UsageError("--all: packs every drive; leave --set sequence= out")
+    if any(setting.startswith("input.sequence=") for setting in overrides):
+        raise UsageError("--all: packs every drive; leave --set input.sequence= out")
     left_out = []
     names = sequences_below(src)
     for name in names:
@@ -78,7 +75,7 @@ def pack(
             check_same(out / name, _packing(frames, preset, overrides))
             continue
         try:
-            _pack_one(src, out / name, frames, preset, [*overrides, f"sequence={name}"])
+            _pack_one(src, out / name, frames, preset, [*overrides, f"input.sequence={name}"])
         except UsageError as error:  # of this drive; a full disk ends them all
             typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
             left_out.append(name)
@@ -88,27 +85,27 @@ def pack(
 
 def _check_packing(frames: str, preset: str, overrides: list[str]) -> None:
     """Raise UsageError for what is wrong whatever the drive."""
-    from dpm2_core.data.settings import InputSettings
+    from dpm2_core.data.settings import input_settings
     from dpm2_core.network.settings import preset as network_preset
 
-    load_settings(InputSettings, None, overrides)
+    input_settings(overrides)
     network_preset(preset)
     parse_range(frames)
 
 
 def _packing(frames: str, preset: str, overrides: list[str]) -> dict[str, Any]:
     """What a packed drive is made by, beside its own frames."""
-    given = sorted(setting for setting in overrides if not setting.startswith("sequence="))
+    given = sorted(setting for setting in overrides if not setting.startswith("input.sequence="))
     return {"frames": frames, "preset": preset, "input": given}
 
 
 def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[str]) -> None:
     from dpm2_core.data.open import open_source
-    from dpm2_core.data.settings import InputSettings
+    from dpm2_core.data.settings import input_settings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
     from dpm2_core.network.settings import preset as network_preset
 
-    source = open_source(src, load_settings(InputSettings, None, overrides))
+    source = open_source(src, input_settings(overrides))
     network = network_preset(preset)
     start, stop = parse_range(frames)
     chosen = range(len(source))[start:stop]

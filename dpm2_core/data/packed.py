@@ -74,7 +74,7 @@ class PackedWriter:
         if len(pixels) != self.images or (self.images and pixels.shape != self._files["pixels"].row):
             raise UsageError(
                 f"{self.folder}: some frames have an image and some have none, or another size; "
-                "--no-image packs them without"
+                "--set input.images=false packs them without"
             )
         self._files["clouds"].append(np.round(sample.cloud / QUANTUM).clip(-32767, 32767).astype(np.int16))
         self._offsets.append(self._offsets[-1] + len(sample.cloud))

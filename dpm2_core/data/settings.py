@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation
 
-from dpm2_core.config import Settings
+from dpm2_core.config import Settings, load_settings
 from dpm2_core.data.point_times import TimeUnit
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -122,3 +123,16 @@ class InputSettings(Settings):
     def imu_rotation(self) -> Array | None:
         """R_lidar_imu (3, 3); None if it is not set here."""
         return None if self.q_lidar_imu is None else np.asarray(Rotation.from_quat(self.q_lidar_imu).as_matrix())
+
+
+class _OfInput(Settings):
+    input: InputSettings = InputSettings()
+
+
+def input_settings(overrides: Sequence[str]) -> InputSettings:
+    """How a recording is read, of a command that has no other settings: named as in all others.
+
+    Raises:
+        UsageError: a key or value is not allowed.
+    """
+    return load_settings(_OfInput, None, overrides).input

@@ -229,8 +229,8 @@ def _check_cameras(name: str, first: tuple[int, list[str]], now: tuple[int, list
     if len(fewer[1]) < len(more[1]):
         lacking = ", ".join(sorted(set(more[1]) - set(fewer[1])) or more[1])
         raise UsageError(
-            f"{name}: frame {fewer[0]} has no usable image of {lacking}, frame {more[0]} has one; --no-image packs "
-            "the drive without images"
+            f"{name}: frame {fewer[0]} has no usable image of {lacking}, frame {more[0]} has one; "
+            "--set input.images=false packs the drive without images"
         )
 
 

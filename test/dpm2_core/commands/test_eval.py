@@ -153,11 +153,12 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
     """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
     folder, poses = drive_with_truth(tmp_path)
     write_kitti(tmp_path / "est.txt", poses[1:], range(1, 6))
-    run = CliRunner().invoke(
-        app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt"), "--json", str(tmp_path / "m.json")]
-    )
-    assert run.exit_code == 0, run.output
-    assert json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"] < 1e-6
+    for drive in ([str(folder)], [str(tmp_path), "--set", "input.sequence=07"]):
+        run = CliRunner().invoke(
+            app, ["eval", "--gt", *drive, "--est", str(tmp_path / "est.txt"), "--json", str(tmp_path / "m.json")]
+        )
+        assert run.exit_code == 0, run.output
+        assert json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"] < 1e-6
     (folder / "poses.txt").unlink()
     run = CliRunner().invoke(app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt")])
     assert "no ground truth" in str(run.exception)

@@ -178,7 +178,7 @@ def kitti(tmp_path: Path) -> Path:
 def test_command_and_mixture(kitti: Path, packed: Path, tmp_path: Path) -> None:
     """`dpm2 train pack`, then training data by weight: 0.9 of the groups from a folder whatever its size."""
     out = tmp_path / "real" / "03"
-    arguments = ["train", "pack", str(kitti), str(out), "--frames", "1:", "--set", "sequence=03"]
+    arguments = ["train", "pack", str(kitti), str(out), "--frames", "1:", "--set", "input.sequence=03"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert f"{out}: 3 frames" in done.stderr
@@ -202,7 +202,7 @@ def test_a_bag_with_poses_packs_like_its_drive(kitti: Path, tmp_path: Path) -> N
     bag, drive = tmp_path / "bag", str(kitti)
     arguments = {
         "bag": ["train", "pack", str(bag), str(tmp_path / "of_bag")],
-        "drive": ["train", "pack", drive, str(tmp_path / "of_drive"), "--set", "sequence=03"],
+        "drive": ["train", "pack", drive, str(tmp_path / "of_drive"), "--set", "input.sequence=03"],
     }
     made = runner.invoke(app, ["convert", drive, str(bag), "--set", "input.sequence=03"])
     assert made.exit_code == 0, made.output
@@ -230,11 +230,11 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     for other, name in (
         (["--preset", "paper"], "preset small"),
         (["--frames", "0:3"], "frames :"),
-        (["--no-image"], "input"),
+        (["--set", "input.images=false"], "input"),
     ):
         refused = CliRunner().invoke(app, [*arguments, *other])
         assert f"03: made with {name}" in str(refused.exception)
-    one_of_all = CliRunner().invoke(app, [*arguments, "--set", "sequence=03"])
+    one_of_all = CliRunner().invoke(app, [*arguments, "--set", "input.sequence=03"])
     assert "packs every drive" in str(one_of_all.exception)
     nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])
     assert "no drives below" in str(nothing.exception)
