@@ -88,9 +88,11 @@ def merge(
     out: Annotated[Path, typer.Option(help="New map file.")],
     transform: Annotated[
         list[str] | None,
-        typer.Option(help='Pose of a further map in the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; one each.'),
+        typer.Option(
+            help='Pose of a further map in the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; one each. Else the '
+            "maps are found in each other by their descriptors."
+        ),
     ] = None,
-    align: Annotated[bool, typer.Option("--align", help="Find the maps in each other by their descriptors.")] = False,
     config: ConfigFile = None,
     settings: Overrides = None,
 ) -> None:
@@ -101,21 +103,21 @@ def merge(
 
     check_new(out)
     given = [parse_transform(text) for text in transform or ()]
-    if len(paths) < 2 or align == bool(given) or (given and len(given) != len(paths) - 1):
-        raise UsageError("merge: want two or more maps, and either --align or a --transform for each but the first")
+    if len(paths) < 2 or (given and len(given) != len(paths) - 1):
+        raise UsageError("merge: want two or more maps, and no --transform or one for each but the first")
     if given and (config is not None or settings):
-        raise UsageError("merge: --config and --set are for --align; known transforms need no settings")
+        raise UsageError("merge: --config and --set say how places are found; known transforms need no settings")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
         maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
         described = {session.weights for data in maps for session in data.sessions if session.weights}
-        if align:
+        if not given:
             described.add(weights_id(chosen.neural.weights))
         if len(described) > 1:
             raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
         named = list(zip(paths, maps, strict=True))
         _say_what_is_there_twice(named)
-        first = _joined_by_places(named, chosen) if align else maps[0]
+        first = maps[0] if given else _joined_by_places(named, chosen)
         for (path, other), T in zip(named[1:], given, strict=False):
             if (off := off_by_satellites(first, other, T)) > _OFF:
                 doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"

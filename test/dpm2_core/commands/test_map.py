@@ -212,7 +212,7 @@ def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
     both = loaded(out)
     T = se3.make([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [10, 0, 0])
     np.testing.assert_allclose(both.poses[12:], T @ both.poses[:12], atol=1e-9)
-    for words in (["--transform", "1 2 3"], [], ["--align", "--transform", "0 0 0 0"], ["--transform", "a b c d"]):
+    for words in (["--transform", "1 2 3"], 2 * ["--transform", "0 0 0 0"], ["--transform", "a b c d"]):
         done = dpm2("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words)
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1

@@ -39,7 +39,7 @@ def test_figures_on_stdout_are_json_where_one_is_not_known(capsys: pytest.Captur
     (["map", "export", "m", "a.g2o", "--voxel", "1"], "--voxel: a map as g2o has no use for it"),
     (["map", "export", "m", "a.ply", "--resolution", "1"], "--resolution: a map as ply has no use for it"),
     (["map", "merge", "a", "b", "--out", "c", "--transform", "1 2 3 4", "--set", "slam.threads=1"],
-     "--config and --set are for --align"),
+     "--config and --set say how places are found"),
 ])  # fmt: skip
 def test_an_option_without_effect_is_rejected(
     command: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -55,7 +55,7 @@ def test_a_loop_that_the_merged_map_contradicts_is_rejected_in_its_file_and_name
     monkeypatch.setattr(merge, "loops_by", lambda closer: lambda a, b: found)
     save_as(two, tmp_path / "two")
     save_as(one, tmp_path / "one")
-    done = dpm2("map", "merge", tmp_path / "two", tmp_path / "one", "--out", tmp_path / "all", "--align",
+    done = dpm2("map", "merge", tmp_path / "two", tmp_path / "one", "--out", tmp_path / "all",
                 "--set", "slam.loops.descriptors=false")  # fmt: skip
     assert done.returncode == 0
     assert "loops that contradict the rest are rejected, those of the new map's keyframes 0 and 12\n" in done.stderr
