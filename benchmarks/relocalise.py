@@ -63,7 +63,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
-            verifier = Verifier(settings.relocalise.verification, settings.geometric)
+            verifier = Verifier(settings.verification, settings.geometric)
             known = KnownMap(data.keyframes, data.clouds, data.poses)
             verifiers = ByScale(verifier, verifier)
             relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, known)

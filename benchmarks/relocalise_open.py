@@ -91,7 +91,7 @@ def _relocalised(
     poses = np.stack([place.T_map_lidar for place in known])
     clouds = [keyframe.cloud for keyframe in keyframes]
     in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
-    verifier = Verifier(settings.relocalise.verification, settings.geometric)
+    verifier = Verifier(settings.verification, settings.geometric)
     verifiers = ByScale(verifier, verifier)
     relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, in_map)
     rows = []

@@ -143,7 +143,7 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
 
 
 def _verifiers(s: SlamSettings) -> ByScale[Verifier]:
-    return ByScale(*(Verifier(one.relocalise.verification, one.geometric) for one in (s, s.indoors())))
+    return ByScale(*(Verifier(one.verification, one.geometric) for one in (s, s.indoors())))
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:
@@ -153,7 +153,7 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    ways = ByScale(*((one.loops, Verifier(one.loops.verification, one.geometric)) for one in (s, s.indoors())))
+    ways = ByScale(*((one.loops, Verifier(one.verification, one.geometric)) for one in (s, s.indoors())))
     return LoopCloser(ways, _network(s) if described else None)
 
 

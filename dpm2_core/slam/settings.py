@@ -16,6 +16,7 @@ from dpm2_core.slam.filters import FilterSettings
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.closure import LoopSettings
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings
+from dpm2_core.slam.loops.verification import VerificationSettings
 from dpm2_core.slam.mapping.mapper import MapSettings
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
 from dpm2_core.slam.odometry.settings import OdometrySettings
@@ -49,6 +50,7 @@ class SlamSettings(Settings):
     keyframes: KeyframeSettings = KeyframeSettings()
     loops: LoopSettings = LoopSettings()
     relocalise: RelocalizationSettings = RelocalizationSettings()
+    verification: VerificationSettings = VerificationSettings()
     pose_graph: RobustSettings = RobustSettings()
     map: MapSettings = MapSettings()
 

@@ -26,12 +26,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain, margin
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
-from dpm2_core.slam.loops.verification import (
-    SAME_PLACE,
-    VerificationSettings,
-    Verifier,
-    objection_of_others,
-)
+from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, objection_of_others
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
@@ -65,7 +60,6 @@ class LoopSettings(Settings):
     """Widens the radius by so many meters per meter of path since that keyframe."""
     surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate along the path make up the map to register to, m."""
-    verification: VerificationSettings = VerificationSettings()
     consistency: ConsistencySettings = ConsistencySettings()
 
 

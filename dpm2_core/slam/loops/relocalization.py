@@ -26,13 +26,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-from dpm2_core.slam.loops.verification import (
-    SAME_PLACE,
-    Along,
-    VerificationSettings,
-    Verifier,
-    objection_of_others,
-)
+from dpm2_core.slam.loops.verification import SAME_PLACE, Along, Verifier, objection_of_others
 from dpm2_core.slam.registration.texture import VisualSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
@@ -61,7 +55,6 @@ class RelocalizationSettings(Settings):
     """With a hint, keyframes farther from it than this are no candidates, m."""
     max_failures: int = Field(3, ge=1)
     """Keyframes in a row that do not fit the map where they are thought to be, after which one is lost."""
-    verification: VerificationSettings = VerificationSettings()
 
 
 class FindsPlaces(Protocol):

@@ -34,7 +34,7 @@ Along = Callable[[Registration], Registration]
 
 
 class VerificationSettings(Settings):
-    """What a pose needs to be accepted."""
+    """What the pose of a loop, or of a place in a search, needs to be accepted."""
 
     voxel: float = Field(0.8, gt=0)
     """Spacing of the points that are registered, m, as in the odometry..."""

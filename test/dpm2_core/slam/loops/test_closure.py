@@ -29,7 +29,7 @@ from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
-from dpm2_core.slam.loops.verification import Verifier
+from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 from ....helpers.drives import street
@@ -65,8 +65,7 @@ def where(s: float, lateral: float = 0.0, heading: float = 0.0) -> Array:
 
 
 def closer(with_network: bool = True, **settings: object) -> LoopCloser:
-    loops = LoopSettings.model_validate(settings)
-    way = loops, Verifier(loops.verification, GeometricSettings())
+    way = LoopSettings.model_validate(settings), Verifier(VerificationSettings(), GeometricSettings())
     return LoopCloser(ByScale(way, way), network() if with_network else None)
 
 

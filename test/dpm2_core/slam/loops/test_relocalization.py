@@ -23,7 +23,7 @@ from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
-from dpm2_core.slam.loops.verification import Verifier
+from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.texture import VisualSettings
 
@@ -63,10 +63,9 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
         Keyframe(i, i, i, poses[i], cloud[:0], None, "", described[id(cloud)])
         for i, cloud in enumerate(looks or clouds)
     ]
-    settings = RelocalizationSettings()
-    verifier = Verifier(settings.verification, GeometricSettings())
+    verifier = Verifier(VerificationSettings(), GeometricSettings())
     known, verifiers = KnownMap(keyframes, clouds, poses), ByScale(verifier, verifier)
-    return Relocalizer(settings, VisualSettings(), verifiers, network, known)
+    return Relocalizer(RelocalizationSettings(), VisualSettings(), verifiers, network, known)
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:
