@@ -139,7 +139,7 @@ def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> No
     def pixels(of: Keyframe) -> tuple[Array, Texture]:
         image = image_of(of.thumbnail or b"")
         assert image is not None
-        texture = textured(image, 320)
+        texture = textured(image)
         uv, shown = texture.project(se3.transform(texture.T_cam_lidar, of.cloud[:, :3].astype(np.float64)))
         return uv[shown], texture
 

@@ -39,6 +39,7 @@ _FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, a
 _SHARED = 0.6
 """Loops per place: at 0.5 no two share one, and wrong ones may have their way where all are solved at once."""
 _WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
+_ROUNDS = 8  # of solving and judging, at most
 _STEPS = 50  # of the plain least squares, at most
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
@@ -53,10 +54,8 @@ class RobustSettings(Settings):
     wrong ones hundreds off: the room between is for covariances that promise too much."""
     odometry_sigmas: float = Field(20.0, gt=0)
     """A loop starts out set aside if the odometry between its ends is more than so many standard deviations off."""
-    rounds: int = Field(8, ge=1)
-    """At most so many times of solving and judging."""
     iterations: int = Field(50, ge=1)
-    """At most so many Levenberg-Marquardt steps in each."""
+    """At most so many Levenberg-Marquardt steps in each round of solving and judging."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Solution:
         sigmas: (E,) how far the optimized poses are from each loop, in standard deviations.
         odometry_sigmas: (E,) how far the odometry alone is; nan for loops between two trajectories.
         rounds: of solving and judging.
-        settled: whether the results stayed; after `rounds` of the settings the last ones stand.
+        settled: whether the results stayed; else these are those of the last round that is allowed.
     """
 
     poses: Array
@@ -117,7 +116,7 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
     ends = np.searchsorted(condensed.nodes, graph.ends)
     poses = start[condensed.nodes]
     settled, count = False, 0
-    while not settled and count < settings.rounds:
+    while not settled and count < _ROUNDS:
         count += 1
         factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
         starts = [poses]
@@ -127,7 +126,7 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
         settled = bool((kept == used).all())
-        if not settled and count < settings.rounds:
+        if not settled and count < _ROUNDS:
             used = kept
     return Solution(condensed.spread(poses), used, sigmas, apart, count, settled)
 

@@ -26,23 +26,23 @@ _MOST_SIGMAS = 3.0
 """...and is none where the odometry is no more than so many standard deviations off: on the next storey of a car park
 it is 3.7 to 5.1. The odometry promises little: at right loops of whole drives it is 0.2, on real ones perhaps 1."""
 _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off by without such an edge
+_TURN = 3.0, 0.02  # degrees, and per meter of path: a loop may correct the odometry so much
+_CIRCLE = 0.01  # m, per meter of path: the circle of two loops may miss its start by so much more
 
 
 class ConsistencySettings(Settings):
     """How far loops may differ from the odometry and from each other."""
 
     drift: float = Field(_DRIFT, gt=0)
-    """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected."""
-    drift_turn: float = Field(0.02, ge=0)
-    """The same for rotation, degrees per meter (and 3 degrees)."""
+    """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected;
+    or by more than 0.02 degrees per meter, plus 3."""
     certain: float = Field(2.0, ge=0)
     """A loop that corrects the odometry by no more than this, m (and degrees), needs no other loop to confirm it."""
     reach: float = Field(100.0, gt=0)
     """Another loop confirms it if both its ends are nearer than this along the path, m..."""
     circle: float = Field(0.4, ge=0)
-    """...and the circle of the two misses its start by no more than this, m (and three times that, degrees)..."""
-    circle_drift: float = Field(0.01, ge=0)
-    """...and this per meter of the path in the circle (and three times that in degrees)."""
+    """...and the circle of the two misses its start by no more than this, m, and 0.01 m per meter of its path (three
+    times that in degrees)."""
 
 
 class OdometryChain:
@@ -159,7 +159,7 @@ class Consistency:
         meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
-            if meters > margin(since, s) or degrees > 3 + s.drift_turn * since:
+            if meters > margin(since, s) or degrees > _TURN[0] + _TURN[1] * since:
                 return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *confirmed])
@@ -189,7 +189,7 @@ class Consistency:
         if back > s.reach:
             return False
         meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ T_there @ other.T_from_to @ T_back)
-        allowed = s.circle + s.circle_drift * (there + back)
+        allowed = s.circle + _CIRCLE * (there + back)
         return meters <= allowed and degrees <= 3 * allowed
 
     def _way(self, a: int, b: int) -> tuple[float, Array]:

@@ -79,8 +79,7 @@ class PicturedPlaces:
 
     def texture(self, picture: Image | None) -> Texture | None:
         """Of a picture that is looked for; None without one, and if none are to be used."""
-        s = self._settings
-        return textured(picture, s.width) if picture is not None and s.enabled else None
+        return textured(picture) if picture is not None and self._settings.enabled else None
 
     def along(self, picture: Texture, reach: float, nodes: Sequence[int]) -> Along:
         """How far along a place is, at most `reach` m from where it is thought to be, by the nearest of `nodes`.
@@ -158,10 +157,10 @@ class PicturedPlaces:
         return self._references[node]
 
     def _made(self, node: int, axis: Array) -> Reference | None:
-        image, s = usable_image(self._known.thumbnail(node)), self._settings
+        image = usable_image(self._known.thumbnail(node))
         if image is None:
             return None
-        return reference(self._known.clouds[node], textured(image, s.width), s.points, axis)
+        return reference(self._known.clouds[node], textured(image), axis)
 
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:

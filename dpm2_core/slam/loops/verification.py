@@ -26,6 +26,7 @@ _WELL = 0.75  # fraction of that which fits where a pose is right; with less, a 
 _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
 _LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
 _ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
+_MOST_TURNED = 5.0  # degrees, from the proposed pose
 SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
 
 
@@ -51,9 +52,7 @@ class VerificationSettings(Settings):
     max_sigma: float = Field(0.1, gt=0)
     """Largest standard deviation of the position in its worst direction, m: rejects loops along a tunnel."""
     max_moved: float = Field(2.0, gt=0)
-    """The points may not move the proposed pose farther than this, m..."""
-    max_turned: float = Field(5.0, gt=0)
-    """...or turn it by more than this, degrees."""
+    """The points may not move the proposed pose farther than this, m, or turn it by more than 5 degrees."""
     range: float = Field(40.0, gt=0)
     """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
 
@@ -157,6 +156,6 @@ class Verifier:
     def _departure(self, T_proposed_found: Array, widen: float) -> str:
         """Why a pose is too far from the proposed one; empty if it is not."""
         meters, degrees = se3.magnitude(T_proposed_found)
-        if meters > widen * self._settings.max_moved or degrees > widen * self._settings.max_turned:
+        if meters > widen * self._settings.max_moved or degrees > widen * _MOST_TURNED:
             return f"points and proposal {meters:.1f} m, {degrees:.1f} deg apart"
         return ""

@@ -19,7 +19,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.admission import check_keyframe
-from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow
+from dpm2_core.slam.mapping.moving import MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
 from dpm2_core.slam.mapping.restore import restore_solved
@@ -41,7 +41,9 @@ class MapSettings(Settings):
     thumbnail: int = Field(0, ge=0, le=1024)
     """Width of the image that a map file keeps of each keyframe, pixels. 0: only of those by whose picture one can say
     how far along a tunnel or a highway one is, see `slam.visual`: 6 kB each."""
-    moving: MovingSettings = MovingSettings()
+    moving_window: int = Field(5, ge=0)
+    """So many keyframes before and after one tell which of its points are of moving things, and no part of the map; 0
+    keeps all."""
     redundancy: RedundancySettings = RedundancySettings()
 
 
@@ -198,7 +200,7 @@ class Mapper:
             self._lend(node, to_before, self.loops[before:])
             if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
                 self._mark_moving(robot.window.finish(self.poses))
-                robot.window = MovingWindow(self._settings.moving)
+                robot.window = MovingWindow(self._settings.moving_window)
             self._mark_moving(robot.window.add(node, cloud, self.poses, origin))
         finally:
             self._store(node, thumbnail, [*to_before, *self.loops[before:]])
@@ -266,7 +268,7 @@ class Mapper:
             self._writer = MapWriter(store, self._clouds, data.poses)
 
     def _robot(self, name: str) -> _Robot:
-        return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving)))
+        return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving_window)))
 
     def _add_node(self, keyframe: Keyframe, way: Registration | None, last: int | None) -> list[Edge]:
         """A node with an edge to its robot's `last` one, also when some between them never arrived; `way`: its edge as

@@ -13,11 +13,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
-from dpm2_core.config import Settings
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
@@ -29,21 +27,10 @@ _COLUMNS = 360
 _LOWEST, _ROWS = np.radians(-45.0), 90
 _HALVES = (1, 2, 4)  # half sizes, pixels, of the windows in which a near return counts
 _CLEARANCE = 0.25  # m above the local ground: lower points stay, for the ground is seen at grazing angles
-
-
-class MovingSettings(Settings):
-    """Keeping points of moving things out of the map."""
-
-    window: int = Field(5, ge=0)
-    """So many keyframes before and after one are its witnesses; 0 keeps all points."""
-    witnesses: int = Field(2, ge=1)
-    """So many must look through the place of a point."""
-    margin: float = Field(0.5, gt=0)
-    """What they see must lie so far behind it, m; 3 % of the range are added."""
-    growth: float = Field(0.7, gt=0)
-    """Points this near to a moving one move with it, unless neighbors saw them, m."""
-    footprint: float = Field(0.3, gt=0)
-    """A return within this of the line of sight counts as seeing the point, m."""
+_WITNESSES = 2  # so many must look through the place of a point
+_BEHIND = (0.5, 0.03)  # m, and per meter of range: what they see must lie so far behind it
+_FOOTPRINT = 0.3  # m: a return within this of the line of sight counts as seeing the point
+_TOUCHES = 0.7  # m: points this near to a moving one move with it, unless neighbors saw them
 
 
 class RangeImage:
@@ -58,11 +45,11 @@ class RangeImage:
         standing = _nearest(r[above], row[above], column[above])
         self._near = [minimum_filter(standing, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALVES]
 
-    def compare(self, points: Points, settings: MovingSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def compare(self, points: Points) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """For (M, 3+) points in the sensor's frame: whether they are looked through, and whether they are seen."""
         r, row, column = _spherical(points[:, :3])
-        margin = settings.margin + 0.03 * r
-        window = np.searchsorted(_HALVES[:-1], settings.footprint / np.maximum(r, 0.1) / _PIXEL)
+        margin = _BEHIND[0] + _BEHIND[1] * r
+        window = np.searchsorted(_HALVES[:-1], _FOOTPRINT / np.maximum(r, 0.1) / _PIXEL)
         near = np.choose(window, [image[row, column] for image in self._near])
         own = self._own[row, column]
         through = np.isfinite(own) & (np.minimum(own, near) > r + margin) & (r > 2.0)
@@ -75,9 +62,7 @@ def _nearest(r: Points, row: NDArray[np.intp], column: NDArray[np.intp]) -> Poin
     return image
 
 
-def find_moving(
-    cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImage, Array]], settings: MovingSettings
-) -> NDArray[np.bool_]:
+def find_moving(cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImage, Array]]) -> NDArray[np.bool_]:
     """Which of the (M, 4) points of a keyframe belong to moving things.
 
     Args:
@@ -91,19 +76,19 @@ def find_moving(
     candidates = np.flatnonzero(height_above_ground(cloud) > _CLEARANCE)
     part = cloud[candidates]
     for image, T_map_other in others:
-        looked, present = image.compare(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part), settings)
+        looked, present = image.compare(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part))
         through[candidates] += looked
         seen[candidates] += present
-    moving = (through >= settings.witnesses) & (through > seen)
-    return _grown(moving, cloud, candidates[through[candidates] >= seen[candidates]], settings.growth)
+    moving = (through >= _WITNESSES) & (through > seen)
+    return _grown(moving, cloud, candidates[through[candidates] >= seen[candidates]])
 
 
-def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp], reach: float) -> Mask:
+def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
     """With those candidates that touch a moving point: the rest of a car, against the sky or out of their sight."""
     grown = moving.copy()
     edge = np.flatnonzero(moving)
     while len(edge) and len(candidates):
-        near, _ = cKDTree(cloud[edge, :3]).query(cloud[candidates, :3], distance_upper_bound=reach)
+        near, _ = cKDTree(cloud[edge, :3]).query(cloud[candidates, :3], distance_upper_bound=_TOUCHES)
         edge = candidates[np.isfinite(near)]
         edge = edge[~grown[edge]]
         grown[edge] = True
@@ -113,9 +98,10 @@ def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp], reach: flo
 class MovingWindow:
     """The last keyframes of a drive: each is checked once there are as many after it as before it."""
 
-    def __init__(self, settings: MovingSettings) -> None:
-        self._settings = settings
-        self._seen: deque[tuple[int, Points, RangeImage, Array]] = deque(maxlen=2 * settings.window + 1)
+    def __init__(self, window: int) -> None:
+        """`window`: see `MapSettings.moving_window`."""
+        self._window = window
+        self._seen: deque[tuple[int, Points, RangeImage, Array]] = deque(maxlen=2 * window + 1)
         self._next = 0  # the first node that has not been checked
 
     def add(
@@ -125,12 +111,12 @@ class MovingWindow:
 
         `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is where in its frame the LiDAR was.
         """
-        if self._settings.window:
+        if self._window:
             T_kf_lidar = se3.make(np.eye(3), origin)
             cloud = se3.transform(se3.inverse(T_kf_lidar), cloud)
             self._seen.append((node, cloud, RangeImage(cloud), T_kf_lidar))
-            if len(self._seen) > self._settings.window:
-                yield from self._compare(self._seen[-1 - self._settings.window][0], poses)
+            if len(self._seen) > self._window:
+                yield from self._compare(self._seen[-1 - self._window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Check those at the end of the drive by the keyframes that there are."""
@@ -141,7 +127,7 @@ class MovingWindow:
         for node, cloud, _, T_kf_lidar in self._seen:
             if self._next <= node <= last:
                 others = [(image, poses[n] @ T) for n, _, image, T in self._seen if n != node]
-                yield node, find_moving(cloud, poses[node] @ T_kf_lidar, others, self._settings)
+                yield node, find_moving(cloud, poses[node] @ T_kf_lidar, others)
                 self._next = node + 1
 
 

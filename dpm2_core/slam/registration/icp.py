@@ -35,8 +35,6 @@ class GeometricSettings(Settings):
     """The same in the last iterations, m."""
     noise: float = Field(0.06, gt=0)
     """Standard deviation of a point on a perfect plane, m: range noise and calibration."""
-    iterations: int = Field(15, ge=1)
-    """At most so many Gauss-Newton steps."""
     min_points: int = Field(80, ge=1)
     """A registration with fewer inliers is rejected."""
     min_inliers: float = Field(0.5, ge=0, le=1)
@@ -47,6 +45,7 @@ class GeometricSettings(Settings):
     wrong place."""
 
 
+_STEPS = 15  # of Gauss-Newton, at most
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
 CORRELATED = 10
 _NORMAL_NOISE = 0.12  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, on open roads over 0.2
@@ -105,7 +104,7 @@ class GeometricRegistration:
         # Points that share a plane are not independent: the information of `CORRELATED` of them counts as one.
         predicted = prior is not None
         prior = 1e-6 * np.eye(6) if prior is None else CORRELATED * prior
-        for _ in range(s.iterations):
+        for _ in range(_STEPS):
             points = np.ascontiguousarray(source[::4]) if coarse else source
             matched = self._matched(points, target, T, gate)
             H, gradient, inliers, rmse = linearize(points, np.ascontiguousarray(T[:3, :3]), *matched)

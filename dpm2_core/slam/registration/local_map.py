@@ -18,6 +18,7 @@ from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
 _SIGHT = (0.99, 1.1)  # quantile of the distances of a scan's points, and times that: farther away it shows nothing
+_NEIGHBORS = 15  # points that a plane is fitted to
 _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
@@ -32,8 +33,6 @@ class LocalMapSettings(Settings):
     """Points farther than this from the sensor are forgotten, m."""
     scans: int = Field(25, ge=1)
     """Points that entered this many scans ago are forgotten: bounds memory, and traces of moving things."""
-    plane_neighbours: int = Field(15, ge=3)
-    """Points that a local plane is fitted to."""
 
 
 class LocalMap:
@@ -131,6 +130,6 @@ class LocalMap:
         asked[index] = True
         requested = np.flatnonzero(asked & np.isnan(self._variances))
         if len(requested):
-            k = min(self._settings.plane_neighbours, len(self.points))
+            k = min(_NEIGHBORS, len(self.points))
             around = self._grid.neighbors(self.points[requested], k)
             self._normals[requested], self._variances[requested] = fit_planes(self.points[around])

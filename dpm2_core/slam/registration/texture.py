@@ -34,18 +34,14 @@ class VisualSettings(Settings):
     """Standard deviation of the position in its worst direction above which it counts as open, m."""
     reach: float = Field(20.0, gt=0)
     """Farthest that is looked to either side, m; less where the motion so far says more."""
-    baseline: float = Field(3.0, gt=0)
-    """Way after which another image is the one to compare with, m."""
-    points: int = Field(1500, gt=0)
-    """So many points are compared."""
-    width: int = Field(640, gt=0)
-    """Images are reduced to this width, pixels."""
     min_correlation: float = Field(0.3, ge=0, le=1)
     """Minimum correlation; lower values are discarded."""
     distinct: float = Field(0.1, ge=0, le=1)
     """Minimum margin over the second-best correlation peak; rejects repetitive structure such as lane markings."""
 
 
+_WIDTH = 640  # pixels: images are reduced to it
+_POINTS = 1500  # are compared, at most
 _NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
 _STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
 _GLANCE, _FEW = 0.2, 3  # m, between the places at a glance, by each third point
@@ -108,27 +104,27 @@ class Peak:
     correlation: float
 
 
-def textured(image: Image, width: int) -> Texture:
+def textured(image: Image) -> Texture:
     """Brightness without its slow changes, over its local contrast, undistorted."""
     camera, gray = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
     if camera.distortion:
         gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
-    scale = min(1.0, width / camera.size[0])
+    scale = min(1.0, _WIDTH / camera.size[0])
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
     detail = local_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _LOCAL)
     blurred = tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR)
     return Texture(blurred, camera.resized(*size).K, se3.inverse(camera.T_lidar_cam))
 
 
-def reference(points: Points, image: Texture, count: int, axis: Array) -> Reference:
-    """At most `count` of the points (P, 4) that the image shows, spread evenly over the scan.
+def reference(points: Points, image: Texture, axis: Array) -> Reference:
+    """Some of the points (P, 4) that the image shows, spread evenly over the scan.
 
     Args:
         axis: (3,) in the LiDAR frame, the direction that is open; either sign.
     """
     in_camera = se3.transform(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
-    kept = kept[:: max(1, len(kept) // count)]
+    kept = kept[:: max(1, len(kept) // _POINTS)]
     step = image.T_cam_lidar[:3, :3] @ axis
     here = [_changes(image, in_camera[kept], step, np.zeros(1), level) for level in range(len(_BLUR))]
     shown = here[0][1][0]

@@ -21,6 +21,7 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, a
 from dpm2_core.slam.registration.swept import Beginning, Swept
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
+_BASELINE = 3.0  # m: way after which another image is the one to compare with
 _LEAST_REACH = 0.6  # m: however well the motion is known
 _PERIOD = 0.1  # s, of most LiDARs: the prediction is of one period, its error over that time is the error of the speed
 _ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
@@ -71,7 +72,7 @@ class VisualScanRegistration:
     def _wants(self, T_odom_lidar: Array) -> bool:
         if self._last is None or self._reference is None:
             return True
-        return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= self._settings.baseline)
+        return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= _BASELINE)
 
     def _told(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
         """The result moved along its open direction by the intensities, which need no calibration, or else by the
@@ -93,20 +94,20 @@ class VisualScanRegistration:
         """
         if self._last is None:
             return result
-        s, (earlier, T_odom_ref) = self._settings, self._last
+        earlier, T_odom_ref = self._last
         before = earlier.images[0]
         image = next((image for image in scan.images if image.camera.name == before.camera.name), None)
         if image is None:
             return result
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
-            self._reference = reference(earlier.points, textured(before, s.width), s.points, axis)
+            self._reference = reference(earlier.points, textured(before), axis)
         # Only the difference: the twist itself follows from the images, so that moving the camera by its whole offset
         # feeds an error back, and it grows from half a period on. What is left is the offset times the change of speed.
         late = image.time_offset - before.time_offset
         reach, of_speed = self._reach(result, information)
-        image_now = replace(textured(placed(image, late, scan.twist), s.width), sigma=of_speed * abs(late))
-        return along(s, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
+        image_now = replace(textured(placed(image, late, scan.twist)), sigma=of_speed * abs(late))
+        return along(self._settings, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
 
     def _by_intensity(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
         """As `_by_image`, by the intensities of the LiDAR."""

@@ -275,7 +275,7 @@ def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None
 
     with MapStore.create(tmp_path / "a.dpm2map") as store:
         store.begin_session()
-        mapper, drive = make(store, moving={"window": 0}), laps(3)
+        mapper, drive = make(store, moving_window=0), laps(3)
         for keyframe in drive[:LAP]:
             mapper.add(keyframe)
         tracemalloc.start()

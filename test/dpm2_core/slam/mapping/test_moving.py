@@ -15,10 +15,9 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_mapper
-from dpm2_core.slam.mapping.moving import MovingSettings, MovingWindow, RangeImage, find_moving
+from dpm2_core.slam.mapping.moving import MovingWindow, RangeImage, find_moving
 from dpm2_core.slam.settings import SlamSettings
 
-SETTINGS = MovingSettings()
 GEOMETRIC = SlamSettings.model_validate({"loops": {"enabled": False}})
 
 
@@ -37,7 +36,7 @@ def scene(box: tuple[float, float] | None = None) -> Points:
 
 def test_a_box_that_drives_off_is_found_and_nothing_else() -> None:
     here, away = scene((8, 0)), [scene((8, y)) for y in (6.0, -6.0, 14.0)]
-    moving = find_moving(here, np.eye(4), [(RangeImage(c), np.eye(4)) for c in away], SETTINGS)
+    moving = find_moving(here, np.eye(4), [(RangeImage(c), np.eye(4)) for c in away])
     box = (np.abs(np.hypot(here[:, 0], here[:, 1]) - 8) < 0.1) & (np.abs(here[:, 1]) < 1.1) & (here[:, 2] > -1.6)
     above = box & (height_above_ground(here) > 0.25)
     assert above.sum() > 100
@@ -48,16 +47,16 @@ def test_a_box_that_drives_off_is_found_and_nothing_else() -> None:
 def test_a_box_that_stays_is_kept() -> None:
     here = scene((8, 0))
     others = [(RangeImage(here), np.eye(4))] * 4
-    assert not find_moving(here, np.eye(4), others, SETTINGS).any()
+    assert not find_moving(here, np.eye(4), others).any()
 
 
 def test_one_witness_is_not_enough_and_none_says_nothing() -> None:
     here, empty = scene((8, 0)), RangeImage(scene())
-    assert not find_moving(here, np.eye(4), [(empty, np.eye(4))], SETTINGS).any()
-    assert not find_moving(here, np.eye(4), [], SETTINGS).any()
+    assert not find_moving(here, np.eye(4), [(empty, np.eye(4))]).any()
+    assert not find_moving(here, np.eye(4), []).any()
     nothing = np.zeros((0, 4), np.float32)
-    assert find_moving(nothing, np.eye(4), [(empty, np.eye(4))], SETTINGS).shape == (0,)
-    assert not find_moving(here, np.eye(4), [(RangeImage(nothing), np.eye(4))] * 3, SETTINGS).any()
+    assert find_moving(nothing, np.eye(4), [(empty, np.eye(4))]).shape == (0,)
+    assert not find_moving(here, np.eye(4), [(RangeImage(nothing), np.eye(4))] * 3).any()
 
 
 def test_a_wrong_pose_by_noise_removes_nothing_that_stands() -> None:
@@ -65,11 +64,11 @@ def test_a_wrong_pose_by_noise_removes_nothing_that_stands() -> None:
     here, noise = scene((8, 0)), np.random.default_rng(0)
     sigma = [0.005, 0.005, 0.005, 0.05, 0.05, 0.05]
     others = [(RangeImage(here), se3.exp(noise.normal(0, sigma))) for _ in range(8)]
-    assert find_moving(here, np.eye(4), others, SETTINGS).mean() < 1e-3
+    assert find_moving(here, np.eye(4), others).mean() < 1e-3
 
 
 def test_each_keyframe_is_checked_once() -> None:
-    window, checked = MovingWindow(MovingSettings(window=3)), []
+    window, checked = MovingWindow(3), []
     poses = np.repeat(np.eye(4)[None], 10, 0)
     for node in range(10):
         checked += [n for n, _ in window.add(node, scene(), poses[: node + 1])]
@@ -77,7 +76,7 @@ def test_each_keyframe_is_checked_once() -> None:
     checked += [n for n, _ in window.finish(poses)]
     assert checked == list(range(10))
     assert list(window.finish(poses)) == []
-    off = MovingWindow(MovingSettings(window=0))
+    off = MovingWindow(0)
     assert list(off.add(0, scene(), poses)) == []
 
 
@@ -109,7 +108,7 @@ def test_what_stands_stays_wherever_on_the_vehicle_the_lidar_is() -> None:
 
 
 def moved(clouds: list[Points], poses: Array, mount: Array) -> np.ndarray:
-    window, masks = MovingWindow(SETTINGS), list[np.ndarray]()
+    window, masks = MovingWindow(5), list[np.ndarray]()
     for node, cloud in enumerate(clouds):
         masks += [mask for _, mask in window.add(node, cloud, poses[: node + 1], mount)]
     return np.concatenate([*masks, *(mask for _, mask in window.finish(poses))])
@@ -150,7 +149,7 @@ def test_traffic_of_a_synthetic_street_is_left_out(labeled_scans: list[tuple[Poi
     assert dynamic > 500
     assert removed / dynamic > 0.45
     assert static_removed / static < 1e-3
-    off = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}, "map": {"moving": {"window": 0}}}))
+    off = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}, "map": {"moving_window": 0}}))
     for node, (points, _, T) in enumerate(labeled_scans[:8]):
         off.add(Keyframe(node, node, node, T, points))
     off.finish()

@@ -32,8 +32,8 @@ def test_neither_rails_nor_a_truck_ahead_hide_the_way(contrast: float, truck: bo
     """1.7 m, to 5 cm, and nothing else correlates half as well; the truck drives as fast."""
     paint = railed(contrast)
     first, second = frame(0.0, paint, truck=truck), frame(1.7, paint, 1, gain=0.8, truck=truck)
-    known = reference(first.points, textured(first.images[0], 640), 1500, AXIS)
-    image = textured(second.images[0], 640)
+    known = reference(first.points, textured(first.images[0]), AXIS)
+    image = textured(second.images[0])
     best, *others = peaks(SETTINGS, known, image, np.eye(4), AXIS, 6.0)
     assert best.offset == pytest.approx(1.7, abs=0.05)
     assert all(peak.correlation < best.correlation / 2 for peak in others if abs(peak.offset - best.offset) > 0.6)
