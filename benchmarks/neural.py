@@ -54,7 +54,7 @@ def bench_neural(options: Options) -> Report:
     """
     chosen = requested(options, PARTS)
     s = settings_of(options)
-    network = load_network(s.neural.weights, options.threads, s.neural.preset)
+    network = load_network(s.neural.weights, options.threads)
     weights = _weights(s.neural.weights)
     path = options.out / "neural.json"
     same = {"weights": weights, "options": _options(options)}

@@ -62,7 +62,7 @@ def bench_relocalise(options: Options) -> Report:
         roads = survey(options, settings, file, progress)
         with MapStore.open(file) as store:
             data = load_map(store)
-            network = load_network(settings.neural.weights, settings.threads, settings.neural.preset)
+            network = load_network(settings.neural.weights, settings.threads)
             verifier = Verifier(settings.verification, settings.geometric)
             known = KnownMap(data.keyframes, data.clouds, data.poses)
             verifiers = ByScale(verifier, verifier)

@@ -49,7 +49,7 @@ WAYS = ((), ("front",), ("rear",), ("front", "rear"), ("left", "right"))
 def bench() -> int:
     """Errors of pairs with no image, one and two."""
     s = SlamSettings().neural
-    network = load_network(s.weights, 1, s.preset)
+    network = load_network(s.weights, 1)
     figures = ("pairs", "median m", "median deg", "success")
     table = FigureTable("Pairs 1 to 5 m apart by descriptors alone", names=["world", "cameras"], figures=figures)
     for kind, seeds in WORLDS.items():

@@ -37,7 +37,7 @@ def bench_tilt(options: Options) -> Report:
         UsageError: there is no drive, or one has no ground truth.
     """
     s = settings_of(options)
-    network = load_network(s.neural.weights, options.threads, s.neural.preset)
+    network = load_network(s.neural.weights, options.threads)
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         named = progress.track(sources.items())
         results = {name: _of_drive(source, network, options.pairs) for name, source in named}

@@ -116,7 +116,7 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
     return cast(M, network)
 
 
-def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
+def load_network(weights: str, threads: int) -> DeepPointMap2:
     """The network with weights, ready to run on the CPU; without its camera if it was trained without images.
 
     The weights are loaded once in a process, see `load_once`.
@@ -124,16 +124,11 @@ def load_network(weights: str, threads: int, preset: str = "") -> DeepPointMap2:
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
         threads: of torch, which has one number for the whole process.
-        preset: that the weights must be of; empty: any.
 
     Raises:
-        UsageError: no such weights, or of another preset.
+        UsageError: no such weights.
     """
-    path = weights_path(weights)
-    model = load_once(path, threads, _load)
-    if preset and model.settings.preset != preset:
-        raise UsageError(f"{path}: weights of preset {model.settings.preset}, slam.neural.preset is {preset}")
-    return model
+    return load_once(weights_path(weights), threads, _load)
 
 
 def _load(path: Path) -> DeepPointMap2:

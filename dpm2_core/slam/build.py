@@ -159,6 +159,6 @@ def make_loops(s: SlamSettings) -> LoopCloser:
 
 def _network(s: SlamSettings) -> DeepPointMap2:
     """The same one for registration, loops and relocalization."""
-    network = load_network(s.neural.weights, s.threads, s.neural.preset)
+    network = load_network(s.neural.weights, s.threads)
     network.solver = s.neural.solver
     return network

@@ -32,8 +32,6 @@ class NeuralSettings(Settings):
 
     weights: str = "small"
     """Name of weights that come with dpm2, or path of a .safetensors file."""
-    preset: str = ""
-    """Preset that the weights must have been trained for; empty takes any."""
     spacing: float = Field(1.0, gt=0)
     """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
     residual: float = Field(0.0, ge=0)

@@ -62,7 +62,7 @@ def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
     shutil.copy(PRETRAINED_DIR / "movers.safetensors", filter_file)
     settings = SlamSettings.model_validate({
         "registration": "refined", "threads": torch.get_num_threads(), "loops": {"descriptors": True},
-        "neural": {"weights": str(network_file), "preset": ""}, "filter": {"kind": "movers", "weights": filter_file},
+        "neural": {"weights": str(network_file)}, "filter": {"kind": "movers", "weights": filter_file},
     })  # fmt: skip
     points = np.column_stack([boxes(noise), np.full(4000, 0.5)]).astype(np.float32)
     with open_session(tmp_path / "a.dpm2map", settings, "", resume=False) as store:

@@ -263,11 +263,9 @@ def test_descriptors_of_a_keyframe_take_86_kb(noise: np.random.Generator) -> Non
     assert result.nbytes <= 86_000
 
 
-def test_missing_weights_and_a_wrong_preset_are_errors_of_use(weights: Path) -> None:
+def test_missing_weights_and_what_is_none_are_errors_of_use() -> None:
     with pytest.raises(UsageError, match="nowhere: no such file; weights that come with dpm2"):
         load_network("nowhere", 1)
-    with pytest.raises(UsageError, match=r"weights of preset tiny, slam\.neural\.preset is base"):
-        load_network(str(weights), 1, "base")
     with pytest.raises(UsageError, match="not a safetensors file"):
         load_network(__file__, 1)
 
