@@ -151,7 +151,7 @@ train-ground: setup  ## train the weights of slam.filter.kind=ground (2 cores: 1
 	$(DPM2) train tasks-data out/ground/train/dense --set train=16 --set train_frames=10 --set val=1 \
 		--set val_frames=2 --set first_seed=8000 --set lidar.columns=2170
 	$(DPM2) train gndnet out/ground/train --val out/ground/val --out out/ground/run --set network.channels=16 \
-		--set epochs=8 --set rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
+		--set epochs=8 --set optimiser.rate=2e-3 --set lift=0.3 --set gaps=0.1 $(call RESUMED,ground/run)
 
 # The usual traffic and a dense one with 64 beams, and 32 beams higher up; the task learns from all of them.
 MOVERS = $(DPM2) train tasks-data out/movers/$(1) --config config/movers_drives.yaml

@@ -48,7 +48,7 @@ def settings_of(training: Training) -> SlamTaskTraining:
     gamma = 0.0 if arm == "without" else chosen.slam.gamma
     return chosen.model_copy(
         update={
-            "seed": training["seed"],
+            "optimiser": chosen.optimiser.model_copy(update={"seed": training["seed"]}),
             "slam": chosen.slam.model_copy(update={"gamma": gamma}),
             "slam_loss": chosen.slam_loss.model_copy(update={"placebo": arm == "placebo"}),
         }

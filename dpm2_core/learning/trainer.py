@@ -29,8 +29,8 @@ from dpm2_core.network.precision import mixed_precision
 _DIVERGED = 100  # steps in a row without a finite gradient: the weights, which none of them changes, do not recover
 
 
-class OptimizerSettings(Settings):
-    """Optimisation."""
+class StepSettings(Settings):
+    """How a step changes the weights."""
 
     kind: Literal["adamw", "adam", "sgd"] = "adamw"
     """AdamW; Adam, whose decay is a part of the gradient; or stochastic gradient descent with momentum."""
@@ -40,8 +40,6 @@ class OptimizerSettings(Settings):
     """Steps after which the rate is multiplied by `drop`, again and again, instead of the cosine; 0: the cosine."""
     drop: float = Field(0.8, gt=0, le=1)
     """See `drop_every`."""
-    steps: int = Field(3000, gt=0)
-    """Batches."""
     rate: float = Field(1e-3, gt=0)
     """Peak learning rate."""
     final_rate: float = Field(1e-5, ge=0)
@@ -56,6 +54,13 @@ class OptimizerSettings(Settings):
     """Decay of the averaged weights, which are the ones that are kept."""
     seed: int = Field(0, ge=0)
     """Of weights, data and everything random."""
+
+
+class OptimizerSettings(StepSettings):
+    """Optimisation, counted in steps."""
+
+    steps: int = Field(3000, gt=0)
+    """Batches."""
     compile: bool = True
     """torch.compile: slower to start, about twice as fast."""
     bf16: bool = True

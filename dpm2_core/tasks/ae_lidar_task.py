@@ -14,11 +14,20 @@ from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.chamfer import chamfer_figures
 from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
 from dpm2_core.tasks.training import mean_figures
 
 _LEAST_DIVERGENCE = 5.0
 """Below this the divergence of a VAE costs no less, nats: the codes keep something to say."""
+
+
+class AeLidarOptimizer(TaskOptimizer):
+    """Optimisation."""
+
+    rate: float = Field(5e-4, gt=0)
+    """Peak learning rate."""
+    clip: float = Field(1000.0, gt=0)
+    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
 
 
 class AeLidarTraining(SlamTaskTraining):
@@ -30,12 +39,9 @@ class AeLidarTraining(SlamTaskTraining):
     """Passes over the windows (the original: 150)."""
     divergence_warmup: int = Field(default=150, ge=1)
     """Epochs until the divergence of a VAE counts in full."""
-    rate: float = Field(default=5e-4, gt=0)
-    """Peak learning rate."""
+    optimiser: AeLidarOptimizer = AeLidarOptimizer()
     batch: int = Field(default=4, ge=1)
     """Windows of a step: means are over more than one place."""
-    clip: float = Field(default=1000.0, gt=0)
-    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
 
 
 class AeLidarTask(Task):

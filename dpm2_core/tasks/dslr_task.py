@@ -17,12 +17,19 @@ from dpm2_core.network.perception.dslr import Dslr, DslrSettings
 from dpm2_core.tasks.chamfer import chamfer_figures
 from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.task import SlamTaskTraining, Task
+from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
 from dpm2_core.tasks.training import mean_figures
 
 _BATCH = 16
 _MOVED = 0.5
 """A slot whose distance differs by more from that of the static twin has something moving in it, m."""
+
+
+class DslrOptimizer(TaskOptimizer):
+    """Optimisation."""
+
+    clip: float = Field(1000.0, gt=0)
+    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
 
 
 class DslrTraining(SlamTaskTraining):
@@ -44,8 +51,7 @@ class DslrTraining(SlamTaskTraining):
     """The autoencoder learns from static scans alone. False: from the others, too, as the authors'."""
     batch: int = Field(default=4, ge=1)
     """Windows of a step: pairs of codes are of different places, and means are over more than one place."""
-    clip: float = Field(default=1000.0, gt=0)
-    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
+    optimiser: DslrOptimizer = DslrOptimizer()
 
     @property
     def third(self) -> int:

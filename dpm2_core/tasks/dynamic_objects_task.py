@@ -21,7 +21,7 @@ from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pretrained import DYNAMIC
 from dpm2_core.tasks.ground_task import UNCOUNTED
 from dpm2_core.tasks.scan import TaskScan, TaskScans
-from dpm2_core.tasks.task import Task, TaskTraining
+from dpm2_core.tasks.task import Task, TaskOptimizer, TaskTraining
 
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
@@ -37,6 +37,15 @@ Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 there are."""
 
 
+class DynamicObjectOptimizer(TaskOptimizer):
+    """Optimisation."""
+
+    rate: float = Field(3e-3, gt=0)
+    """Peak learning rate."""
+    ema: float = Field(0.998, ge=0, lt=1)
+    """Decay of the averaged weights, which are the ones that are kept."""
+
+
 class DynamicObjectTraining(TaskTraining):
     """A training of the dynamic objects."""
 
@@ -46,8 +55,7 @@ class DynamicObjectTraining(TaskTraining):
     window: int = Field(default=2, ge=2)
     batch: int = Field(default=4, ge=1)
     every: int = Field(default=5, ge=1)
-    rate: float = Field(default=3e-3, gt=0)
-    average: float = Field(default=0.998, ge=0, lt=1)
+    optimiser: DynamicObjectOptimizer = DynamicObjectOptimizer()
     thin: float = Field(default=0.7, ge=0, lt=1)
     """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
     paste: float = Field(default=0.5, ge=0, le=1)
@@ -100,7 +108,7 @@ class DynamicObjectTask(Task):
     def settle(self, scans: TaskScans) -> None:
         """The means and variances of the layers are made those of whole scans: the training has seen thinned and mixed
         ones alone, and off its own kind of scan that costs as much as anything else."""
-        network, generator = self.settings.network, torch.Generator().manual_seed(self.settings.seed)
+        network, generator = self.settings.network, torch.Generator().manual_seed(self.settings.optimiser.seed)
         chosen = torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist()
         scanned = (voxels(_arrays(scans[i])[0], network) for i in chosen)
         grids = (occupancy([voxel[inside]], network).to(self.device) for voxel, inside in scanned)

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -17,6 +17,7 @@ from dpm2_core.config import Settings
 from dpm2_core.diffslam.schedule import ScheduleSettings, is_due, total_loss
 from dpm2_core.diffslam.trajectory_loss import SlamLossSettings
 from dpm2_core.errors import UsageError
+from dpm2_core.learning.trainer import StepSettings
 from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
 
 TASKS = {
@@ -26,6 +27,17 @@ TASKS = {
     "movers": "dpm2_core.tasks.dynamic_objects_task:DynamicObjectTask",
 }
 """Where the task of each name is; imported when it is asked for."""
+
+
+class TaskOptimizer(StepSettings):
+    """Optimisation."""
+
+    drop_every: int = Field(0, ge=0)
+    """Epochs after which the rate is multiplied by `drop`, again and again, instead of the cosine; 0: the cosine."""
+    warmup: int = Field(20, ge=0)
+    """Steps of linear warm-up."""
+    ema: float = Field(0, ge=0, lt=1)
+    """Decay of the averaged weights, which are the ones that are kept; 0: the last ones."""
 
 
 class TaskTraining(Settings):
@@ -41,28 +53,7 @@ class TaskTraining(Settings):
     """Windows of a step."""
     every: int = Field(default=2, ge=1)
     """Distance of these scans (the paper: every second)."""
-    optimizer: Literal["adamw", "adam", "sgd"] = "adamw"
-    """AdamW, or what the authors of the tasks use: sgd for GndNet, adam for DSLR and AE_lidar."""
-    momentum: float = Field(default=0.9, ge=0, lt=1)
-    """Of sgd; of the others the first beta (DSLR's authors: 0.1)."""
-    drop_every: int = Field(default=0, ge=0)
-    """Epochs after which the rate is multiplied by `drop`, instead of the cosine (GndNet's authors: 15); 0: cosine."""
-    drop: float = Field(default=0.8, gt=0, le=1)
-    """See `drop_every`."""
-    rate: float = Field(default=1e-3, gt=0)
-    """Peak learning rate."""
-    final_rate: float = Field(default=1e-5, ge=0)
-    """At the end of the cosine."""
-    warmup: int = Field(default=20, ge=0)
-    """Steps of linear warm-up."""
-    decay: float = Field(default=1e-4, ge=0)
-    """Weight decay."""
-    clip: float = Field(default=1.0, gt=0)
-    """Largest norm of the gradient."""
-    average: float = Field(default=0, ge=0, lt=1)
-    """Decay of the average of the weights that is kept; 0: the last ones."""
-    seed: int = 0
-    """Of the weights, the order of the windows and everything random."""
+    optimiser: TaskOptimizer = TaskOptimizer()
     validate_every: int = Field(default=5, ge=1)
     """Epochs between validations."""
 

@@ -24,7 +24,7 @@ from dpm2_core.tasks.task import Task, TaskTraining, task_type
 
 def new_task(name: str, settings: TaskTraining) -> Task:
     """An untrained task; `settings` of the type that `task_type(name)` names."""
-    torch.manual_seed(settings.seed)
+    torch.manual_seed(settings.optimiser.seed)
     return task_type(name)(settings)
 
 
@@ -47,13 +47,12 @@ def train_task(
         UsageError: no window fits into the scans, or there is nothing to resume.
     """
     settings = task.settings
-    windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.seed)
+    windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.optimiser.seed)
     epoch = max(1, len(windows) // settings.batch)
+    of_step = {**settings.optimiser.model_dump(), "drop_every": settings.optimiser.drop_every * epoch}
     optimizer = OptimizerSettings(
-        kind=settings.optimizer, momentum=settings.momentum, drop_every=settings.drop_every * epoch,
-        drop=settings.drop, steps=settings.epochs * epoch, rate=settings.rate, final_rate=settings.final_rate,
-        warmup=settings.warmup, decay=settings.decay, clip=settings.clip, ema=settings.average, seed=settings.seed,
-        compile=False, bf16=False, save_every=epoch, validate_every=settings.validate_every * epoch,
+        **of_step, steps=settings.epochs * epoch, compile=False, bf16=False,
+        save_every=epoch, validate_every=settings.validate_every * epoch,
     )  # fmt: skip
 
     def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:
@@ -134,7 +133,7 @@ def _batches(
             windows.set_epoch(epoch)
             order = [i for window in windows for i in window]
         else:  # neighbors in a step would be nearly one scan: batch statistics and gradients want many places
-            generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + epoch)
+            generator = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + epoch)
             order = torch.randperm(len(scans), generator=generator).tolist()
         size = settings.batch * settings.window
         for step in range(skip, steps):

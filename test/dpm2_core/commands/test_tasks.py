@@ -34,7 +34,7 @@ def recording(tmp_path: Path) -> Path:
 
 def train(recording: Path, out: Path, *more: object) -> Done:
     """A training of three epochs of one step."""
-    settings = [word for setting in [*SMALL, "epochs=3", "warmup=1"] for word in ("--set", setting)]
+    settings = [word for setting in [*SMALL, "epochs=3", "optimiser.warmup=1"] for word in ("--set", setting)]
     return dpm2("train", "gndnet", recording, "--out", out, *settings, *more)
 
 

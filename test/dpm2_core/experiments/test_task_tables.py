@@ -23,7 +23,15 @@ from ...helpers.command import dpm2
 from ...helpers.experiments import first_table
 from ..tasks.conftest import labelled_drive, write_pairs
 
-QUICK = ("window=2", "every=1", "batch=1", "warmup=0", "slam_loss.points=150", "slam.gamma=0.5", "slam.every=2")
+QUICK = (
+    "window=2",
+    "every=1",
+    "batch=1",
+    "optimiser.warmup=0",
+    "slam_loss.points=150",
+    "slam.gamma=0.5",
+    "slam.every=2",
+)
 RANGE = (
     "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 60}",
     "network.channels=4",
@@ -185,7 +193,7 @@ def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_lef
 def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: Path) -> None:
     """At this rate the weights are beyond float32 after one step."""
     labelled_drive(tmp_path / "data/sequences/00", range(4), points=300)
-    far = ("epochs=2", "optimizer=sgd", "rate=1e30", "clip=1e38")
+    far = ("epochs=2", "optimiser.kind=sgd", "optimiser.rate=1e30", "optimiser.clip=1e38")
     settings = ["network={cells: 32, cell: 3, channels: 4}", *QUICK, *far]
     arm = Training(task="gndnet", data=str(tmp_path / "data"), learn=["00"], config=None, settings=settings, seed=0,
                    arm="without")  # fmt: skip

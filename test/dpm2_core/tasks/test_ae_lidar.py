@@ -27,8 +27,8 @@ def network(**changes: object) -> AeLidarSettings:
 
 def training(**changes: object) -> AeLidarTraining:
     small: dict[str, object] = {
-        "network": network(), "window": 4, "every": 1, "batch": 2, "warmup": 5, "rate": 3e-3, "epochs": 10,
-        "slam_loss": SlamLossSettings(points=300),
+        "network": network(), "window": 4, "every": 1, "batch": 2, "optimiser": {"warmup": 5, "rate": 3e-3},
+        "epochs": 10, "slam_loss": SlamLossSettings(points=300),
     }  # fmt: skip
     return AeLidarTraining.model_validate(small | changes)
 

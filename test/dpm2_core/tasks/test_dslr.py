@@ -30,7 +30,7 @@ NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)
 def training(**changes: object) -> DslrTraining:
     """Small, and fast."""
     small: dict[str, object] = {
-        "network": NETWORK, "window": 4, "every": 1, "batch": 2, "warmup": 5, "rate": 3e-3,
+        "network": NETWORK, "window": 4, "every": 1, "batch": 2, "optimiser": {"warmup": 5, "rate": 3e-3},
         "slam_loss": SlamLossSettings(points=300), "autoencoder_epochs": 1, "discriminator_epochs": 1, "epochs": 3,
     }  # fmt: skip
     return DslrTraining.model_validate(small | changes)

@@ -15,12 +15,22 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNetSettings, load
 from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
-from dpm2_core.tasks.dynamic_objects_task import MOVABLE, DynamicObjectTask, DynamicObjectTraining
+from dpm2_core.tasks.dynamic_objects_task import (
+    MOVABLE,
+    DynamicObjectOptimizer,
+    DynamicObjectTask,
+    DynamicObjectTraining,
+)
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.training import new_task, save_task, train_task
 
 SMALL = DynamicObjectTraining(
-    network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8), epochs=24, every=1, batch=1, thin=0.3, average=0.9
+    network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=8),
+    epochs=24,
+    every=1,
+    batch=1,
+    thin=0.3,
+    optimiser=DynamicObjectOptimizer(ema=0.9),
 )
 
 
@@ -148,7 +158,8 @@ def test_the_average_of_the_weights_is_kept_where_one_is_asked_for(tmp_path: Pat
     scans = TaskScans([Drive(5)])
 
     def settings(average: float) -> DynamicObjectTraining:
-        return SMALL.model_copy(update={"epochs": 4, "warmup": 1, "average": average})
+        optimiser = DynamicObjectOptimizer(warmup=1, ema=average)
+        return SMALL.model_copy(update={"epochs": 4, "optimiser": optimiser})
 
     first = list(new_task("movers", settings(0)).parameters())
     last = list(train_task(new_task("movers", settings(0)), scans, tmp_path / "last").parameters())

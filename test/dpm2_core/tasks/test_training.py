@@ -37,7 +37,7 @@ TINY = {"cells": 32, "cell": 2.0, "channels": 4}
 def settings(**changes: Any) -> GroundTraining:
     """Two windows of three scans an epoch, a small network, the SLAM loss in every second epoch."""
     tree = {
-        "network": TINY, "epochs": 4, "window": 3, "every": 1, "warmup": 2, "rate": 3e-3, "tilt": 2.0,
+        "network": TINY, "epochs": 4, "window": 3, "every": 1, "optimiser": {"warmup": 2, "rate": 3e-3}, "tilt": 2.0,
         "slam": {"gamma": 0.5, "every": 2, "most": None}, "slam_loss": {"points": 300},
     }  # fmt: skip
     return GroundTraining.model_validate({**tree, **changes})
