@@ -195,8 +195,7 @@ class OdometryResult:
         seconds: wall time of each stage.
         comparison: with another odometry, where there is one and the frame was registered.
         imu: why the IMU was of no use, in words, empty where it was; None while there has been none.
-        camera: why an image of the frame was left out, in words; empty where none was. repeated: names of the cameras
-            whose image that is.
+        repeated: names of the cameras whose image is left out, as it is that of before.
         times: why the times of the points are not used, in words; empty where they are.
     """
 
@@ -212,6 +211,10 @@ class OdometryResult:
     seconds: dict[str, float] = field(default_factory=dict)
     comparison: Comparison | None = None
     imu: str | None = None
-    camera: str = ""
     repeated: frozenset[str] = frozenset()
     times: str = ""
+
+    @property
+    def camera(self) -> str:
+        """Why an image of the frame was left out, in words; empty where none was."""
+        return "the same image as before: the camera or its driver repeats itself" if self.repeated else ""

@@ -17,7 +17,6 @@ from dpm2_core.frame import Array, Frame, Guess, Image, Points
 from dpm2_core.geometry import se3
 
 PROBLEM = "the same cloud as before: the LiDAR or its driver repeats itself"
-IMAGE_PROBLEM = "the same image as before: the camera or its driver repeats itself"
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
 _STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from dpm2_core.data.repeated import IMAGE_PROBLEM, PART_PROBLEM, RepeatedCloud, RepeatedImages, RepeatedPart
+from dpm2_core.data.repeated import PART_PROBLEM, RepeatedCloud, RepeatedImages, RepeatedPart
 from dpm2_core.data.repeated import PROBLEM as REPEATED
 from dpm2_core.data.stream_clock import DOUBTED, NOMINAL, SLOWEST, StreamClock
 from dpm2_core.estimates import OdometryResult, Registration, State
@@ -144,8 +144,7 @@ class Odometry:
         T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
         T = T @ T_scan_lidar
         keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
-        looked_at = {image.camera.name for image in frame.images}
-        repeated = frozenset(image.camera.name for image in given.images) - looked_at
+        looked_at, seen = ({image.camera.name for image in one.images} for one in (frame, given))
         clock.append(perf_counter())
         return OdometryResult(
             stamp=given.stamp,
@@ -161,8 +160,7 @@ class Odometry:
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
             times=self._sweep.problem,
-            camera=IMAGE_PROBLEM if repeated else "",
-            repeated=repeated,
+            repeated=frozenset(seen - looked_at),
         )
 
     def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:

@@ -26,9 +26,10 @@ def test_frames_with_a_bad_image_or_bad_times_are_counted(recording: Path) -> No
     good = OdometryResult(0, 0, np.eye(4), np.eye(6), np.zeros(6), State.TRACKING, found)
     result.add(good)
     assert "problems" not in result.timing
-    result.add(replace(good, camera="the same image"))
-    result.add(replace(good, camera="the same image", times="wrong times"))
-    assert result.timing["problems"] == {"the same image": 2, "wrong times": 1}
+    result.add(replace(good, repeated=frozenset({"left"})))
+    result.add(replace(good, repeated=frozenset({"left"}), times="wrong times"))
+    again = "the same image as before: the camera or its driver repeats itself"
+    assert result.timing["problems"] == {again: 2, "wrong times": 1}
 
 
 @pytest.mark.parametrize("numbered", [False, True])
