@@ -91,7 +91,6 @@ def merge(
 
 @app.command()
 def sweep(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG.yaml", help="Settings that all have in common.")],
     drives: Drives,
     out: Out,
     settings: Annotated[
@@ -99,6 +98,7 @@ def sweep(
     ],
     address: Address = None,
     workers: Workers = None,
+    config: ConfigFile = None,
     json_file: JsonFile = None,
 ) -> None:
     """Run the same drives with other settings, and show their figures in one table, a row for each combination."""

@@ -45,7 +45,9 @@ def _values(setting: str) -> list[str]:
     return values
 
 
-def sweep_parts(drives: Sequence[ManifestDrive], config: Path, settings: Mapping[str, Sequence[str]]) -> Iterator[Part]:
+def sweep_parts(
+    drives: Sequence[ManifestDrive], config: Path | None, settings: Mapping[str, Sequence[str]]
+) -> Iterator[Part]:
     """A part for each drive with each combination of `variants`.
 
     Raises:

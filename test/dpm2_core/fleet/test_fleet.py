@@ -152,7 +152,7 @@ def test_a_sweep_has_a_row_for_each_combination(cluster: Cluster, drives: list[P
     config, out = tmp_path / "config.yaml", tmp_path / "out"
     config.write_text("slam: {registration: geometric, threads: 1, loops: {descriptors: false}}")
     values = ["--set", "slam.map.voxel=0.3,0.6", "--set", "slam.preprocess.max_range=30,60"]
-    done = dpm2("fleet", "sweep", config, drives[0], drives[2], "--out", out, *values)
+    done = dpm2("fleet", "sweep", drives[0], drives[2], "--out", out, "--config", config, *values)
     assert done.returncode == 1
     assert "means over 1 of 2 drives" in done.stdout
     rows = json.loads((out / SUMMARY).read_text())["drives"]
