@@ -19,7 +19,8 @@ from dpm2_core.frame import Frame
 
 def show(
     src: Annotated[Path, typer.Argument(help="Any recording that `dpm2 run` reads.")],
-    frames: Annotated[str, typer.Option(help="Two frames a,b by position from 0; b is registered to a.")],
+    first: Annotated[int, typer.Argument(metavar="A", min=0, help="Position of a frame, from 0.")],
+    second: Annotated[int, typer.Argument(metavar="B", min=0, help="That of the frame that is registered to A.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[
         list[str] | None,
@@ -30,7 +31,7 @@ def show(
     ] = None,
     corrupt: Annotated[str | None, typer.Option(help="Let sensors fail, as `dpm2 run --corrupt` does.")] = None,
     point: Annotated[
-        int | None, typer.Option(help="Reference point whose attention to the image of b is shown.")
+        int | None, typer.Option(help="Reference point whose attention to the image of B is shown.")
     ] = None,
 ) -> None:
     """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.
@@ -41,7 +42,6 @@ def show(
     from dpm2_core.evaluation.matches import compared_png
     from dpm2_core.network.pretrained import load_network
 
-    first, second = _two(frames)
     corruption = None if corrupt is None else parse_corruption(corrupt)
     models = {name: load_network(name, threads=2) for name in weights or ["small"]}
     source: Source = open_source(src, InputSettings(images=any(m.encoder.image is not None for m in models.values())))
@@ -58,16 +58,9 @@ def show(
     note(f"{out}: {title}")
 
 
-def _two(text: str) -> tuple[int, int]:
-    parts = text.split(",")
-    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
-        raise UsageError(f"--frames {text}: want two positions a,b, such as 0,8")
-    return int(parts[0]), int(parts[1])
-
-
 def _frame(source: Source, src: Path, position: int) -> Frame:
     if position >= len(source):
-        raise UsageError(f"--frames {position}: {src} has {len(source)} frames")
+        raise UsageError(f"frame {position}: {src} has {len(source)} frames")
     frame = frame_at(source, position)
     if frame.problem:
         raise UsageError(f"frame {position} of {src}: {frame.problem}")

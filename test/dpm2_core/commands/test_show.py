@@ -35,7 +35,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_draws_an_image(sequence: Path, tmp_path: Path) -> None:
     weights = str(sequence / "tiny.safetensors")
-    done = dpm2("show", sequence, "--frames", "0,1", "--out", str(tmp_path / "m.png"), "--weights", weights)
+    done = dpm2("show", sequence, "0", "1", "--out", str(tmp_path / "m.png"), "--weights", weights)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
 
@@ -54,7 +54,7 @@ def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     sizes = []
     for name in ("tiny", "camera"):
         out, weights = tmp_path / f"{name}.png", str(folder / f"{name}.safetensors")
-        done = dpm2("show", folder, "--frames", "0,1", "--out", str(out), "--weights", weights)
+        done = dpm2("show", folder, "0", "1", "--out", str(out), "--weights", weights)
         assert done.returncode == 0, done.stderr
         sizes.append(cv2.imread(str(out)).shape)
     assert sizes[1][0] > 1.5 * sizes[0][0]
@@ -70,7 +70,7 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
     for name, arguments in (
         ("one", weights[:2]), ("two", weights), ("half", [*weights[:2], "--corrupt", "obstruction=1,seed=1"])
     ):  # fmt: skip
-        done = dpm2("show", sequence, "--frames", "0,1", "--out", tmp_path / f"{name}.png", *arguments)
+        done = dpm2("show", sequence, "0", "1", "--out", tmp_path / f"{name}.png", *arguments)
         assert done.returncode == 0, done.stderr
         pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
         shapes.append(pictures[-1].shape)
@@ -82,10 +82,10 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--frames", "0,1", "--corrupt", "nothing=1"], "nothing"),
-        (["--frames", "0"], "want two positions"),
-        (["--frames", "0,7"], "2 frames"),
-        (["--frames", "0,1", "--weights", "/nowhere"], "/nowhere"),
+        (["0", "1", "--corrupt", "nothing=1"], "nothing"),
+        (["0"], "Missing argument"),
+        (["0", "7"], "2 frames"),
+        (["0", "1", "--weights", "/nowhere"], "/nowhere"),
     ],
 )
 def test_errors_of_use(sequence: Path, arguments: list[str], words: str) -> None:
