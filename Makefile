@@ -18,7 +18,7 @@ JOBS ?= -n 3 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup ros demo test test-long test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation sim diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup ros demo test test-long test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -169,9 +169,6 @@ ablation: train-data  ## Tables 3 and 4, as shipped and as in the paper: every f
 	$(call STAGE,phase1,ablation_start,ablation/start)
 	$(TRAIN) ablation --config config/ablation.yaml --out out/ablation
 	$(TRAIN) ablation --config config/ablation_paper.yaml --out out/ablation_paper --json benchmarks/ablation_paper.json
-
-sim: setup  ## a synthetic drive in KITTI layout in out/sim
-	$(DPM2) sim out/sim --frames $(or $(FRAMES),300) --seed $(or $(SEED),1) $(ARGS)
 
 diagrams: setup  ## redraw the imports in docs/architecture.md
 	$(call with,lint,grimp)
