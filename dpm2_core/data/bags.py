@@ -44,6 +44,9 @@ _CLOCKS = 0.15
 class BagSource:
     """A rosbag2 folder, or a .mcap, .db3 or .bag file. See `Source`; `Frame.index` is the message count.
 
+    Attributes:
+        T_base_lidar: (4, 4) how the LiDAR is mounted; None where /tf_static does not say that.
+
     Raises:
         UsageError: it cannot be read, has no point clouds, leaves the choice of a topic open, or has a camera with
             intrinsics but no known place.
@@ -73,9 +76,11 @@ class BagSource:
         self._delays: dict[str, list[int]] = {}  # ns from the stamp to the time of recording, of the clouds of a topic
         self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
-        up = self._mounted(first)
+        self.T_base_lidar = self._mounted(first)
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
-        self._frames.up = up
+        if self.T_base_lidar is not None:
+            x, y, z = self.T_base_lidar[2, :3].tolist()
+            self._frames.up = x, y, z
         self.vertical_angle_correction_deg = self._frames.angle_correction_deg
         self.camera = self._choose_cameras() if self._settings.images else None
 
@@ -190,25 +195,26 @@ class BagSource:
             what = f"{topics.TF_STATIC}: {len(problems)} transforms left out"
             note_once(self.notes, what, f"the first: {printable(problems[0])}")
 
-    def _mounted(self, first: Any) -> tuple[float, float, float]:
-        """Which way (3,) along the LiDAR's axes is up in the base: as for slam_node the root above it in /tf_static.
+    def _mounted(self, first: Any) -> Array | None:
+        """T_base_lidar (4, 4), the base as for slam_node the root above the LiDAR in /tf_static.
 
-        Its own z without one, and where the first cloud shows that the root is none, as the frame of a camera.
+        None without one, and where the first cloud shows that the root is none, as the frame of a camera.
         """
         base = self.transforms.root(self.lidar_frame, _NO_BASE)
         if first is None or base == self.lidar_frame.lstrip("/"):
-            return (0.0, 0.0, 1.0)
-        x, y, z = self.transforms.lookup(base, self.lidar_frame)[2, :3].tolist()
-        if z > _LEVEL:
-            return x, y, z
-        angle = float(np.degrees(np.arccos(max(z, -1.0))))
+            return None
+        T_base_lidar = self.transforms.lookup(base, self.lidar_frame)
+        up = T_base_lidar[2, :3]
+        if up[2] > _LEVEL:
+            return T_base_lidar
+        angle = float(np.degrees(np.arccos(max(up[2], -1.0))))
         tilted = f"{topics.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
         seen = self._ground(first)
-        if seen is not None and seen @ (x, y, z) < _LIKE:
+        if seen is not None and seen @ up < _LIKE:
             note_once(self.notes, tilted, "which is no base: the ground is not level in it")
-            return (0.0, 0.0, 1.0)
+            return None
         note_once(self.notes, tilted, "and the map is level by that")
-        return x, y, z
+        return T_base_lidar
 
     def _ground(self, cloud: Any) -> Points | None:
         """Which way (3,) is up by the ground that a cloud shows; rooms have ceilings, which look alike."""

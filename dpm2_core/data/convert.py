@@ -100,12 +100,15 @@ class _Bag:
         self._cameras: list[str] = [] if camera is None else [camera.name]
         self._path: list[tuple[int, Array]] = []
         self._R_lidar_imu = np.eye(3)
+        T_base_lidar = getattr(source, "T_base_lidar", None)
         if isinstance(source, KittiSource):
             self.source = copy(source)
             self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
             self._names, self._correction_deg = topics.KITTI, source.vertical_angle_correction_deg
             self._R_lidar_imu = source.R_lidar_imu
-            self._links[self._names.lidar] = (topics.BASE, _T_BASE_LIDAR)
+            T_base_lidar = _T_BASE_LIDAR
+        if T_base_lidar is not None:
+            self._links[self._names.lidar] = (topics.BASE, T_base_lidar)
         if source.T_cam_lidar is not None:
             self._links[topics.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.bags import BagSource
+from dpm2_core.data.convert import convert
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.geometry import se3
 
@@ -77,3 +78,18 @@ def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path:
     assert ups(source).tolist() == [[0, 0, 1]] * 2
     (note,) = said(source)
     assert note.startswith("/tf_static has the LiDAR tilted by 90 degrees in camera_optical (which is no base")
+
+
+def test_a_converted_bag_has_the_mount(bags: Any, tmp_path: Path) -> None:
+    """Its LiDAR is in the same place of its base, and as tilted: it leads to the same map, level as before."""
+    source = read(bags, tmp_path, [("odom", "base", (0.0, 0.0)), ("base", "velo_link", (0, 30))], (0, 30))
+    convert(source, tmp_path / "converted")
+    converted = BagSource(tmp_path / "converted")
+    np.testing.assert_allclose(ups(converted), ups(source), atol=1e-12)
+    T = converted.transforms.lookup("base_link", converted.lidar_frame)
+    np.testing.assert_allclose(T, source.transforms.lookup("base", "velo_link"), atol=1e-12)
+
+
+def test_a_converted_bag_has_no_base_that_is_none(bags: Any, tmp_path: Path) -> None:
+    convert(read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))]), tmp_path / "converted")
+    assert BagSource(tmp_path / "converted").transforms.frames == []
