@@ -111,9 +111,12 @@ def is_level(up: NDArray[np.floating]) -> bool:
 
 
 def levelling(up: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(3, 3) the smallest rotation that turns a unit vector (3,), which points up by and large, into the z axis."""
+    """(3, 3) the smallest rotation that turns a unit vector (3,) into the z axis; if it points down, after half a turn
+    about x: straight down that leaves no choice, on which rounding would decide."""
     x, y, z = (float(value) for value in up)
-    c = 1 / (1 + max(z, -0.999))
+    if z < 0:
+        return levelling(np.array([x, -y, -z])) * np.array([1, -1, -1], np.float32)
+    c = 1 / (1 + z)
     R = [[1 - c * x * x, -c * x * y, -x], [-c * x * y, 1 - c * y * y, -y], [x, y, z]]
     return np.array(R, np.float32)
 

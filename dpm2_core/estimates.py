@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.frame import Array, Fix, Points
+from dpm2_core.frame import Array, Fix, Points, Up
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +102,7 @@ class Keyframe:
         fix: the last one on the way here from the keyframe before, or None.
         origin: (3,) m, where in its own frame the LiDAR was, of several the first: from there `cloud` was seen. It goes
             with the cloud, also into the map file.
+        up: see `Frame`, in its own frame.
     """
 
     id: int
@@ -115,6 +116,7 @@ class Keyframe:
     thumbnail: bytes | None = None
     fix: Fix | None = None
     origin: Array = field(default_factory=lambda: np.zeros(3))
+    up: Up | None = None
 
 
 @dataclass(frozen=True, eq=False)

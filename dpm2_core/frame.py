@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
+Up = tuple[float, float, float]
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
 
 
@@ -116,7 +117,7 @@ class Inertial:
     stamps: NDArray[np.int64]
     rates: Array
     forces: Array
-    up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
+    up: Up | None = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         shape = (len(self.stamps), 3)
@@ -198,8 +199,8 @@ class Frame:
         dropped: scans since the frame before that came, but were left out for want of time.
         stepped: whether less time may have passed since the frame before than the stamps say: a clock was set.
         up: (3,) unit vector along the LiDAR's axes, by its mounting upwards: so is the odometry's frame level where a
-            drive begins with this frame; None: it has the LiDAR's axes, as where the mounting is not known or counts
-            elsewhere.
+            drive begins with this frame, and what the network sees; None: both have the LiDAR's axes, as where the
+            mounting is not known or counts elsewhere.
     """
 
     stamp: int
@@ -213,7 +214,7 @@ class Frame:
     fix: Fix | None = None
     dropped: int = 0
     stepped: bool = False
-    up: tuple[float, float, float] | None = None
+    up: Up | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4 or self.points.dtype != np.float32:

@@ -18,7 +18,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
-from dpm2_core.frame import Array, Camera, Fix, Frame, Image, Inertial, Points
+from dpm2_core.frame import Array, Camera, Fix, Frame, Image, Inertial, Points, Up
 from dpm2_core.geometry import se3
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
@@ -90,7 +90,7 @@ class FrameBuilder:
         self.problems: dict[str, str] = {}
         self.time_problem = ""
         self._imu, self._gnss = imu, gnss
-        self.up: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
+        self.up: Up | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, index: int, beside: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
         """A cloud with its stamp (ns), and what goes with it; an unreadable cloud comes with `problem` set.

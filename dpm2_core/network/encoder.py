@@ -81,7 +81,8 @@ class Encoder(nn.Module):
     def encode(self, frame: Frame) -> Descriptors:
         """Descriptors of one frame, from its raw points and its images, if any.
 
-        Those of a tilted sensor are made in level axes, those of a room as if it had the size of a street.
+        Those of a tilted sensor are made in level axes, by its mounting (`Frame.up`) and the ground; those of a room as
+        if it had the size of a street.
 
         Raises:
             Dpm2Error: too few points in range, or the result is not finite.
@@ -89,7 +90,7 @@ class Encoder(nn.Module):
         device = next(self.parameters()).device
         cloud, scale = crop(frame.points, self.settings.points), scale_of(frame.points)
         images = [small_image(image, self.settings.image) for image in frame.images] if self.image is not None else []
-        up = tilt_of(cloud)
+        up = tilt_of(cloud, frame.up)
         if scale != 1:
             cloud = crop(frame.points[:, :3] * np.float32(scale), self.settings.points)
         if up is None and scale == 1:

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpm2_core.descriptors import is_level
+from dpm2_core.descriptors import is_level, levelling
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Image
+from dpm2_core.frame import Image, Up
 from dpm2_core.geometry.corners import TEXTURE, Corners, image_corners, no_corners
 from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.point_grid import PointGrid
@@ -70,13 +70,20 @@ def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.fl
     return xyz[np.argsort(xyz[:, 0])]
 
 
-def tilt_of(cloud: NDArray[np.float32]) -> NDArray[np.float32] | None:
+def tilt_of(cloud: NDArray[np.float32], mounted: Up | None = None) -> NDArray[np.float32] | None:
     """Unit vector (3,) that points up in a cropped cloud of a tilted sensor, which the network reads in level axes.
 
-    None where the sensor is level, as the network was trained, or no ground shows how it is.
+    None where the sensor is level, as the network was trained, or neither the ground nor its mounting shows how it is.
+
+    Args:
+        mounted: which way is up by the mounting; from there the ground is looked for.
     """
-    up = up_of(cloud)
-    return None if up is None or is_level(up) else up
+    if mounted is not None and not is_level(up := np.array(mounted, np.float32)):
+        R = levelling(up)
+        more = tilt_of(np.ascontiguousarray(cloud[:, :3] @ R.T))
+        return up if more is None else more @ R
+    seen = up_of(cloud)
+    return None if seen is None or is_level(seen) else seen
 
 
 def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: Sequence[Image] = ()) -> Pyramid:

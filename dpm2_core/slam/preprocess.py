@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
-from dpm2_core.frame import Array, Frame, Image, Points
+from dpm2_core.frame import Array, Frame, Image, Points, Up
 from dpm2_core.geometry.compiled import READ_F4, compiled
 from dpm2_core.geometry.deskew import deskew, measured_turn
 from dpm2_core.geometry.scatter import MANY, scattered
@@ -60,6 +60,7 @@ class Scan:
             moment that the frame counts from. Both are empty where there is no motion to undo.
         description: neural descriptors, made when they are needed; None where the registration uses none.
         images: those that were taken with it, where the registration asks for them.
+        up: see `Frame`, where the registration makes descriptors.
         twist: (6,) [rad/s, m/s] at which it was taken, as far as it was known, where the registration asks for images.
     """
 
@@ -71,6 +72,7 @@ class Scan:
     description: LazyDescriptors | None = None
     images: tuple[Image, ...] = ()
     twist: Array = field(default_factory=lambda: np.zeros(6))
+    up: Up | None = None
 
     @property
     def descriptors(self) -> Descriptors | None:

@@ -38,6 +38,14 @@ def test_levelling_is_the_smallest_turn_that_brings_up_to_z(up: list[float]) -> 
     assert np.arccos((np.trace(R) - 1) / 2) == pytest.approx(np.arccos(up[2]), abs=1e-3)
 
 
+@pytest.mark.parametrize("up", [[0, 0, -1], [3e-8, -1e-8, -1], [0.6, 0, -0.8]])
+def test_what_points_down_is_turned_over_about_x_first(up: list[float]) -> None:
+    """Straight down a heading must not depend on rounding."""
+    R = levelling(np.array(up)).astype(float)
+    np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(R, levelling(np.array(up) * [1, -1, -1]) @ np.diag([1, -1, -1]), atol=1e-6)
+
+
 def test_the_heights_of_a_tilted_set_are_those_of_a_level_one(noise: np.random.Generator) -> None:
     plain = level(noise)
     again = leaning(plain, LEAN[:3, :3]).as_encoded()
@@ -59,9 +67,11 @@ def test_axes_point_to_the_descriptors_after_any_move(noise: np.random.Generator
     assert (np.einsum("ij,ij->i", seen, moved.axes)[low] > 0.98).all()
 
 
-def test_in_a_level_base_they_are_those_of_a_level_sensor(noise: np.random.Generator) -> None:
+@pytest.mark.parametrize("lean", [LEAN, se3.exp([np.pi, 0, 0, 0, 0, 0]), se3.exp([3.0, 0.2, 0.5, 0, 0, 0])])
+def test_in_a_level_base_they_are_those_of_a_level_sensor(noise: np.random.Generator, lean: Array) -> None:
+    """Also of one that hangs."""
     plain = level(noise)
-    base = leaning(plain, LEAN[:3, :3]).moved(se3.inverse(LEAN))
+    base = leaning(plain, lean[:3, :3]).moved(se3.inverse(lean))
     assert base.up is None
     np.testing.assert_allclose(base.xyz, plain.xyz, atol=1e-4)
     np.testing.assert_allclose(base.axes, plain.axes, atol=1e-4)

@@ -122,7 +122,7 @@ class Localizer:
 
     def _find(self, keyframe: Keyframe, picture: Image | None, rejected: Registration) -> LocalizationResult:
         """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
-        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors, picture)
+        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors, picture, keyframe.up)
         self._hint = None
         tracking = self._state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf

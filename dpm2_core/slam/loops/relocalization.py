@@ -21,7 +21,7 @@ from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Image, Points
+from dpm2_core.frame import Array, Image, Points, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
@@ -66,6 +66,7 @@ class FindsPlaces(Protocol):
         hint: Array | None = None,
         descriptors: Descriptors | None = None,
         picture: Image | None = None,
+        up: Up | None = None,
     ) -> Registration:
         """T_map_lidar of a cloud (M, 4), or why it is not known."""
 
@@ -100,6 +101,7 @@ class Relocalizer:
         hint: Array | None = None,
         descriptors: Descriptors | None = None,
         picture: Image | None = None,
+        up: Up | None = None,
     ) -> Registration:
         """T_map_lidar of a cloud (M, 4), or why it is not known.
 
@@ -107,9 +109,10 @@ class Relocalizer:
             hint: T_map_lidar (4, 4) to look around; its heading does not matter.
             descriptors: of the cloud, if they are known already.
             picture: taken with the cloud, for where the points do not say how far along a road it was.
+            up: in the cloud, see `Frame`.
         """
         try:
-            descriptors = descriptors or self._places.describe(cloud)
+            descriptors = descriptors or self._places.describe(cloud, up)
         except Dpm2Error as error:
             return nowhere(str(error))
         allowed = np.ones(len(self), bool)

@@ -19,7 +19,7 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Registration
 from dpm2_core.files import new_folder, write_json
-from dpm2_core.frame import Array, Image, Points
+from dpm2_core.frame import Array, Image, Points, Up
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps
@@ -183,9 +183,9 @@ class TiledRelocalizer:
         settings: RelocalizationSettings,
         tiles: TiledMap,
         make: Callable[[MapData], Relocalizer],
-        describe: Callable[[Points], Descriptors],
+        describe: Callable[[Points, Up | None], Descriptors],
     ) -> None:
-        """`make`: for a map that is in memory. `describe`: descriptors of a cloud; Dpm2Error where it has none."""
+        """`make`: for a map that is in memory. `describe`: see `PlaceRecognition`."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
 
@@ -195,6 +195,7 @@ class TiledRelocalizer:
         hint: Array | None = None,
         descriptors: Descriptors | None = None,
         picture: Image | None = None,
+        up: Up | None = None,
     ) -> Registration:
         """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
 
@@ -202,7 +203,7 @@ class TiledRelocalizer:
             Dpm2Error: a square is missing or damaged.
         """
         try:
-            descriptors = descriptors or self._describe(cloud)
+            descriptors = descriptors or self._describe(cloud, up)
         except Dpm2Error as error:
             return nowhere(str(error))
         if hint is None:

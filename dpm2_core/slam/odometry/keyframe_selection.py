@@ -123,6 +123,7 @@ class KeyframeSelector:
             cloud = se3.transform(T_lidar_scan, cloud)
             known = None if known is None else known.moved(T_lidar_scan)
         keyframe = Keyframe(self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
+        keyframe = replace(keyframe, up=frame.up)
         if self._fix is not None:
             fix, T_odom_then = self._fix
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
 from dpm2_core.geometry.turning import leveled
@@ -53,7 +53,7 @@ class MotionState:
         self._open = 0.0  # s, for which the scene has left a direction open
         self._started = False
 
-    def start(self, up: tuple[float, float, float] | None) -> None:
+    def start(self, up: Up | None) -> None:
         """Of the first frame: its pose has `up` (3,), of `Frame`, upwards. Later ones change nothing."""
         if not self._started and up is not None:
             self.T = self.T_registered = se3.make(leveled(up), np.zeros(3))

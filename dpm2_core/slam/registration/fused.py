@@ -58,8 +58,8 @@ class FusedScanRegistration:
     def prepare(self, frame: Frame, motion: Array) -> Scan:
         scan = self._geometric.prepare(frame, motion)
         images = frame.images if self.uses_images else ()
-        description = LazyDescriptors(partial(self._neural.describe, scan.points, images))
-        return replace(scan, description=description, images=images)
+        description = LazyDescriptors(partial(self._neural.describe, scan.points, images, frame.up))
+        return replace(scan, description=description, images=images, up=frame.up)
 
     def rejection(self, scan: Scan) -> str:
         return self._geometric.rejection(scan)

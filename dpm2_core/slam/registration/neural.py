@@ -13,7 +13,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors, LazyDescriptors
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Frame, Image, Points
+from dpm2_core.frame import Array, Frame, Image, Points, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.images import small_image
@@ -78,15 +78,20 @@ class NeuralScanRegistration:
     def prepare(self, frame: Frame, motion: Array) -> Scan:
         points, _ = self._preprocessor.measured(frame, motion)
         images = frame.images if self.uses_images else ()
-        return Scan(points, description=LazyDescriptors(partial(self.describe, points, images)), images=images)
+        return Scan(
+            points,
+            description=LazyDescriptors(partial(self.describe, points, images, frame.up)),
+            images=images,
+            up=frame.up,
+        )
 
-    def describe(self, points: Points, images: tuple[Image, ...] = ()) -> Descriptors:
-        """The descriptors of a prepared scan (P, 4).
+    def describe(self, points: Points, images: tuple[Image, ...] = (), up: Up | None = None) -> Descriptors:
+        """The descriptors of a prepared scan (P, 4), `up` in it as in `Frame`.
 
         Raises:
             Dpm2Error: it has none.
         """
-        return self._model.describe(Frame(0, points, images=images))
+        return self._model.describe(Frame(0, points, images=images, up=up))
 
     def rejection(self, scan: Scan) -> str:
         if scan.description is None:
@@ -145,5 +150,5 @@ class NeuralScanRegistration:
             few = scan.points[voxel_first(scan.points, network.points.voxel)]
             images = scan.images if self.uses_images else ()
             small = tuple(small_image(image, network.image) for image in images)
-            description = LazyDescriptors(partial(self.describe, few, small))
+            description = LazyDescriptors(partial(self.describe, few, small, scan.up))
         self._map.insert(description, T_odom_lidar)

@@ -120,8 +120,8 @@ def unpack_descriptors(data: bytes) -> Descriptors:
         raise ValueError(f"no descriptors: a scale of {scale:g}")
     if not all(np.isfinite(part).all() for part in (xyz, step, axis, up) if part is not None):
         raise ValueError("no descriptors: values that are not finite")
-    if up is not None and not (abs(np.linalg.norm(up) - 1) < 1e-3 and up[2] > 0):
-        raise ValueError("no descriptors: what should point up does not")
+    if up is not None and not abs(np.linalg.norm(up) - 1) < 1e-3:
+        raise ValueError("no descriptors: what should point up is no direction")
     return Descriptors(xyz, features, step, axis, up, scale)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,23 @@ def test_where_there_is_nothing_to_level_the_descriptors_are_those_of_the_scan_a
     assert found.up is None
     np.testing.assert_array_equal(found.xyz, plain.xyz)
     np.testing.assert_array_equal(found.features, plain.features)
+
+
+def test_what_hangs_or_lies_by_its_mounting_is_described_as_if_it_stood(noise: np.random.Generator) -> None:
+    """By the mounting alone where no ground shows it, and by both where one does."""
+    network, standing = model(), street(noise)
+    R = np.diag([1.0, -1, -1])  # exact, so that the turned scan is the same
+    plain, found = network.describe(frame(standing)), network.describe(replace(frame(standing @ R), up=(0.0, 0.0, -1)))
+    np.testing.assert_array_equal(found.features, plain.features)
+    np.testing.assert_array_equal(found.xyz @ R, plain.xyz)
+    assert found.up is not None
+    np.testing.assert_array_equal(found.up, [0, 0, -1])
+    leaves, up = noise.normal(size=(3000, 3)) * 9, (0.6, 0.0, 0.8)
+    by_mount = network.describe(replace(frame(leaves), up=up)).up
+    np.testing.assert_array_equal(by_mount, np.array(up, np.float32))
+    lean = se3.exp([0.3, 0, 0, 0, 0, 0])[:3, :3]  # of the ground, such as a ramp
+    on_a_ramp = network.describe(replace(frame(standing @ (lean @ R).T), up=(0.0, 0.0, -1))).up
+    np.testing.assert_allclose(on_a_ramp, lean @ R[2], atol=0.02)
 
 
 def test_descriptors_of_a_tilted_scan_lie_in_its_own_frame(noise: np.random.Generator) -> None:

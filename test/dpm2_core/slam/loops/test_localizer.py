@@ -11,7 +11,7 @@ import pytest
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe, Registration, State
-from dpm2_core.frame import Array, Frame, Image, Points
+from dpm2_core.frame import Array, Frame, Image, Points, Up
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import Localizer
@@ -34,6 +34,7 @@ class Places:
         hint: Array | None = None,
         descriptors: Descriptors | None = None,
         picture: Image | None = None,
+        up: Up | None = None,
     ) -> Registration:
         x = self._found.pop(0)
         return nowhere("nothing fits") if np.isnan(x) else Registration(at(x), FIRM, 0.95, 0.05, "relocalisation")

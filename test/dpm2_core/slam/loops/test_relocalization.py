@@ -75,14 +75,18 @@ def off(found: Registration, truth: Array) -> tuple[float, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("s", "lateral", "heading"), [(63.0, 0.5, 0.0), (77.0, 2.5, 3.0), (92.0, 1.0, -1.6)], ids=["same", "back", "across"]
+    ("s", "lateral", "heading", "up"),
+    [(63.0, 0.5, 0.0, 1.0), (77.0, 2.5, 3.0, 1.0), (92.0, 1.0, -1.6, 1.0), (63.0, 0.5, 0.0, -1.0)],
+    ids=["same", "back", "across", "hanging"],
 )
 def test_found_from_one_cloud_with_other_traffic(
-    relocalizer: Relocalizer, s: float, lateral: float, heading: float
+    relocalizer: Relocalizer, s: float, lateral: float, heading: float, up: float
 ) -> None:
-    result = relocalizer.find(seen(s, lateral, heading, time=7.0))
+    cloud, truth = seen(s, lateral, heading, time=7.0), world().pose_at(s, lateral, heading)
+    T_level_lidar = se3.make(np.diag([1.0, up, up]), np.zeros(3))
+    result = relocalizer.find(se3.transform(T_level_lidar, cloud).astype(np.float32), up=(0.0, 0.0, up))
     assert result.ok, result.reason
-    meters, degrees = off(result, world().pose_at(s, lateral, heading))
+    meters, degrees = off(result, truth @ T_level_lidar)
     assert meters < 0.1
     assert degrees < 0.2
 

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -235,6 +236,22 @@ def test_images_are_asked_for_and_used_where_the_network_has_a_camera(noise: np.
         assert with_image is not None
         assert without is not None
         assert np.array_equal(with_image.features, without.features) is not requested
+
+
+@pytest.mark.parametrize("registration", ["neural", "refined", "geometric"])
+def test_a_keyframe_of_a_lidar_that_hangs_is_described_as_one_that_stands(
+    weights: Path, noise: np.random.Generator, registration: Any
+) -> None:
+    s = SlamSettings(registration=registration, neural=NeuralSettings(weights=str(weights), min_confidence=0))
+    points, described = cloud(boxes(noise)), []
+    for up in (1.0, -1.0):
+        slam = make_slam(s)
+        keyframe = slam.process(Frame(0, points * np.float32([1, up, up, 1]), up=(0.0, 0.0, up))).odometry.keyframe
+        assert keyframe is not None
+        described.append(slam.mapper.described(keyframe).descriptors)
+    standing, hanging = described
+    np.testing.assert_array_equal(hanging.features, standing.features)
+    assert (standing.up, hanging.up.tolist()) == (None, [0, 0, -1])
 
 
 def test_what_is_remembered_of_a_scan_gives_its_descriptors(noise: np.random.Generator) -> None:
