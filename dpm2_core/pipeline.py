@@ -119,8 +119,8 @@ class OfflineRun:
         began, problems = perf_counter(), list[str]()
         with interrupt_deferred() as interrupted:
             try:
-                frames = self.source.frames(self._start, self._stop)
-                for frame in prefetch(frames_in_order(frames, self._corrected)):
+                frames = frames_in_order(self.source, self._start, self._stop, self._corrected)
+                for frame in prefetch(frames):
                     if frame.problem is None:
                         self._begun = None
                     else:
@@ -141,7 +141,7 @@ class OfflineRun:
         return result
 
     def _corrected(self, number: int, stamp: int) -> None:
-        note_corrected(self.source.notes, self._start + number, stamp)
+        note_corrected(self.source.notes, number, stamp)
 
 
 def open_recording(path: Path | str, config: Config, images: bool) -> Source:

@@ -46,11 +46,14 @@ class BagSource:
 
     Attributes:
         T_base_lidar: (4, 4) how the LiDAR is mounted; None where /tf_static does not say that.
+        in_order: its clouds have been put in order of time before images and IMU joined them.
 
     Raises:
         UsageError: it cannot be read, has no point clouds, leaves the choice of a topic open, or has a camera with
             intrinsics but no known place.
     """
+
+    in_order = True
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings = settings or InputSettings()

@@ -117,7 +117,7 @@ class CorruptedSource:
         self._source = source
         self._settings = settings
         self.name, self.notes, self.truth = source.name, source.notes, source.truth
-        self.numbers = getattr(source, "numbers", None)
+        self.numbers, self.in_order = getattr(source, "numbers", None), getattr(source, "in_order", False)
         turn, shift = self._rng(_EXTRINSIC).normal(size=(2, 3))
         turn *= np.radians(settings.extrinsic_deg) / np.linalg.norm(turn)
         shift *= settings.extrinsic_m / np.linalg.norm(shift)

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.messages import STAMP_END, restamped, serialized_stamp
 from dpm2_core.data.pairing import RawMessage
-from dpm2_core.data.source import note_once
+from dpm2_core.data.source import Source, note_once
 from dpm2_core.frame import Array, Frame
 
 Item = TypeVar("Item")
@@ -52,9 +52,18 @@ def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[in
     return _in_order(messages, stamp_of, lambda m, stamp: (m[0], m[1], restamped(m[2], stamp)), corrected)
 
 
-def frames_in_order(frames: Iterable[Frame], corrected: Callable[[int, int], None]) -> Iterator[Frame]:
-    """The same for the frames of a drive."""
-    return _in_order(frames, lambda frame: frame.stamp, lambda frame, stamp: replace(frame, stamp=stamp), corrected)
+def frames_in_order(source: Source, start: int, stop: int, corrected: Callable[[int, int], None]) -> Iterator[Frame]:
+    """The same for frames start..stop-1 of a drive, by those before and after them, too; a bag has done so itself."""
+    if getattr(source, "in_order", False):
+        return source.frames(start, stop)
+    first = max(start - _AROUND, 0)
+    frames = _in_order(
+        source.frames(first, stop + _AROUND),
+        lambda frame: frame.stamp,
+        lambda frame, stamp: replace(frame, stamp=stamp),
+        lambda number, stamp: corrected(first + number, stamp) if first + number >= start else None,
+    )
+    return islice(frames, start - first, stop - first if stop < len(source) else None)
 
 
 def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -> None:

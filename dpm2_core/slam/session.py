@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.config import dump_settings
 from dpm2_core.data.messages import returned
 from dpm2_core.data.source import Source, frame_at
+from dpm2_core.data.time_order import frames_in_order
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import weights_id
@@ -128,7 +129,8 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     position = min(len(source) - 1, last.index - index_at(0))
     if position > 0 and index_at(position) != last.index:  # some scans are missing
         position = bisect_left(range(position), last.index, key=index_at)
-    result = None if position < 0 else frame_at(source, position)
+    seen = () if position < 0 else frames_in_order(source, position, position + 1, lambda number, stamp: None)
+    result = next(iter(seen), None)
     if result is None or result.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
     if not _shows(result, mapper.clouds[-1]):

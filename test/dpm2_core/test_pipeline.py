@@ -30,7 +30,8 @@ from dpm2_core.slam.system import SlamResult
 from ..helpers.drives import first_scans
 
 FRAMES = 8
-CONFIG = load_settings(Config, None, ["slam.loops.enabled=false", "slam.threads=1"])
+SET = ["slam.loops.enabled=false", "slam.threads=1"]
+CONFIG = load_settings(Config, None, SET)
 """Without loops, which so short a drive has none of: no network is loaded."""
 FILES = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "timing.json", "metrics.json",
@@ -82,9 +83,10 @@ def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
 
 @pytest.mark.slow
 def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
-    recording: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As those of bags and KITTI are: 1 s ahead, in a loader of one's own, it cost 9 m without a word."""
+    """As those of bags and KITTI are: 1 s ahead, in a loader of one's own, it cost 9 m without a word. Also where the
+    drive begins, or is gone on with."""
     source = open_source(recording)
     scans = list(source.frames())
     wrong = scans[4].stamp + 10**9
@@ -94,6 +96,15 @@ def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
     np.testing.assert_allclose(result.recorder.stamps, [frame.stamp for frame in scans[1:]], atol=1000)
     what = "stamps that are not between their neighbors are taken to be"
     assert source.notes == [f"{what} (the first at frame 4: {wrong * 1e-9:.3f} s)"]
+    config, path = load_settings(Config, None, [*SET, "slam.keyframes.distance=0"]), tmp_path / "drive.dpm2map"
+    for span in ((0, 5), (0, 6)):  # the map ends with that frame, and goes on with it
+        with OfflineRun(source, config, span, map_file=path, map_mode="resume") as drive:
+            drive.run()
+            assert drive.slam.mapper.keyframes[-1].index == span[1] - 1
+    stamps = [keyframe.stamp for keyframe in drive.slam.mapper.keyframes]
+    np.testing.assert_allclose(stamps, [scans[i].stamp for i in (0, 1, 2, 3, 4, 4, 5)], atol=1000)
+    began = OfflineRun(source, CONFIG, (4, 5)).run().recorder.stamps
+    np.testing.assert_allclose(began, [scans[4].stamp], atol=1000)
 
 
 @pytest.mark.slow
