@@ -150,25 +150,36 @@ class TiledMap:
         tiles, ends = list(self._counts), np.cumsum(list(self._counts.values()))
         return list(dict.fromkeys(tiles[int(np.searchsorted(ends, node, side="right"))] for _, node in best))
 
-    def read(self, tiles: Collection[Tile]) -> MapData:
-        """One map of some squares, at least one; all others are closed.
+    def read(self, tiles: Collection[Tile]) -> tuple[MapData, str]:
+        """One map of some squares, at least one; all others are closed. And why one of them is missing in it, in words;
+        empty where none is.
 
         Raises:
-            Dpm2Error: one is missing or damaged.
+            Dpm2Error: all are missing or damaged.
         """
         self._keep(tiles)
+        problems = list[Dpm2Error]()
         for tile in tiles:
             if tile not in self._files:
-                store = MapStore.open(self.path / _name(tile))
                 try:
-                    data = load_map(store)
-                    if len(data) != self._counts[tile]:
-                        raise Dpm2Error(f"{store.path}: {len(data)} keyframes, the index says {self._counts[tile]}")
-                except BaseException:
-                    store.close()
-                    raise
-                self._files[tile] = store, data
-        return reduce(lambda a, b: merge_maps(a, b, np.eye(4)), (self._files[tile][1] for tile in tiles))
+                    self._files[tile] = self._opened(tile)
+                except Dpm2Error as error:
+                    problems.append(error)
+        found = [self._files[tile][1] for tile in tiles if tile in self._files]
+        if not found:
+            raise problems[0]
+        return reduce(lambda a, b: merge_maps(a, b, np.eye(4)), found), str(problems[0]) if problems else ""
+
+    def _opened(self, tile: Tile) -> tuple[MapStore, MapData]:
+        store = MapStore.open(self.path / _name(tile))
+        try:
+            data = load_map(store)
+            if len(data) != self._counts[tile]:
+                raise Dpm2Error(f"{store.path}: {len(data)} keyframes, the index says {self._counts[tile]}")
+        except BaseException:
+            store.close()
+            raise
+        return store, data
 
     def _keep(self, tiles: Collection[Tile]) -> None:
         for tile in self.open - set(tiles):
@@ -188,6 +199,7 @@ class TiledRelocalizer:
         """`make`: for a map that is in memory. `describe`: see `PlaceRecognition`."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
+        self._problem = ""  # why a square is not in it
 
     def find(
         self,
@@ -200,7 +212,7 @@ class TiledRelocalizer:
         """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
 
         Raises:
-            Dpm2Error: a square is missing or damaged.
+            Dpm2Error: it is found nowhere, and a square is missing or damaged.
         """
         try:
             descriptors = descriptors or self._describe(cloud, up)
@@ -210,21 +222,29 @@ class TiledRelocalizer:
             tiles = self._tiles.like(pooled(descriptors), self._settings.candidates)
         else:
             tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
-        here = self._at(tiles)
-        return nowhere("outside the map") if here is None else here.find(cloud, hint, descriptors, picture)
+        self._go_to(tiles)
+        return self._known(lambda here: here.find(cloud, hint, descriptors, picture))
 
     def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
         """As `Relocalizer.verify`.
 
         Raises:
-            Dpm2Error: a square is missing or damaged.
+            Dpm2Error: it is not confirmed, and a square is missing or damaged.
         """
         xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
-            self._at(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
-        here = self._here
-        return nowhere("outside the map") if here is None else here.verify(cloud, T_map_lidar, picture)
+            self._go_to(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
+        return self._known(lambda here: here.verify(cloud, T_map_lidar, picture))
 
-    def _at(self, tiles: Collection[Tile]) -> Relocalizer | None:
-        self._here = self._make(self._tiles.read(tiles)) if tiles else None
-        return self._here
+    def _go_to(self, tiles: Collection[Tile]) -> None:
+        self._here, self._problem = None, ""
+        if tiles:
+            data, self._problem = self._tiles.read(tiles)
+            self._here = self._make(data)
+
+    def _known(self, asked: Callable[[Relocalizer], Registration]) -> Registration:
+        """What is known here, where that is something, also without a square that cannot be read."""
+        result = nowhere("outside the map") if self._here is None else asked(self._here)
+        if self._problem and not result.ok:
+            raise Dpm2Error(self._problem)
+        return result

@@ -12,8 +12,10 @@ import pytest
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.estimates import Registration
+from dpm2_core.slam.loops.relocalization import RelocalizationSettings
 from dpm2_core.slam.loops.retrieval import pooled
-from dpm2_core.slam.mapping.tiles import INDEX, VECTORS, TiledMap, write_tiles
+from dpm2_core.slam.mapping.tiles import INDEX, VECTORS, TiledMap, TiledRelocalizer, write_tiles
 from dpm2_core.slam.session import open_for_localization
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
@@ -73,8 +75,8 @@ def test_only_the_tiles_that_are_asked_for_are_open(folder: Path, data: MapData)
         assert len(tiles.around(np.zeros(2), 5.0)) == 4
         (one,) = tiles.around(np.array([25.0, 25.0]), 5.0)
         assert tiles.open == set()
-        assert len(tiles.read([one])) == 15
-        both = tiles.read([one, (-1, 0)])
+        assert len(tiles.read([one])[0]) == 15
+        both, _ = tiles.read([one, (-1, 0)])
         assert tiles.open == {one, (-1, 0)}
         np.testing.assert_allclose(both.poses[:, 2, 3], data.poses[0, 2, 3])
         assert (both.poses[:, 1, 3] >= 0).all()
@@ -115,6 +117,36 @@ def test_what_is_wrong_is_named(tmp_path: Path, folder: Path, data: MapData) -> 
     with TiledMap(folder) as tiles, pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such"):
         tiles.read([(0, 0)])
     assert not list(tmp_path.glob(".*"))
+
+
+def test_what_can_be_read_is_searched_without_what_cannot(folder: Path, data: MapData) -> None:
+    """One tile that was missing among the candidates hid all places in the others."""
+
+    class Here:
+        """Stands in for a relocalizer: everything is found, or nothing is."""
+
+        def __init__(self, made: MapData) -> None:
+            self.count = len(made)
+
+        def find(self, *_: object) -> Registration:
+            counts.append(self.count)
+            return replace(Registration(np.eye(4), np.eye(6)), ok=found)
+
+        verify = find
+
+    cloud, counts, like = np.zeros((0, 4), np.float32), list[int](), data.keyframes[0].descriptors
+    (folder / "0_0.dpm2map").unlink()
+    with TiledMap(folder) as tiles:
+        settings = RelocalizationSettings(candidates=60)
+        places = TiledRelocalizer(settings, tiles, Here, lambda *_: like)  # type: ignore[arg-type,return-value]
+        for found in (True, False):
+            for ask in (places.find, lambda cloud: places.verify(cloud, np.eye(4))):
+                if found:
+                    assert ask(cloud).ok
+                else:
+                    with pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such map file"):
+                        ask(cloud)
+    assert counts == [44] * 4  # of 59, 15 of them in the tile that is missing
 
 
 def test_nobody_is_looked_for_in_tiles_without_descriptors(tmp_path: Path, folder: Path) -> None:
