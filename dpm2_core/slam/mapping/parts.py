@@ -43,6 +43,14 @@ def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
     return fixes.georeference
 
 
+def placed(data: MapData) -> MapData:
+    """The map, if it has no georeference, with that of its first part's fixes, where these tell."""
+    if data.georeference is not None:
+        return data
+    parts = parts_of(data)
+    return replace(data, georeference=located(data, parts == parts[:1]))
+
+
 def frame_of(known: Georeference) -> Array:
     """T_ecef_map (4, 4)."""
     return np.asarray(geodesy.enu_frame(known.origin) @ known.T_enu_map)

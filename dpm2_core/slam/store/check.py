@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
+from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -12,13 +13,18 @@ from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_connection import explained
-from dpm2_core.slam.store.map_data import save_as
+from dpm2_core.slam.store.map_data import MapData, save_as
 from dpm2_core.slam.store.map_file import copy_with_log, missing_log
 from dpm2_core.slam.store.salvage import Findings, Salvage
 
 
-def check_map(path: Path, recover: Path | None = None) -> Findings:
+def check_map(
+    path: Path, recover: Path | None = None, complete: Callable[[MapData], MapData] = lambda data: data
+) -> Findings:
     """Check a map file without changing it; write the good part of it to a new file if wanted.
+
+    Args:
+        complete: is given that part, and gives it back with what can be made anew of what was lost.
 
     Raises:
         UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, `recover` cannot be written, or
@@ -39,7 +45,7 @@ def check_map(path: Path, recover: Path | None = None) -> Findings:
             if recover is not None:
                 if not len(data):
                     raise Dpm2Error(f"{path}: nothing in it can be recovered")
-                save_as(data, recover)
+                save_as(complete(data), recover)
     return findings
 
 

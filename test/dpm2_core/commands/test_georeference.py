@@ -5,6 +5,8 @@ truth, also where a receiver errs for a while."""
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -259,3 +261,16 @@ def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
     assert done.stderr.strip().endswith("the map has no georeference; see input.gnss_topic")
     assert not (tmp_path / "a.geojson").exists()
     assert "georeference" in dpm2("map", "info", map_file).stdout
+
+
+def test_a_recovered_map_is_where_its_fixes_are(tmp_path: Path) -> None:
+    """The row that says so was damaged: the recovered map was nowhere, and "80 fixes do not tell it"."""
+    data = two_drives()
+    save_as(data, tmp_path / "map")
+    with closing(sqlite3.connect(tmp_path / "map")) as sql, sql:
+        sql.execute("UPDATE georeference SET latitude = 0")
+    done = dpm2("map", "check", tmp_path / "map", "--recover", tmp_path / "again")
+    assert "georeference 0: its checksum is wrong" in done.stdout
+    assert dpm2("map", "export", tmp_path / "again", tmp_path / "a.geojson").returncode == 0
+    np.testing.assert_allclose(lines_of(tmp_path / "a.geojson")[1], data.poses[:40, :3, 3], atol=0.01)
+    assert "40 of 80 fixes used" in " ".join(dpm2("map", "info", tmp_path / "again").stdout.split())
