@@ -22,6 +22,7 @@ from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Array
 from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_core.slam.mapping.occupancy import why_of_no_use
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
@@ -73,6 +74,7 @@ class MapperThread:
             )
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
+        self._of_no_use = ""  # why it is, in words
         node.create_timer(0.1, self._show, clock=STEADY)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
@@ -292,9 +294,13 @@ class MapperThread:
         of = (mapper, ros.grid, ros.grid_max_cells)
         if self._drawn is None or self._drawn[0] != of:
             self._drawn = of, OccupancyMap(ros.grid, ros.grid_max_cells)
+            self._of_no_use = ""
         grid = self._drawn[1]
         if not mapper.update_grid(grid, _GRID_WORK):  # of a map that was loaded, or after a loop in a large one
             self._displays[-1].again()
+        before, self._of_no_use = self._of_no_use, why_of_no_use(mapper.poses[mapper.placed])
+        if self._of_no_use and not before:
+            self._node.get_logger().warning(f"dpm2/grid: {self._of_no_use}")
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
     def _map(self) -> Any:

@@ -293,7 +293,7 @@ def _export_page(data: MapData, out: Path, voxel: float) -> None:
 
 
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.mapping.occupancy import ground_tilt, height_over_each_other, occupancy_grid, write_grid
+    from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid, why_of_no_use, write_grid
     from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 
     tied = _tied(data, out)
@@ -302,13 +302,11 @@ def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     if (tilt := ground_tilt(tied.clouds, tied.poses, tied.clouds.origin)) > _STEEP:
         why = "as of a LiDAR mounted at an angle: an IMU, or its mounting in /tf_static, makes a level one"
         note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
-    if (height := height_over_each_other(tied.poses)) > _STOREY:
-        why = "of storeys, which need a map each, or of drift that no loop took away"
-        note(f"{out}: not to be used, what it shows lies up to {height:.1f} m over each other, {why}")
+    if why := why_of_no_use(tied.poses):
+        note(f"{out}: {why}")
 
 
 _STEEP = 10.0  # degrees that the ground of a whole map may be tilted against the place where it begins
-_STOREY = 2.4  # m that keyframes may stand above each other: less than a floor, more than from a base to its LiDAR
 _SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
 """Default of each option that is a spacing, m."""
 _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {

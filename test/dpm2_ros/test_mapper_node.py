@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rcl_interfaces.msg import Log
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 from std_srvs.srv import Trigger
@@ -28,6 +29,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import WIRE, descriptors_to_msg, payload_to_msgs
+from dpm2_ros.subscriptions import LAST_ONE
 from dpm2_ros.tf import TFMessage
 
 from ..helpers.mapping import S, core, keyframes, mapped, points, rejections, send_all
@@ -95,6 +97,24 @@ def test_a_keyframe_of_another_name_is_rejected_and_the_rest_goes_on(mapper: Any
     mapper.send(1, np.eye(4), points(0).astype(np.float32), name="not a keyframe")
     mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1).astype(np.float32))
     mapper.wait(lambda: keyframes(mapper) == 2, "two keyframes")
+
+
+def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(mapper: Any) -> None:
+    """Once, by the one that publishes it, as by the export: a robot on the next floor went by the walls of both."""
+    log, grids = mapper.hear(Log, "/rosout"), mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE)
+
+    def said() -> list[str]:
+        return [message.msg for message in log if message.msg.startswith("dpm2/grid: ")]
+
+    for n, height in enumerate((0.0, 0.0, 2.8, 2.8)):
+        before = len(grids)
+        mapper.send(n, se3.exp([0, 0, 0, 5.0 * (n % 2), 0, height]), points(n).astype(np.float32))
+        mapper.wait(lambda expected=n + 1: keyframes(mapper) == expected, "the keyframe")
+        mapper.wait(lambda than=before: len(grids) > than, "its grid")
+        assert n >= 2 or not said()
+    mapper.wait(said, "the warning")
+    (words,) = said()
+    assert words.startswith("dpm2/grid: not to be used, what it shows lies up to 2.8 m over each other, of storeys")
 
 
 def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:

@@ -24,6 +24,7 @@ from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySe
 _MOST = 400_000_000  # cells
 _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
 _SQUARE = 5.0  # m: the steepest ramp rises by less than a storey within one
+_STOREY = 2.4  # m that keyframes may stand above each other: less than a floor, more than from a base to its LiDAR
 _OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
 
 
@@ -63,7 +64,15 @@ def ground_tilt(clouds: Sequence[Points], poses: Array, origin: Callable[[int], 
     return float(np.degrees(np.arctan2(np.hypot(x, y), z)))
 
 
-def height_over_each_other(poses: Array) -> float:
+def why_of_no_use(poses: Array) -> str:
+    """Of the grid of keyframes at (N, 4, 4) T_map_kf: what it shows that lies over each other, in words; else empty."""
+    if not len(poses) or (height := _height_over_each_other(poses)) <= _STOREY:
+        return ""
+    why = "of storeys, which need a map each, or of drift that no loop took away"
+    return f"not to be used, what it shows lies up to {height:.1f} m over each other, {why}"
+
+
+def _height_over_each_other(poses: Array) -> float:
     """The most by which keyframes at (N, 4, 4) T_map_kf, N > 0, in one square of 5 m differ in height, m."""
     _, square = np.unique(np.floor(poses[:, :2, 3] / _SQUARE), axis=0, return_inverse=True)
     lowest, highest = np.full((2, len(poses)), [[np.inf], [-np.inf]])
