@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.commands.options import note
 from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
@@ -136,7 +135,5 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     until = summary["frames_until_found"]
     why = f" ({summary['not_found']})" if summary["not_found"] else ""
     found = f"not found{why}" if until is None else f"found after {until} frames"
-    if summary["map_unreadable"]:
-        note(f"the map cannot be read everywhere: {summary['map_unreadable']}")
     located = f"place known in {len(report.stamps)} of {summary['frames']} frames"
     return f"{name}: {found}, {located}; results in {out}", summary

@@ -86,6 +86,8 @@ def run(
         with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive, interrupt_deferred():
             found, figures = run_localized(drive, out, T_hint, chosen)
             show(found, figures, json_file)
+        if problem := figures["map_unreadable"]:
+            raise Dpm2Error(f"the map cannot be read everywhere: {problem}")
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with ExitStack() as open_things:

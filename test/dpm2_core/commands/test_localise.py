@@ -76,13 +76,14 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
 
 
 def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tmp_path: Path) -> None:
-    """The drive ended where it was needed, with nothing in the folder."""
+    """The drive ended where it was needed, with nothing in the folder. A script is told, as where the map file is not
+    complete."""
     assert dpm2("map", "export", made, tmp_path / "tiles", "--tiles", "100").returncode == 0
     missing = tmp_path / "tiles" / "0_0.dpm2map"
     missing.unlink()
     done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", ":3", "--localise", tmp_path / "tiles", *QUICK)
-    assert done.returncode == 0, done.stderr
-    assert f"the map cannot be read everywhere: {missing}: no such map file" in done.stderr
+    assert done.returncode == 1, done.stderr
+    assert f"dpm2: the map cannot be read everywhere: {missing}: no such map file" in done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert (report["frames"], report["map_unreadable"]) == (3, f"{missing}: no such map file")
 
