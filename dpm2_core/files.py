@@ -65,6 +65,16 @@ def part_beside(path: Path) -> Path:
 
 
 @contextmanager
+def named(path: Path, part: Path) -> Iterator[None]:
+    """What fails while `part` is written names the file or folder at `path` that was asked for."""
+    try:
+        yield
+    except Dpm2Error as error:
+        error.args = (str(error).replace(str(part), str(path)),)
+        raise
+
+
+@contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A folder that is named `path` when the block ends well, and is gone when it does not.
 
@@ -78,7 +88,8 @@ def new_folder(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
-        yield part
+        with named(path, part):
+            yield part
         if path.is_dir() and not any(path.iterdir()):
             for entry in sorted(part.iterdir()):
                 entry.rename(path / entry.name)

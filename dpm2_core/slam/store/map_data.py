@@ -15,7 +15,7 @@ import numpy as np
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe
-from dpm2_core.files import part_beside
+from dpm2_core.files import named, part_beside
 from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -184,7 +184,7 @@ def save_as(data: MapData, path: Path) -> None:
     check_new(path)
     part = part_beside(path)
     try:
-        with MapStore.create(part) as store:
+        with named(path, part), MapStore.create(part) as store:
             append_map(store, data)
         check_new(path)  # another program may have made one meanwhile
         move_map(part, path)

@@ -22,6 +22,7 @@ from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.full_disk import largest_file
 from test.helpers.maps import ring
 
 SIZE = 50.0
@@ -147,6 +148,16 @@ def test_what_can_be_read_is_searched_without_what_cannot(folder: Path, data: Ma
                     with pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such map file"):
                         ask(cloud)
     assert counts == [44] * 4  # of 59, 15 of them in the tile that is missing
+
+
+def test_a_full_disk_names_what_was_asked_for(tmp_path: Path) -> None:
+    """And no hidden file or folder in which it was written."""
+    data, out = ring(20, points=2000), tmp_path / "tiles"
+    with largest_file(150_000), pytest.raises(Dpm2Error, match=rf"^{out}/0_0\.dpm2map: (?!.*\.part)"):
+        write_tiles(data, out, SIZE)
+    with largest_file(150_000), pytest.raises(Dpm2Error, match=rf"^{tmp_path / 'map'}: (?!.*\.part)"):
+        save_as(data, tmp_path / "map")
+    assert not list(tmp_path.iterdir())
 
 
 def test_nobody_is_looked_for_in_tiles_without_descriptors(tmp_path: Path, folder: Path) -> None:
