@@ -43,8 +43,9 @@ class Settings(BaseModel):
     """Base of every configuration type: unknown keys are errors, values immutable, docstrings describe fields."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True, allow_inf_nan=False
-    )
+        extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True, allow_inf_nan=False,
+        coerce_numbers_to_str=True,  # sequence=10 is the text 10
+    )  # fmt: skip
 
     @classmethod
     def implied(cls, tree: Mapping[str, Any]) -> dict[str, Any]:

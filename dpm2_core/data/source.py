@@ -80,4 +80,7 @@ def parse_range(text: str) -> Span:
     first, colon, last = text.partition(":")
     if not colon or not all(part.isdecimal() or not part for part in (first, last)):
         raise UsageError(f"--frames {text}: want a:b, such as 0:100")
-    return int(first or 0), int(last) if last else None
+    start, stop = int(first or 0), int(last) if last else None
+    if stop is not None and stop <= start:
+        raise UsageError(f"--frames {text}: want a before b in a:b, such as 0:100")
+    return start, stop

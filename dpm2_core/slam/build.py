@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpm2_core.errors import UsageError
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.slam.filters import make_filter
@@ -55,7 +56,7 @@ def make_slam(
             drives; the result then depends on its timing.
 
     Raises:
-        UsageError: a network has no weights to run with.
+        UsageError: a network has no weights to run with, or the settings are others.
     """
     s = settings or SlamSettings()
     return Slam(make_odometry(s, robot), *make_map(s, store, background), s.map.thumbnail, s.visual)
@@ -75,7 +76,13 @@ def make_map(
 
 
 def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
-    """The odometry with its tools; with `preset: auto` those for streets and those for rooms."""
+    """The odometry with its tools; with `preset: auto` those for streets and those for rooms.
+
+    Raises:
+        UsageError: as of `make_slam`.
+    """
+    if not isinstance(s, SlamSettings):
+        raise UsageError(f"want SlamSettings, which a Config has as its slam, not {type(s).__name__}")
     if s.preset == "auto":
         return ScaledOdometry(ByScale(_tools(s), _tools(s.indoors())), robot)
     return Odometry(_tools(s), robot)

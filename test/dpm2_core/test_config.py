@@ -229,3 +229,13 @@ def test_a_number_with_leading_zeros_stays_what_was_typed() -> None:
     """04 is a sequence, which YAML 1.1 would read as an octal number."""
     assert load_settings(InputSettings, None, ["sequence=04"]).sequence == "04"
     assert load_settings(InputSettings, None, ["image_time_offset=0.5"]).image_time_offset == 0.5
+
+
+def test_a_number_is_a_text_where_one_is_wanted(tmp_path: Path) -> None:
+    """KITTI's sequences from 10 on had to be given in quotes that the shell leaves; true and lists are no text."""
+    (tmp_path / "a.yaml").write_text("sequence: 10")
+    assert load_settings(InputSettings, tmp_path / "a.yaml").sequence == "10"
+    assert load_settings(InputSettings, None, ["sequence=10"]).sequence == "10"
+    for value in ("true", "[10]"):
+        with pytest.raises(UsageError, match="sequence: input should be a valid string"):
+            load_settings(InputSettings, None, [f"sequence={value}"])

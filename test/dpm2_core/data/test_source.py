@@ -16,6 +16,7 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import parse_range
 from dpm2_core.errors import UsageError
 
 
@@ -91,3 +92,14 @@ def test_closing_prefetch_ends_its_thread() -> None:
     assert any(thread.name == "prefetch" for thread in threading.enumerate())
     ahead.close()  # type: ignore[attr-defined]
     assert not any(thread.name == "prefetch" for thread in threading.enumerate())
+
+
+@pytest.mark.parametrize("text", ["10:5", "3:3", ":0"])
+def test_an_empty_range_is_said_to_be_one(text: str) -> None:
+    """It was said how many frames there are, which are enough."""
+    with pytest.raises(UsageError, match=f"--frames {text}: want a before b in a:b"):
+        parse_range(text)
+
+
+def test_a_range_is_open_where_nothing_is_said() -> None:
+    assert [parse_range(text) for text in (":", "5:", ":7", "5:7")] == [(0, None), (5, None), (0, 7), (5, 7)]

@@ -13,7 +13,7 @@ from dpm2_core.config import dump_settings, flat_fields, load_settings
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam import settings
-from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.build import make_odometry, make_slam
 from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.settings import Config, SlamSettings
 
@@ -98,3 +98,10 @@ def test_the_least_that_is_allowed_runs(suburb_drive: tuple[list[Frame], Array],
     slam.finish()
     assert all(np.isfinite(result.T_map_lidar).all() for result in results)
     slam.mapper.cloud()
+
+
+def test_a_config_in_the_place_of_its_slam_is_an_error_of_use() -> None:
+    """It ended with an AttributeError inside of dpm2."""
+    for make in (make_slam, make_odometry):
+        with pytest.raises(UsageError, match="want SlamSettings, which a Config has as its slam, not Config"):
+            make(Config())  # type: ignore[arg-type]
