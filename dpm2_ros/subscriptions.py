@@ -193,10 +193,11 @@ class Inputs:
             self._node.get_logger().warning(
                 f"{lost} clouds before that at {stamp / 1e9:.3f} s were lost on the way", throttle_duration_sec=5
             )
-        if check is not StampCheck.ACCEPTED:
-            self._node.get_logger().warning(
-                f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}", throttle_duration_sec=5
-            )
+        said = f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}"
+        if check is StampCheck.SET_BACK:  # right after those that were out of order, which must not keep it quiet
+            self._node.get_logger().warning(said)
+        elif check is not StampCheck.ACCEPTED:
+            self._node.get_logger().warning(said, throttle_duration_sec=5)
 
     def _on_image(self, camera: CameraTopic, message: Any) -> None:
         check_header(message.header)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from dpm2_core.data.pairing import JUMP, Beside, passed
+from dpm2_core.data.pairing import JUMP, Beside, SetBack, passed
 
 HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump."""
@@ -38,7 +38,9 @@ class StampCheck(StrEnum):
     REPEATED = "repeated"
     """Rejected: its stamp is that of the cloud before."""
     OUT_OF_ORDER = "out of order"
-    """Rejected: a later cloud has been accepted already."""
+    """Rejected: a later cloud has been accepted already. Unless more follow, see `SET_BACK`."""
+    SET_BACK = "its clock was set back by less than a second; the drive goes on"
+    """Accepted, as are those right before it that were out of order; counted as accepted."""
     JUMPED = "the stamp jumps; the next one shows whether it is right"
     """Neither accepted nor rejected yet; counted as what becomes of it."""
     STRAY = "stray"
@@ -116,6 +118,7 @@ class Synchronizer:
         self._newest: Bundle | None = None  # the last one accepted
         self._period = JUMP  # ns, from the last but one to that
         self._jumped: Bundle | None = None
+        self._set_back = SetBack()
         self.left: Bundle | None = None
 
     def __len__(self) -> int:
@@ -136,18 +139,35 @@ class Synchronizer:
         self.last_arrival = now
         if self._jumped is not None and self._newest is not None:
             self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp))
-        check, bundle = self._check(stamp, now, clock), Bundle(stamp, cloud, now, clock, restarted=False)
+        bundle = Bundle(stamp, cloud, now, clock, restarted=False)
+        check = self._check(bundle)
         if check is StampCheck.JUMPED:
             self._jumped = bundle
             return check
         self.counts[check] += 1
+        late = list[Bundle]()
         if check is StampCheck.ACCEPTED:
-            self._accept(bundle)
-        return check
+            before = self._set_back.end()
+            late = before if before and self._came_in_time(before[0], bundle) else []
+        elif check is StampCheck.OUT_OF_ORDER:
+            late = self._set_back.add(stamp, bundle)
+        self.counts[StampCheck.OUT_OF_ORDER] -= len(late)
+        self.counts[StampCheck.ACCEPTED] += len(late)
+        for one in (*late, *[bundle] * (check is StampCheck.ACCEPTED)):
+            self._accept(one)
+        return StampCheck.SET_BACK if late else check
+
+    def _came_in_time(self, late: Bundle, bundle: Bundle) -> bool:
+        """Whether the clouds from one that was out of order to this one came at the pace of their stamps, and more time
+        has passed than these say since the last one in order: the clock was set back, and nothing was kept on the way.
+        """
+        least = self._period / 2
+        return abs(self._ahead(bundle, late)) < least and self._ahead(bundle, self._newest) < -least
 
     def due(self, stamp: int, now: float, clock: float = 0.0) -> bool:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
-        return self._newest is not None and self._check(stamp, now, clock) is StampCheck.ACCEPTED
+        due = Bundle(stamp, None, now, clock, restarted=False)
+        return self._newest is not None and self._check(due) is StampCheck.ACCEPTED
 
     def add(self, topic: str, stamp: int, message: Any, now: float) -> None:
         """Take a message of another sensor with its stamp (ns)."""
@@ -195,25 +215,26 @@ class Synchronizer:
             return self._queue[0].arrival + self._timeout
         return self._jumped.arrival + HOLD if self._jumped is not None else None
 
-    def _check(self, stamp: int, now: float, clock: float) -> StampCheck:
+    def _check(self, bundle: Bundle) -> StampCheck:
         if self._newest is None:
             return StampCheck.ACCEPTED
-        step = stamp - self._newest.stamp
-        if step < -JUMP or self._ahead(stamp, now, clock) > min(AHEAD * self._period, JUMP):
+        step = bundle.stamp - self._newest.stamp
+        if step < -JUMP or self._ahead(bundle, self._newest) > min(AHEAD * self._period, JUMP):
             return StampCheck.JUMPED
         if step > 0:
             return StampCheck.ACCEPTED
         return StampCheck.OUT_OF_ORDER if step else StampCheck.REPEATED
 
-    def _ahead(self, stamp: int, arrival: float, clock: float) -> float:
-        """By how much more (ns) the stamps have gone on than time has passed since the last cloud.
+    @staticmethod
+    def _ahead(bundle: Bundle, last: Bundle | None) -> float:
+        """By how much more (ns) the stamps have gone on than time has passed since that cloud.
 
         A recording that is played faster passes more time than one who listens, and /clock says how much.
         """
-        if (last := self._newest) is None:
+        if last is None:
             return 0.0
-        passed = max(arrival - last.arrival, clock - last.clock if last.clock else 0.0)
-        return stamp - last.stamp - passed * 1e9
+        passed = max(bundle.arrival - last.arrival, bundle.clock - last.clock if last.clock else 0.0)
+        return bundle.stamp - last.stamp - passed * 1e9
 
     def _settle(self, true: bool) -> None:
         """Accept or reject the cloud whose stamp jumped."""
@@ -221,7 +242,7 @@ class Synchronizer:
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest.stamp
-        bundle.stepped = true and self._ahead(bundle.stamp, bundle.arrival, bundle.clock) > JUMP
+        bundle.stepped = true and self._ahead(bundle, self._newest) > JUMP
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
         ] += 1

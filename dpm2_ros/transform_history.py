@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.data.pairing import JUMP
+from dpm2_core.data.pairing import JUMP, SetBack
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -34,15 +34,20 @@ class _Track:
     parent: str
     stamps: list[int] = field(default_factory=list)
     samples: list[tuple[Any, Array | None]] = field(default_factory=list)
+    _set_back: SetBack = field(default_factory=SetBack)
 
     def add(self, stamp: int, pose: Any, covariance: Array | None) -> None:
-        if self.stamps and stamp < self.stamps[-1] - JUMP:
-            self.stamps.clear()  # a looped bag, or a stray stamp before
+        new = [(stamp, (pose, covariance))]
+        if self.stamps and self.stamps[-1] - JUMP <= stamp <= self.stamps[-1]:
+            new = self._set_back.add(stamp, new[0])
+            if not new:
+                return
+        self._set_back.end()
+        if self.stamps and stamp <= self.stamps[-1]:  # a clock that was set, a looped bag, or a stray stamp before
+            self.stamps.clear()
             self.samples.clear()
-        if self.stamps and stamp <= self.stamps[-1]:
-            return
-        self.stamps.append(stamp)
-        self.samples.append((pose, covariance))
+        self.stamps += [at for at, _ in new]
+        self.samples += [sample for _, sample in new]
         old = bisect_left(self.stamps, stamp - _KEPT)
         if old > 100 or len(self.stamps) > _MOST_SAMPLES:  # now and then: it moves the whole list
             old = max(old, len(self.stamps) - _MOST_SAMPLES // 2)

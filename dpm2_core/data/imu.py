@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.messages import MessageError
-from dpm2_core.data.pairing import JUMP
+from dpm2_core.data.pairing import JUMP, SetBack
 from dpm2_core.frame import Array, Inertial
 
 _LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any sensor that is sold measures
@@ -48,6 +48,7 @@ class ImuBuffer:
         self.last, self.frame = -float("inf"), ""
         self._lock = threading.Lock()
         self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST)
+        self._set_back = SetBack()
 
     def clear(self) -> None:
         """Forget everything."""
@@ -56,20 +57,24 @@ class ImuBuffer:
             self._samples.clear()
 
     def add(self, stamp: int, message: Any) -> None:
-        """Take a sensor_msgs/Imu with its stamp (ns); one that jumps by more than a second begins anew.
+        """Take a sensor_msgs/Imu with its stamp (ns); one that jumps by more than a second begins
+        anew, and so do those of a clock that was set back by less.
 
         Raises:
             MessageError: see `decode_imu`; or it is not newer than the last one, or follows too soon.
         """
         rates, forces = decode_imu(message)
         with self._lock:
-            step = stamp - self.last
+            step, samples = stamp - self.last, [(stamp, rates, forces)]
             if -JUMP < step < _CLOSEST:
-                raise MessageError(f"a sample {step * 1e-6:.3f} ms after the one before")
-            if abs(step) > JUMP:
+                samples = self._set_back.add(stamp, samples[0]) if step < 0 else []
+                if not samples:
+                    raise MessageError(f"a sample {step * 1e-6:.3f} ms after the one before")
+            self._set_back.end()
+            if not 0 < step <= JUMP:
                 self._samples.clear()
             self.last, self.frame = stamp, message.header.frame_id
-            self._samples.append((stamp, rates, forces))
+            self._samples.extend(samples)
 
     def take(self, stamp: int, until: int) -> Inertial | None:
         """Those up to `until` (ns) that were not taken before, for a scan with that stamp (ns); None if there are none

@@ -18,6 +18,8 @@ from dpm2_core.data.messages import serialized_stamp
 JUMP = 1_000_000_000
 """ns by which a stamp goes back, or ahead beyond the time that has passed, only if it is wrong or time itself has
 jumped: a looped bag, a clock that was set, a recording with a gap."""
+FEW = 3
+"""Stamps in a row that may be off; more are of a clock that was set."""
 LATE = 500_000_000
 """ns of log time that a cloud of a recording waits for what goes with it."""
 SWEEP = 250_000_000
@@ -65,6 +67,28 @@ class Beside:
         """A cloud with that stamp (ns) has left: drop what is too old for the next, or from before time went back."""
         while self._messages and not -self.tolerance <= self._messages[0][0] - stamp < JUMP:
             self._messages.popleft()
+
+
+class SetBack:
+    """What has come with an earlier stamp than what came before, until it shows that the clock was set back: more than
+    `FEW` in a row, each stamped later than the one before."""
+
+    def __init__(self) -> None:
+        self._late: list[tuple[int, Any]] = []
+
+    def add(self, stamp: int, item: Any) -> list[Any]:
+        """Take one with its stamp (ns); returns all of them once they show that, else none."""
+        if self._late and stamp <= self._late[-1][0]:
+            self._late.clear()
+        self._late.append((stamp, item))
+        if len(self._late) <= FEW:
+            return []
+        return self.end()
+
+    def end(self) -> list[Any]:
+        """One has come in order; returns what has come late before it."""
+        items, self._late = [item for _, item in self._late], []
+        return items
 
 
 def passed(last: float, cloud: int) -> bool:

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import STAMP_END, restamped, serialized_stamp
-from dpm2_core.data.pairing import RawMessage
+from dpm2_core.data.pairing import FEW, RawMessage
 from dpm2_core.data.source import Source, note_once
 from dpm2_core.frame import Array, Frame
 
 Item = TypeVar("Item")
 
-_FEW = 3  # in a row; more are a clock that was set
-_AROUND = 2 * _FEW + 1  # clouds on either side that show which of the stamps between them are off: more than may be
+_AROUND = 2 * FEW + 1  # clouds on either side that show which of the stamps between them are off: more than may be
 
 
 def out_of_order(times: Array) -> NDArray[np.bool_]:
@@ -32,7 +31,7 @@ def out_of_order(times: Array) -> NDArray[np.bool_]:
     ends = np.flatnonzero(ordered)
     off = np.zeros(len(times), bool)
     for before, after in pairwise(ends):
-        off[before + 1 : after] = after - before <= _FEW + 1
+        off[before + 1 : after] = after - before <= FEW + 1
     return off
 
 

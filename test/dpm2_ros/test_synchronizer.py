@@ -321,6 +321,24 @@ def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
         assert sum(synchronizer.counts.values()) == 5
 
 
+@pytest.mark.parametrize("back", [150, 250, 350, 500, 900])
+def test_a_clock_that_is_set_back_by_less_than_a_second_loses_nothing(back: int) -> None:
+    """As by an NTP client: the drive goes on, its clouds in the order in which they came."""
+    synchronizer = make(camera=False)
+    stamps = [9_901, 10_001, *(stamp - back for stamp in range(10_100, 11_600, 100))]
+    assert feed(synchronizer, *stamps) == [(stamp, False) for stamp in stamps]
+    assert synchronizer.counts[StampCheck.ACCEPTED] == len(stamps)
+
+
+def test_three_clouds_that_come_too_late_are_rejected() -> None:
+    """What was kept somewhere on the way, or comes from another publisher too: never more than three in a row."""
+    synchronizer = make(camera=False)
+    late = (9_500, 9_600, 9_700, 10_100, 9_800, 9_900, 10_000, 10_200, 10_140, 10_130, 10_120, 10_110, 10_300)
+    kept = [10_000, 10_100, 10_200, 10_300]
+    assert feed(synchronizer, 10_000, *late) == [(stamp, False) for stamp in kept]
+    assert synchronizer.counts[StampCheck.OUT_OF_ORDER] == 10
+
+
 def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
     """A recording with a gap, played without it; or a clock that was set."""
     stamps = (9_900, 10_000, 15_000, 15_100)

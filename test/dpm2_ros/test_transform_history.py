@@ -77,6 +77,17 @@ def test_time_that_goes_back_begins_anew_and_samples_out_of_order_are_left_out()
         history.lookup("odom", "base", SECOND // 4, TransformTree())
 
 
+def test_a_clock_that_is_set_back_by_less_than_a_second_tells_the_time() -> None:
+    """What was there at the same stamps before it was set is not there now."""
+    history, elsewhere = moving(*range(0, SECOND, SECOND // 20)), pose_to_msg(se3.exp([0, 0, 0, 7.0, 0, 0]))
+    for k in range(4):
+        before = history.lookup("odom", "base", SECOND // 2, TransformTree())[0]
+        np.testing.assert_allclose(before, truth(SECOND // 2))
+        history.add("odom", "base", SECOND // 2 + k * SECOND // 20, elsewhere)
+    after = history.lookup("odom", "base", SECOND // 2, TransformTree())[0]
+    np.testing.assert_allclose(after[:3, 3], [7.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf, 1e9])
 def test_a_sample_that_is_no_pose_is_named(number: float) -> None:
     history, bad = moving(0), pose_to_msg(np.eye(4))

@@ -204,6 +204,20 @@ def test_stamps_that_repeat_go_back_or_flood(bags: Any) -> None:
     assert found.stamps.tolist() == [8 * SECOND + 2 * 10**7]
 
 
+def test_a_clock_that_is_set_back_by_less_than_a_second_costs_no_sample(bags: Any) -> None:
+    """The first three may be late; from the fourth on all count, and those from before no longer do."""
+    buffer = ImuBuffer()
+    for k in range(-50, 1):
+        buffer.add(10 * SECOND + k * 10**7, imu(bags, 1))
+    for k in range(1, 4):
+        with pytest.raises(MessageError, match="ms after the one before"):
+            buffer.add(9_500_000_000 + k * 10**7, imu(bags, 2))
+    buffer.add(9_540_000_000, imu(bags, 2))
+    found = buffer.take(9_540_000_000, 9_600_000_000)
+    assert found is not None
+    assert found.stamps.tolist() == [9_500_000_000 + k * 10**7 for k in range(1, 5)]
+
+
 def test_memory_is_bounded_where_no_cloud_comes(bags: Any) -> None:
     buffer, message = ImuBuffer(), imu(bags, 1)
     for k in range(12_000):
