@@ -209,7 +209,9 @@ class ActiveMap:
             path = file_beside(folder)
             self._store.copy_to(path)
         file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
-        return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}"
+        untied = int((~self.mapper.placed).sum())
+        without = f"; map.ply and trajectory.tum without {untied} that no loop ties to the first" if untied else ""
+        return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}{without}"
 
     def finish(self) -> None:
         """Do what still waits; the file stays open."""

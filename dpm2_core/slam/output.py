@@ -77,10 +77,17 @@ def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array)
 def save_map(mapper: Mapper, directory: Path) -> None:
     """Write map.ply, trajectory.tum (one pose per keyframe) and pose_graph.g2o, each whole or not at all.
 
+    The graph has all keyframes, the others those whose place in the map is known, the trajectory one robot after the
+    other.
+
     Raises:
         UsageError: the folder cannot be made. Dpm2Error: a file could not be written; the old one survives.
     """
     make_folder(directory)
     write_ply(directory / "map.ply", mapper.cloud())
-    write_tum(directory / "trajectory.tum", [k.stamp for k in mapper.keyframes], mapper.poses)
+    ways: dict[str, list[int]] = {}
+    for node in np.flatnonzero(mapper.placed).tolist():
+        ways.setdefault(mapper.keyframes[node].robot, []).append(node)
+    nodes = [node for way in ways.values() for node in way]
+    write_tum(directory / "trajectory.tum", [mapper.keyframes[node].stamp for node in nodes], mapper.poses[nodes])
     mapper.write_g2o(directory / "pose_graph.g2o")

@@ -302,6 +302,7 @@ def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in [*keyframes(3), *keyframes(2)]:
         active.add(keyframe)
+    assert active.save().endswith("; map.ply and trajectory.tum without 2 that no loop ties to the first")
     active.close()
     result = check_map(tmp_path / "drive.dpm2map")
     assert (result.problems, result.keyframes) == ([], 5)
