@@ -29,6 +29,7 @@ from dpm2_ros.checks import MOST_TRANSFORMS
 from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
+from dpm2_ros.recorded_results import TF, is_result, odometry_frames, published_here, without_frames
 from dpm2_ros.runtime import STOP, end_ros, ros_context
 from dpm2_ros.tf import TFMessage
 
@@ -84,6 +85,7 @@ class BagPlayer:
             node.get_logger().info(f"{CLOCK} is that of the recording")
         self._clock = node.create_publisher(Clock, CLOCK, 10) if options.clock and not recorded else None
         self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
+        self._frames: set[str] = set()  # whose transforms are left to a node
         self._published: list[str] = []  # lines of the log
         self._clouds = 0
 
@@ -96,6 +98,8 @@ class BagPlayer:
         """
         self._publish_latched()
         self._await_subscribers()
+        if not self._options.topics:
+            self._leave_to_nodes()
         if self._lockstep is not None:
             self._lockstep.begin()
         count = played = self._play_once()
@@ -176,7 +180,8 @@ class BagPlayer:
     def _await_subscribers(self) -> None:
         """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
         options, log = self._options, self._node.get_logger()
-        clouds = [topic for topic in self._publishers if self._bag.types[topic] in CLOUDS] or list(self._publishers)
+        given = [topic for topic in self._publishers if not is_result(topic)] or list(self._publishers)
+        clouds = [topic for topic in given if self._bag.types[topic] in CLOUDS] or given
         awaited = "a subscriber" if options.subscribers == 1 else f"{options.subscribers} subscribers"
         awaited += f" named {options.listener}" * bool(options.listener) + f" to {', '.join(clouds)}"
         began, info = time.monotonic(), False
@@ -193,6 +198,18 @@ class BagPlayer:
         if self._lockstep is not None:
             self._lockstep.find(began + options.wait)
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
+
+    def _leave_to_nodes(self) -> None:
+        """What nodes of dpm2 publish now is not played beside it."""
+        left = published_here(self._node, self._timed)
+        if not left:
+            return
+        self._frames = odometry_frames(self._bag, left)
+        for topic in left:
+            self._timed.remove(topic)
+            self._node.destroy_publisher(self._publishers.pop(topic))
+        frames = f"; so are transforms from and to {', '.join(sorted(self._frames))}" if self._frames else ""
+        self._node.get_logger().warning(f"{', '.join(left)}: left out, as nodes publish these now{frames}")
 
     def _listeners(self, topics: Sequence[str]) -> int:
         """Subscriptions, or, of nodes with the name that is waited for, nodes: one robot may have two LiDARs."""
@@ -256,8 +273,10 @@ class BagPlayer:
             self._looked_at = (log_time - origin) * 1e-9
             if last is not None and log_time > last:
                 return
-            if log_time >= first:
-                yield topic, log_time, bytes(data)
+            if log_time < first:
+                continue
+            if played := without_frames(bytes(data), self._frames) if topic == TF and self._frames else bytes(data):
+                yield topic, log_time, played
 
     def _why_nothing(self) -> str:
         start, duration, at = self._options.start, self._options.duration, self._looked_at
