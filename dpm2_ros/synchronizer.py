@@ -137,9 +137,9 @@ class Synchronizer:
     def add_cloud(self, stamp: int, cloud: Any, now: float, clock: float = 0.0) -> StampCheck:
         """Take a cloud with its stamp (ns); `now` is when it arrived, `clock` as of `Bundle`."""
         self.last_arrival = now
-        if self._jumped is not None and self._newest is not None:
-            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp))
         bundle = Bundle(stamp, cloud, now, clock, restarted=False)
+        if self._jumped is not None and self._newest is not None:
+            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp), bundle)
         check = self._check(bundle)
         if check is StampCheck.JUMPED:
             self._jumped = bundle
@@ -161,8 +161,19 @@ class Synchronizer:
         """Whether the clouds from one that was out of order to this one came at the pace of their stamps, and more time
         has passed than these say since the last one in order: the clock was set back, and nothing was kept on the way.
         """
-        least = self._period / 2
-        return abs(self._ahead(bundle, late)) < least and self._ahead(bundle, self._newest) < -least
+        return self._on_pace(bundle, late) and self._ahead(bundle, self._newest) < -self._period / 2
+
+    def _came_at_once(self, bundle: Bundle, following: Bundle | None) -> bool:
+        """Whether one that is ahead came a period after the last, and the one after it at the pace of their stamps: the
+        clock was set; where clouds were lost or kept on the way one of the two is not so."""
+        last = self._newest
+        if last is None or following is None or bundle.stamp < last.stamp:
+            return False
+        return abs((bundle.arrival - last.arrival) * 1e9 / self._period - 1) < 0.5 and self._on_pace(following, bundle)
+
+    def _on_pace(self, bundle: Bundle, last: Bundle) -> bool:
+        """Whether the stamps have gone on from that cloud by as much as has passed."""
+        return abs(self._ahead(bundle, last)) < self._period / 3
 
     def due(self, stamp: int, now: float, clock: float = 0.0) -> bool:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
@@ -236,13 +247,14 @@ class Synchronizer:
         passed = max(bundle.arrival - last.arrival, bundle.clock - last.clock if last.clock else 0.0)
         return bundle.stamp - last.stamp - passed * 1e9
 
-    def _settle(self, true: bool) -> None:
-        """Accept or reject the cloud whose stamp jumped."""
+    def _settle(self, true: bool, following: Bundle | None = None) -> None:
+        """Accept or reject the cloud whose stamp jumped; `following`: the next one, where it is there."""
         bundle, self._jumped = self._jumped, None
         if bundle is None or self._newest is None:
             return
         bundle.restarted = true and bundle.stamp < self._newest.stamp
-        bundle.stepped = true and self._ahead(bundle, self._newest) > JUMP
+        ahead = self._ahead(bundle, self._newest)
+        bundle.stepped = true and (ahead > JUMP or self._came_at_once(bundle, following))
         self.counts[
             StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
         ] += 1
