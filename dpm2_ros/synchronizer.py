@@ -16,15 +16,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from dpm2_core.data.pairing import JUMP, Beside, SetBack, passed
+from dpm2_core.data.pairing import AHEAD, JUMP, Beside, SetBack, is_due, passed
 
 HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump."""
 FEW = 2
 """Clouds that may wait at least where they come faster than they can be processed."""
-AHEAD = 3
-"""Periods of the LiDAR by which a stamp may exceed the last one and the time that has passed since; `JUMP` at most. If
-the stamp of one cloud is wrong by less than that, the next ones may have to catch up with it."""
 PATIENCE = 5
 """Clouds in a row that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
 
@@ -169,7 +166,7 @@ class Synchronizer:
         last = self._newest
         if last is None or following is None or bundle.stamp < last.stamp:
             return False
-        return abs((bundle.arrival - last.arrival) * 1e9 / self._period - 1) < 0.5 and self._on_pace(following, bundle)
+        return is_due((bundle.arrival - last.arrival) * 1e9, self._period) and self._on_pace(following, bundle)
 
     def _on_pace(self, bundle: Bundle, last: Bundle) -> bool:
         """Whether the stamps have gone on from that cloud by as much as has passed."""

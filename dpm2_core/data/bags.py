@@ -21,7 +21,7 @@ from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
-from dpm2_core.data.pairing import JUMP, SWEEP, Beside, RawMessage, clouds_after_others
+from dpm2_core.data.pairing import AHEAD, JUMP, SWEEP, Beside, RawMessage, clouds_after_others, is_due
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import note_once
 from dpm2_core.data.time_order import in_order, note_corrected
@@ -92,7 +92,7 @@ class BagSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
-        before, recorded_before, count, known = None, 0, 0, self._calibration
+        before, recorded_before, period, count, known = None, 0, 0, 0, self._calibration
         found: Counter[str] = Counter()  # frames that have something of a topic
         self._imu.clear()
         self._gnss.clear()
@@ -104,7 +104,10 @@ class BagSource:
                 note_once(
                     self.notes, "time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s"
                 )
-            stepped = before is not None and (stamp - before) - (recorded - recorded_before) > JUMP
+            step, gone = (0, 0) if before is None else (stamp - before, recorded - recorded_before)
+            # By less than a second only where the cloud came when it was due: others may have been lost on the way.
+            stepped = step - gone > (min(AHEAD * period, JUMP) if is_due(gone, period) else JUMP)
+            period = period if stepped or step <= 0 else step
             frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._frames.up, stepped=stepped)
             before, recorded_before, count = stamp, recorded, count + 1
             found.update(image.camera.name for image in frame.images)

@@ -18,6 +18,9 @@ from dpm2_core.data.messages import serialized_stamp
 JUMP = 1_000_000_000
 """ns by which a stamp goes back, or ahead beyond the time that has passed, only if it is wrong or time itself has
 jumped: a looped bag, a clock that was set, a recording with a gap."""
+AHEAD = 3
+"""Periods of the LiDAR by which a stamp may exceed the last one and the time that has passed since; `JUMP` at most. If
+the stamp of one cloud is wrong by less than that, the next ones may have to catch up with it."""
 FEW = 3
 """Stamps in a row that may be off; more are of a clock that was set."""
 LATE = 500_000_000
@@ -89,6 +92,11 @@ class SetBack:
         """One has come in order; returns what has come late before it."""
         items, self._late = [item for _, item in self._late], []
         return items
+
+
+def is_due(passed: float, period: float) -> bool:
+    """Whether a cloud comes about one period after the last, when so much has passed (ns), whatever its stamp says."""
+    return 0.5 * period < passed < 1.5 * period
 
 
 def passed(last: float, cloud: int) -> bool:

@@ -50,6 +50,18 @@ def test_a_clock_that_was_set_is_told_from_a_pause_by_the_time_of_recording(bags
     assert [frame.stepped for frame in source.frames()] == [False, False, True, False, False, False]
 
 
+@pytest.mark.parametrize(
+    ("recorded", "stepped"), [((1.2, 1.3, 1.4), True), ((1.8, 1.9, 2.0), False), ((1.11, 1.2, 1.3), False)]
+)
+def test_a_clock_that_was_set_ahead_by_less_than_a_second_is_no_pause(
+    bags: Any, tmp_path: Path, recorded: tuple[float, ...], stepped: bool
+) -> None:
+    """Where the cloud was recorded when it was due: not after a pause, nor with what was kept on the way before it."""
+    times = zip((1.0, 1.1, *recorded), (1.0, 1.1, 1.8, 1.9, 2.0), strict=True)
+    source = BagSource(bags.write(tmp_path / "b", [(at, POINTS, bags.cloud(stamp)) for at, stamp in times]))
+    assert [frame.stepped for frame in source.frames()] == [False, False, stepped, False, False]
+
+
 def test_compressed_images(bags: Any, tmp_path: Path) -> None:
     data = cv2.imencode(".png", np.full((6, 8, 3), 33, np.uint8))[1].reshape(-1)
     compressed = bags.new("sensor_msgs/CompressedImage", header=bags.header(1, "cam"), format="png", data=data)
