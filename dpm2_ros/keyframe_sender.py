@@ -133,8 +133,10 @@ class KeyframeSender:
                 file.close(keep=late > lost)
                 if file.path is not None and late > lost:
                     self._log.warning(f"{late - lost} keyframes not delivered: sent at the next start from {file.path}")
-                if file.path is not None and lost:
-                    self._log.error(f"{lost} keyframes neither delivered nor in {file.path}: {file.problem}")
+                if lost:
+                    kept = "on the disk" if file.path is None else f"in {file.path}"
+                    why = file.problem or "ros.map_directory is empty"
+                    self._log.error(f"{lost} keyframes neither delivered nor {kept}: {why}")
 
     @staticmethod
     def _late(drive: Delivery) -> int:
@@ -149,6 +151,9 @@ class KeyframeSender:
                 return KeyframeFile(path)
             except (sqlite3.Error, OSError) as error:
                 self._log.error(f"{path}: {error}; keyframes that are not delivered end with this process")
+                file = KeyframeFile()
+                file.problem = str(error)
+                return file
         return KeyframeFile()
 
     def _left_behind(self) -> Iterator[Delivery]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -202,6 +203,24 @@ def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..
     file = KeyframeFile(path)
     assert len(file) == 6
     file.close(keep=False)
+
+
+@pytest.mark.parametrize("folder", ["", "file/map"])
+def test_keyframes_that_end_with_the_node_are_named(
+    rig: Callable[..., Rig], tmp_path: Path, capfd: pytest.CaptureFixture[str], folder: str
+) -> None:
+    """Without a folder to keep them in, or with one that cannot be made, and no mapper: gone without a word."""
+    (tmp_path / "file").touch()
+    directory = tmp_path / folder if folder else "''"
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", f"ros.map_directory:={directory}")
+    r.send_and_wait(*range(6))
+    expected = f"of 6 keyframes have arrived at the mapper{'; 6 keyframes in memory only' if folder else ''}"
+    assert r.status("mapper", saying(expected)).level == (DiagnosticStatus.ERROR if folder else DiagnosticStatus.OK)
+    r.harness.remove(r.node)
+    why = "Not a directory" if folder else "ros.map_directory is empty"
+    said = re.search("6 keyframes neither delivered nor on the disk: (.*)", capfd.readouterr().err)
+    assert said is not None
+    assert why in said[1]
 
 
 def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Rig]) -> None:
