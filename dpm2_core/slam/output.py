@@ -26,6 +26,10 @@ class TrajectoryRecorder:
         self.breaks = 0  # of the odometry, see `OdometryResult`
         self._T_odom_lidar: list[Array] = []
         self._keyframe: list[int] = []  # position of each keyframe among the frames
+        self._known = 0  # position of the last frame that was registered
+        self._begun: int | None = None  # of the first one after it that was at least held against a map
+        self._ended: list[int] = []  # the last frame before each break from which the way is known
+        self._began: list[int] = []  # the first one after each
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -37,8 +41,16 @@ class TrajectoryRecorder:
 
     def add(self, tracked: OdometryResult) -> None:
         """Take in the result of the next frame."""
+        position, registered = len(self), tracked.registration
+        if self._begun is None and (registered.ok or registered.method != "none"):
+            self._begun = position
+        if tracked.breaks > self.breaks and self._begun is not None:
+            self._ended.append(self._known)
+            self._began.append(self._begun)
+        if registered.ok:
+            self._known, self._begun = position, None
         if tracked.keyframe is not None:
-            self._keyframe.append(len(self.stamps))
+            self._keyframe.append(position)
         self.breaks = tracked.breaks
         self.stamps.append(tracked.stamp)
         self.index.append(tracked.index)
@@ -46,31 +58,49 @@ class TrajectoryRecorder:
 
     def poses(self, T_map_kf: Array) -> Array:
         """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimized poses of the keyframes."""
-        return corrected(np.array(self._T_odom_lidar).reshape(-1, 4, 4), np.array(self._keyframe, np.intp), T_map_kf)
+        T_odom_lidar = np.array(self._T_odom_lidar).reshape(-1, 4, 4)
+        if not self._keyframe:
+            return T_odom_lidar
+        at, keyframe = self._known_corrections()
+        corrections = T_map_kf @ se3.inverse(T_odom_lidar[self._keyframe])
+        return corrected(T_odom_lidar, at, corrections[keyframe])
+
+    def _known_corrections(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Positions of frames, ascending, and for each the keyframe as which it is corrected.
+
+        Across a break the odometry is a guess: a loop may move what comes after it by far more than what was before. So
+        the frames at both sides are corrected as the keyframe on theirs, if there is one.
+        """
+        positions, known = np.array(self._keyframe, np.intp), {(at, kf) for kf, at in enumerate(self._keyframe)}
+        for first, last in zip([None, *self._began], [*self._ended, None], strict=True):
+            own = np.flatnonzero((positions >= (first or 0)) & (positions <= (len(self) if last is None else last)))
+            if len(own) and first is not None:
+                known.add((first, int(own[0])))
+            if len(own) and last is not None:
+                known.add((last, int(own[-1])))
+        at, keyframe = np.array(sorted(known), np.intp).T
+        return at, keyframe
 
 
-def corrected(T_odom_lidar: Array, keyframes: NDArray[np.intp], T_map_kf: Array) -> Array:
-    """Odometry poses in the map frame, corrected as the keyframes around them were.
+def corrected(T_odom_lidar: Array, at: NDArray[np.intp], corrections: Array) -> Array:
+    """Odometry poses in the map frame, corrected as frames around them were.
 
-    The correction of a frame is interpolated between the keyframes before and after it: rigidly following one
-    keyframe would put steps into the trajectory where a loop was closed.
+    The correction of a frame is interpolated between those before and after it: rigidly following one would put steps
+    into the trajectory where a loop was closed.
 
     Args:
         T_odom_lidar: (N, 4, 4).
-        keyframes: (K,) ascending positions of the keyframes among them.
-        T_map_kf: (K, 4, 4) optimized poses of the keyframes.
+        at: (K,) ascending positions of frames whose corrections are known, at least one.
+        corrections: (K, 4, 4) T_map_odom of these.
 
     Returns:
-        (N, 4, 4) T_map_lidar; the odometry itself without any keyframe.
+        (N, 4, 4) T_map_lidar.
     """
-    if not len(keyframes):
-        return T_odom_lidar
-    corrections = T_map_kf @ se3.inverse(T_odom_lidar[keyframes])
     position = np.arange(len(T_odom_lidar))
-    before = np.clip(np.searchsorted(keyframes, position, side="right") - 1, 0, len(keyframes) - 1)
-    after = np.minimum(before + 1, len(keyframes) - 1)
-    span = np.maximum(keyframes[after] - keyframes[before], 1)
-    ratio = np.clip((position - keyframes[before]) / span, 0, 1)
+    before = np.clip(np.searchsorted(at, position, side="right") - 1, 0, len(at) - 1)
+    after = np.minimum(before + 1, len(at) - 1)
+    span = np.maximum(at[after] - at[before], 1)
+    ratio = np.clip((position - at[before]) / span, 0, 1)
     return se3.interpolated(corrections[before], corrections[after], ratio) @ T_odom_lidar
 
 

@@ -209,6 +209,22 @@ def test_corrections_reach_the_frames_between_keyframes() -> None:
     np.testing.assert_allclose(out[6:, 1, 3] - poses[6:, 1, 3], 1.0, atol=1e-9)
 
 
+def test_a_loop_after_a_break_moves_what_comes_after_it_alone() -> None:
+    """Frames 6 and 7 come after a pause that frame 8 gives up to bridge, and frame 10 is the next keyframe. Frames to
+    both sides were put on a line between the two keyframes: registered ones, that the loop has told the place of, were
+    off by as much as the guess across the pause was. What no scan tells, 4 and 5, is between the two still."""
+    recorder = TrajectoryRecorder()
+    poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0, 0.4, 0, 0]))
+    cloud = np.zeros((0, 4), np.float32)
+    for i, T in enumerate(poses):
+        keyframe = Keyframe(i // 10, i, i, T, cloud) if i in (0, 10) else None
+        how = replace(found(T, ok=i not in (4, 5, 6, 7)), method="none" if i in (4, 5) else "test")
+        recorder.add(replace(tracked(i, T, keyframe), registration=how, breaks=int(i >= 8)))
+    shift = se3.exp([0, 0, 0, 0, 30.0, 0])
+    out = recorder.poses(np.array([poses[0], shift @ poses[10]]))
+    np.testing.assert_allclose(out[:, 1, 3], [0, 0, 0, 0, 10, 20, *[30] * 6], atol=1e-9)
+
+
 def test_no_keyframe_no_correction() -> None:
     recorder = TrajectoryRecorder()
     recorder.add(tracked(0, np.eye(4), None))
