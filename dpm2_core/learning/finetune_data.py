@@ -3,29 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.pair_set import FAR, NEAR, has_pair
+from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
 from dpm2_core.learning.generate import check_same, generate, pack
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.graph.graph_data import components
 from dpm2_core.slam.settings import Config, SlamSettings
+
+_APART = 1e4  # m: no two frames of what has nothing to do with each other make a pair
 
 
 class Referenced:
     """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
 
-    def __init__(self, source: Source, poses: Array) -> None:
-        self.name, self.notes, self.poses, self.truth = source.name, source.notes, poses, "SLAM"
+    def __init__(self, source: Source, poses: Array, notes: Iterable[str] = ()) -> None:
+        """`notes`: what the SLAM found out about the drive."""
+        self.name, self.notes, self.poses, self.truth = source.name, [*notes], poses, "SLAM"
         self.T_cam_lidar = None
         self._source = source
 
@@ -37,13 +43,31 @@ class Referenced:
 
 
 def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
-    """The source with the trajectory that the SLAM finds for it, loops closed."""
+    """The source with the trajectory that the SLAM finds for it, loops closed.
+
+    Parts of the drive of which the SLAM does not know where they are to each other, as after a pause during which the
+    robot was carried away, are put far apart: each is a reference for itself.
+    """
     result = OfflineRun(source, Config(slam=settings)).run(lambda tracked: advance())
     if result.interrupted:  # half a reference is none
         raise KeyboardInterrupt
-    poses = result.poses.copy()
+    part, poses = _parts(result), result.poses.copy()
     poses[~np.array(result.registered, bool)] = np.nan
-    return Referenced(source, poses)
+    there = np.flatnonzero(known(poses))
+    last = there[:-1][np.diff(part[there]) != 0]
+    poses[last] = np.nan  # the motion during its sweep is that to the next one, and that is not known
+    poses[:, 0, 3] += _APART * part
+    count = len(np.unique(part[there]))
+    split = f"of {count} parts of the drive the SLAM does not know where they are to each other: each is for itself"
+    return Referenced(source, poses, [split] if count > 1 else [])
+
+
+def _parts(result: Result) -> NDArray[np.int32]:
+    """(N,) number of the part of a drive that each frame is in: breaks divide it, and loops tie together again."""
+    stretch = result.recorder.stretches
+    of = stretch[np.searchsorted(result.recorder.stamps, [keyframe.stamp for keyframe in result.mapper.keyframes])]
+    ties = [(of[loop.from_node], of[loop.to_node]) for loop in result.mapper.loops if loop.ok]
+    return components(int(stretch[-1]) + 1, np.array(ties, np.intp).reshape(-1, 2))[stretch]
 
 
 def prepare(
@@ -53,7 +77,7 @@ def prepare(
     """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
 
     Returns:
-        Notes: of which drives the part that is held out has nothing to measure.
+        Notes: what the SLAM found out about drives, and of which the part that is held out has nothing to measure.
 
     Raises:
         UsageError: the SLAM could hardly follow a drive, or one that is there is another one or of other settings.
@@ -70,6 +94,7 @@ def prepare(
             check_same(out / DRIVES / name, asked)
             continue
         referenced = refer(source, slam, partial(advance, f"{name}: reference by SLAM"))
+        notes += [f"{name}: {text}" for text in referenced.notes]
         followed = int(known(referenced.poses).sum())
         if followed < 2 * settings.frames:
             raise UsageError(f"{source.name}: the SLAM followed {followed} of {len(source)} scans; nothing to learn")

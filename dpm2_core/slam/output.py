@@ -56,6 +56,11 @@ class TrajectoryRecorder:
         self.index.append(tracked.index)
         self._T_odom_lidar.append(tracked.T_odom_lidar)
 
+    @property
+    def stretches(self) -> NDArray[np.intp]:
+        """(N,) breaks before each frame: those of two numbers are related by loops alone, if at all."""
+        return np.searchsorted(self._began, np.arange(len(self)), side="right")
+
     def poses(self, T_map_kf: Array) -> Array:
         """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimized poses of the keyframes."""
         T_odom_lidar = np.array(self._T_odom_lidar).reshape(-1, 4, 4)
