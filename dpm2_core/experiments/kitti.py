@@ -12,8 +12,10 @@ from dpm2_core.evaluation.run_folder import read_run
 from dpm2_core.evaluation.run_page import aligned
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
+    FAILED,
     SHOWN,
     cells,
+    failed_note,
     missing_note,
     own_part,
     peer_names,
@@ -55,7 +57,7 @@ def _parts(request: Request, paper: Sequence[str], settings: Sequence[str] = ())
 def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     sequences = present(request, TESTED, ORIGINAL_POSES)
     title = "KITTI odometry: t_err % / r_err deg per 100 m"
-    caption = "KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences."
+    caption = f"KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences. {FAILED}"
     table = ResultTable(title, [*sequences, MEAN], SHOWN, caption)
     speed = ResultTable("APE rmse m / frames per s", [*sequences, MEAN], _SPEED,
                         "APE: positions after SE(3) alignment; frames per second: processing alone, of each of"
@@ -63,7 +65,8 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
         for rows in (table, speed):
-            rows.add(name, cells(name, sequences, figures, list(rows.figures)))
+            note = failed_note(name, sequences, figures)
+            rows.add(name, cells(name, sequences, figures, list(rows.figures)), note=note)
     table.add("DeepPointMap2", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
     notes = missing_note(sequences, TESTED)
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
@@ -76,10 +79,12 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
 def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     sequences = present(request, TESTED_360)
     title = "KITTI-360: APE mean m / APE rmse m / t_err % / r_err deg per 100 m"
-    table = ResultTable(title, [*sequences, MEAN], _APE, "APE: positions after SE(3) alignment, of the known poses.")
+    caption = f"APE: positions after SE(3) alignment, of the known poses. {FAILED}"
+    table = ResultTable(title, [*sequences, MEAN], _APE, caption)
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
-        table.add(name, cells(name, sequences, figures, list(_APE)))
+        note = failed_note(name, sequences, figures)
+        table.add(name, cells(name, sequences, figures, list(_APE)), note=note)
     for name, ape in (("DeepPointMap2", 26.00), ("DeepPointMap", 93.77)):
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)

@@ -13,8 +13,10 @@ from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
+    FAILED,
     SHOWN,
     cells,
+    failed_note,
     missing_note,
     own_part,
     present,
@@ -79,7 +81,7 @@ def _parts(request: Request) -> Sequence[Sequence[Part]]:
 
 def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     sequences = present(request, TESTED, ORIGINAL_POSES)
-    caption = "KITTI metric; change: of the mean t_err from the row that is whole. Hit frames are drawn with seed 0."
+    caption = f"KITTI metric; change: of the mean t_err from the whole row. Hit frames are drawn with seed 0. {FAILED}"
     table = ResultTable("Failing sensors: t_err % / r_err deg per 100 m", [*sequences, MEAN], SHOWN, caption)
     variants = _variants(request)
     changes: dict[str, float | None] = {}
@@ -89,9 +91,11 @@ def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
         mean = table.value(table.rows[-1], MEAN, "t_err_percent")
         whole = mean if corrupt is None else whole
         change = 100 * (mean / whole - 1) if mean is not None and whole else None
+        notes = [failed_note(name, sequences, figures)]
         if corrupt is not None:
             changes[name] = change
-            table.rows[-1] = replace(table.rows[-1], note="" if change is None else f"{change:+.0f} %")
+            notes = ["" if change is None else f"{change:+.0f} %", *notes]
+        table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, notes)))
     table.add("DeepPointMap2, whole", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
     for kind, means in _PAPER_MEAN.items():
         for share, mean in zip(SHARES, means, strict=True):

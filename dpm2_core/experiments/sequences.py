@@ -18,6 +18,8 @@ from dpm2_core.fleet.part import Figures, Part
 
 SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
 """Figures of the KITTI metric, and how they are printed."""
+FAILED = "Failed: frames that were only predicted, or have no pose and so no part in the figures."
+"""What `failed_note` means."""
 
 
 def reading(request: Request, sequence: str, settings: Sequence[str] = ()) -> list[str]:
@@ -106,6 +108,13 @@ def cells(name: str, sequences: Sequence[str], figures: Mapping[str, Figures], s
         sequence: {figure: figures[f"{_folder(name)}/{sequence}"].get(figure) for figure in shown}
         for sequence in sequences
     }
+
+
+def failed_note(name: str, sequences: Sequence[str], figures: Mapping[str, Figures]) -> str:
+    """What is to be said beside a row: how many frames of which sequences have no pose of their own."""
+    of = {sequence: figures[f"{_folder(name)}/{sequence}"] for sequence in sequences}
+    found = [f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in of.items() if f["failed_frames"]]
+    return f"failed: {', '.join(found)}" if found else ""
 
 
 def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> list[tuple[str, Path]]:

@@ -14,8 +14,10 @@ from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
 from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
+    FAILED,
     SHOWN,
     cells,
+    failed_note,
     learned_note,
     missing_note,
     own_part,
@@ -107,11 +109,14 @@ class VariantTable:
         notes = learned_note(_learned(request), sequences)
         tables = []
         if self.judged:
-            table = ResultTable(self.title, [*sequences, MEAN], SHOWN, "t_err % / r_err deg per 100 m, network alone.")
+            caption = f"t_err % / r_err deg per 100 m, network alone. {FAILED}"
+            table = ResultTable(self.title, [*sequences, MEAN], SHOWN, caption)
             for variant in self.variants:
                 random = len(figures[self._training(variant)]["random_at_start"])
-                note = f"{random} tensors began at random" if random else ""
-                table.add(variant, cells(self._name(variant), sequences, figures, list(SHOWN)), note=note)
+                name = self._name(variant)
+                about = [f"{random} tensors began at random" if random else "", failed_note(name, sequences, figures)]
+                note = "; ".join(filter(None, about))
+                table.add(variant, cells(name, sequences, figures, list(SHOWN)), note=note)
             for variant, row in self.paper.items():
                 there = {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True) if s in sequences}
                 table.add(variant, there, "the paper")

@@ -72,6 +72,22 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_program_that_was_lost_has_no_better_row_without_a_word(kitti: Path, tmp_path: Path) -> None:
+    """Its figures are of the frames until then: of half a drive, they stood beside those of whole ones."""
+    truth = read_trajectory(kitti / "poses" / "06.txt").poses
+    for name, count in (("whole", 6), ("lost", 4)):
+        write_tum(tmp_path / f"{name}.tum", np.arange(count) * 10**8, truth[:count])
+    peers = [word for name in ("whole", "lost") for word in ("--peer", f"{name}={tmp_path}/{name}.tum")]
+    out = tmp_path / "out"
+    done = dpm2("experiment", "kitti", kitti, "--out", out, "--lengths", "2", "--sequences", "06", *QUICK, *peers)
+    assert done.returncode == 0, done.stderr
+    for table in json.loads((out / "kitti.json").read_text())["tables"]:
+        notes = {row["name"]: row["note"] for row in table["rows"]}
+        assert (notes["whole"], notes["lost"]) == ("", "failed: 2 of 6 frames of 06")
+    assert "2 of 6 frames of 06" in done.stdout
+
+
+@pytest.mark.slow
 def test_kitti_360_by_mean_position_error(recording: Path, tmp_path: Path) -> None:
     data = kitti_360(recording, tmp_path / "data", ("0007",), 8)
     out = tmp_path / "out"
