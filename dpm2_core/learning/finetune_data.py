@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.graph.graph_data import components
 from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.system import SlamResult
 
 _APART = 1e4  # m: no two frames of what has nothing to do with each other make a pair
 
@@ -29,26 +31,35 @@ _APART = 1e4  # m: no two frames of what has nothing to do with each other make 
 class Referenced:
     """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
 
-    def __init__(self, source: Source, poses: Array, notes: Iterable[str] = ()) -> None:
-        """`notes`: what the SLAM found out about the drive."""
+    def __init__(self, source: Source, poses: Array, notes: Iterable[str] = (), timed: bool = True) -> None:
+        """`notes`: what the SLAM found out about the drive. `timed`: whether the times of its points are right."""
         self.name, self.notes, self.poses, self.truth = source.name, [*notes], poses, "SLAM"
         self.T_cam_lidar = None
-        self._source = source
+        self._source, self._timed = source, timed
 
     def __len__(self) -> int:
         return len(self._source)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        yield from self._source.frames(start, stop)
+        for frame in self._source.frames(start, stop):
+            yield frame if self._timed else replace(frame, time_offset=None)
 
 
 def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
     """The source with the trajectory that the SLAM finds for it, loops closed.
 
     Parts of the drive of which the SLAM does not know where they are to each other, as after a pause during which the
-    robot was carried away, are put far apart: each is a reference for itself.
+    robot was carried away, are put far apart: each is a reference for itself. Times of points that the motion has
+    contradicted, as of clouds that were de-skewed already, are taken away.
     """
-    result = OfflineRun(source, Config(slam=settings)).run(lambda tracked: advance())
+    times = ""
+
+    def step(tracked: SlamResult) -> None:
+        nonlocal times
+        times = tracked.odometry.times
+        advance()
+
+    result = OfflineRun(source, Config(slam=settings)).run(step)
     if result.interrupted:  # half a reference is none
         raise KeyboardInterrupt
     part, poses = _parts(result), result.poses.copy()
@@ -57,9 +68,12 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
     last = there[:-1][np.diff(part[there]) != 0]
     poses[last] = np.nan  # the motion during its sweep is that to the next one, and that is not known
     poses[:, 0, 3] += _APART * part
-    count = len(np.unique(part[there]))
-    split = f"of {count} parts of the drive the SLAM does not know where they are to each other: each is for itself"
-    return Referenced(source, poses, [split] if count > 1 else [])
+    notes = []
+    if (count := len(np.unique(part[there]))) > 1:
+        notes.append(f"where {count} parts of the drive are to each other the SLAM does not know: each is for itself")
+    if times:
+        notes.append("the times of the points are not used, the motion contradicts them")
+    return Referenced(source, poses, notes, timed=not times)
 
 
 def _parts(result: Result) -> NDArray[np.int32]:
