@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from dpm2_core.files import write_json
+from dpm2_core.files import make_folder, write_json
 from dpm2_core.fleet.cluster import Cluster, Job, Status
 from dpm2_core.fleet.part import Figures, Part, do_part, figures_of, remove_attempts
 from dpm2_core.tables import FigureTable
@@ -41,7 +42,8 @@ class View:
 
 
 def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | None = None) -> list[Outcome]:
-    """Do all parts that are not whole yet and write OUT/fleet.json; Ctrl-C ends it early, and the rest is "stopped".
+    """Do all parts that are not whole yet and write OUT/fleet.json; Ctrl-C ends it early, and the rest is "stopped", as
+    it is in the file until it ends.
 
     Args:
         cluster: not entered yet.
@@ -49,10 +51,27 @@ def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | N
     Raises:
         UsageError: no Ray. Dpm2Error: the folder or the summary cannot be written.
     """
+    out = out.resolve()  # a worker has another working directory
+    make_folder(out)
+    kept = [(part.name, figures_of(part, out)) for part in parts]
+    _write(out, [Outcome(name, "stopped" if figures is None else "kept", figures) for name, figures in kept])
     with cluster:
-        found = do_parts(parts, out.resolve(), cluster, view or View())  # a worker has another working directory
-    write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in found]})
+        found = do_parts(parts, out, cluster, view or View())
+    _write(out, found)
     return found
+
+
+def _write(out: Path, outcomes: Sequence[Outcome]) -> None:
+    write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in outcomes]})
+
+
+def not_done(out: Path) -> dict[str, str]:
+    """Drives that were asked for last, but not done, with the reason: what is there of them is of other settings."""
+    try:
+        rows = json.loads((out / SUMMARY).read_text(encoding="utf-8"))["drives"]
+        return {row["name"]: row["reason"] or row["state"] for row in rows if row["state"] in ("failed", "stopped")}
+    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: nothing is known
+        return {}
 
 
 def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> list[Outcome]:

@@ -22,7 +22,7 @@ from dpm2_core.fleet.joins import ENOUGH, edge_from, join_part, stretches
 from dpm2_core.fleet.part import Figures, Part, is_whole
 from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
 from dpm2_core.fleet.regions import Join, first_nodes, owners
-from dpm2_core.fleet.run import Outcome, View, do_parts
+from dpm2_core.fleet.run import Outcome, View, do_parts, not_done
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings
@@ -52,10 +52,12 @@ class Search:
 
     def drives(self, left_out: dict[str, str]) -> dict[str, Part]:
         """The part that reads the places of each drive that is whole, in the order of their names."""
-        found = {}
+        found, missing = {}, not_done(self.folder)
         for path in sorted(self.folder.glob(f"*/{MAP}")):
             name = path.parent.name
-            if is_whole(path.parent):
+            if name in missing:
+                left_out[name] = f"not done as it was asked for last: {missing[name]}"
+            elif is_whole(path.parent):
                 found[name] = places_part(name, path)
             else:
                 left_out[name] = "not whole: it is being written, or was cut short"

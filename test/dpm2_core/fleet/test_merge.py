@@ -16,14 +16,14 @@ import pytest
 from benchmarks.fleet_drives import poses_of, write_drive
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.fleet.cluster import Cluster, Ended, Job
+from dpm2_core.fleet.cluster import Cluster, Ended, Job, Watch
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, stretches
 from dpm2_core.fleet.merge import merge
-from dpm2_core.fleet.part import DONE, Figures, Part
+from dpm2_core.fleet.part import DONE, Advance, Figures, Part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.regions import Join
-from dpm2_core.fleet.run import View
+from dpm2_core.fleet.run import View, carry_out
 from dpm2_core.fleet.search import Search
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
@@ -221,6 +221,51 @@ def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         merge(tmp_path, tmp_path / "town", SlamSettings(), Stopped())
     assert not (tmp_path / "town").exists()
+
+
+class AtOnce(Cluster):
+    """Does its jobs here, until one is interrupted."""
+
+    def run(self, jobs: Iterable[Job], watch: Watch = lambda status: None) -> Iterator[Ended]:
+        for job in jobs:
+            try:
+                yield Ended(job.key, job.function(*job.arguments, advance=lambda done, total: None))
+            except Dpm2Error as error:
+                yield Ended(job.key, None, str(error))
+
+
+def leave_a_map(folder: Path, advance: Advance, voxel: float, end: str) -> Figures:
+    """The work of a part: all that a merge looks at, or what keeps it from that."""
+    if end == "stopped":
+        raise KeyboardInterrupt
+    if end == "failed":
+        raise Dpm2Error("no such recording")
+    (folder / MAP).write_text(f"{voxel}")
+    return {}
+
+
+def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tmp_path: Path) -> None:
+    """Drives that failed or were not reached when they were asked for with other settings had their old maps still, and
+    these were joined with those of the new settings without a word."""
+
+    def run(voxel: float, ends: dict[str, str]) -> list[str]:
+        work = f"{__name__}:leave_a_map"
+        parts = [Part(name, work, {"voxel": voxel, "end": end}, fresh=True) for name, end in ends.items()]
+        return [outcome.state for outcome in carry_out(parts, tmp_path, AtOnce())]
+
+    def joined() -> tuple[list[str], dict[str, str]]:
+        left_out: dict[str, str] = {}
+        return list(Search(tmp_path, SlamSettings(), Cluster(), View()).drives(left_out)), left_out
+
+    assert run(0.2, {"a": "", "b": "", "c": ""}) == ["done"] * 3
+    assert joined() == (["a", "b", "c"], {})
+    assert run(0.4, {"a": "", "b": "failed", "c": "stopped"}) == ["done", "failed", "stopped"]
+    names, left_out = joined()
+    assert names == ["a"]
+    assert left_out["b"] == "not done as it was asked for last: no such recording"
+    assert left_out["c"] == "not done as it was asked for last: stopped"
+    assert run(0.2, {"b": "", "c": ""}) == ["kept", "kept"]
+    assert joined()[0] == ["a", "b", "c"]
 
 
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
