@@ -26,7 +26,7 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
     Raises:
         UsageError: one has no values, or one key is given twice.
     """
-    keys = [setting.partition("=")[0].strip() for setting in settings]
+    keys = [_key(setting) for setting in settings]
     if twice := {key for key in keys if keys.count(key) > 1}:
         raise UsageError(f"--set {min(twice)}: given twice; all its values belong to one, with commas")
     out = {}
@@ -35,6 +35,10 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
         # No two have one name: each with its whole key, and % for what a folder's name cannot have.
         out[" ".join(chosen).replace("%", "%25").replace("/", "%2F")] = chosen
     return out
+
+
+def _key(setting: str) -> str:
+    return setting.partition("=")[0].strip()
 
 
 def _values(setting: str) -> list[str]:
@@ -51,8 +55,12 @@ def sweep_parts(
     """A part for each drive with each combination of `variants`.
 
     Raises:
-        UsageError: a setting that there is not.
+        UsageError: a setting that there is not, or that a drive of a list has one value of its own for.
     """
+    keys = {_key(setting) for overrides in settings.values() for setting in overrides}
+    for drive in drives:
+        if own := [setting for setting in drive.set if _key(setting) in keys]:
+            raise UsageError(f"{drive.name}: has {own[0]} of its own, which would count for more than all of --set")
     for name, overrides in settings.items():
         yield from parts_of(drives, config, overrides, f"{name}/")
 

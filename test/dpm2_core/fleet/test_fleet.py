@@ -18,9 +18,9 @@ import pytest
 
 from dpm2_core.errors import UsageError
 from dpm2_core.fleet.cluster import Cluster, Job
-from dpm2_core.fleet.drives import MAP, parts_of, read_drives
+from dpm2_core.fleet.drives import MAP, ManifestDrive, parts_of, read_drives
 from dpm2_core.fleet.run import SUMMARY, carry_out
-from dpm2_core.fleet.sweep import variants
+from dpm2_core.fleet.sweep import sweep_parts, variants
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_store import MapStore
 
@@ -169,6 +169,13 @@ def test_a_sweep_has_a_row_for_each_combination(cluster: Cluster, drives: list[P
 def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         variants(settings)
+
+
+def test_a_drive_with_its_own_value_of_what_is_swept_is_an_error_of_use(tmp_path: Path) -> None:
+    """Its own counts for more, so all its rows were the same: as if the setting made no difference."""
+    drives = [ManifestDrive(path="x", name="x", set=("slam.map.voxel=0.3", "slam.keyframes.distance = 5"))]
+    with pytest.raises(UsageError, match=r"^x: has slam\.keyframes\.distance = 5 of its own"):
+        list(sweep_parts(drives, tmp_path / "base.yaml", variants(["slam.keyframes.distance=4,6"])))
 
 
 def test_values_of_a_sweep_may_be_lists() -> None:
