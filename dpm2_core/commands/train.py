@@ -184,6 +184,8 @@ def ablation(
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:
         raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
+    for name, folder in chosen.measure.items():
+        say_packed(f"measure.{name}", Path(folder), chosen.training.data.packed)
     found = compare(chosen, out)
     results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
     write_record(report, "ablation", results)
@@ -206,11 +208,23 @@ def _begin(
     read = [weights_path(settings.start)] if settings.start else []
     begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
     if validation := getattr(settings, "validation", ""):  # the training of the image branch has none
-        measured = {drive.folder.resolve(): drive.name for drive in open_packed(Path(validation))}
-        learned = {
-            d.folder.resolve() for folder, found in drives.items() if settings.data.packed[folder] for d in found
-        }
-        say_learned(f"validation {validation} is what the network", measured, learned)
+        say_packed(f"validation {validation}", Path(validation), settings.data.packed)
+
+
+def say_packed(what: str, folder: Path, packed: Mapping[str, float]) -> None:
+    """Say which packed drives below a folder hold scans that are learned from, also where these were packed anew.
+
+    Args:
+        packed: folders that are learned from, with their weights; those of none are not.
+    """
+    from dpm2_core.data.packed import open_packed, scans_of
+
+    learned = {
+        scan for of, weight in packed.items() if weight for drive in open_packed(Path(of)) for scan in scans_of(drive)
+    }
+    measured = open_packed(folder)
+    both = {drive.folder.resolve() for drive in measured if not learned.isdisjoint(scans_of(drive))}
+    say_learned(f"{what} is what the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
 
 
 def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:

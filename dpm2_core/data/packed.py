@@ -221,6 +221,13 @@ def open_packed(root: Path) -> list[PackedDrive]:
     return found
 
 
+def scans_of(drive: PackedDrive) -> set[bytes]:
+    """What tells each scan from all others, also where a part of the drive is packed again: where it was taken, and how
+    many points it has. Those at the origin do not count, at which many drives begin."""
+    counts = np.diff(drive.offsets)
+    return {t.tobytes() + n.tobytes() for t, n in zip(drive.poses[:, :3, 3], counts, strict=True) if t.any()}
+
+
 def packed_digest(drives: Iterable[PackedDrive]) -> str:
     """What drives hold, in 16 characters: how many points each frame has, where it is, and the images of the first and
     the last: the same world in other weather has the same points."""

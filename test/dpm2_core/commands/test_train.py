@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from dpm2_core.data.packed import Sample, write_packed
+from dpm2_core.geometry import se3
+
 from ...helpers.command import dpm2
 from ...helpers.networks import TINY
 from ..tasks.conftest import labelled_drive, write_pairs
@@ -67,20 +70,26 @@ def test_pairs_that_are_measured_on_and_learned_from_are_named(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_packed_drives_of_a_validation_that_are_learned_from_are_named(packed: Path, tmp_path: Path) -> None:
-    """Not those of no weight."""
-    elsewhere = shutil.copytree(packed, tmp_path / "elsewhere")
+def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
+    packed: Path, samples: list[Sample], tmp_path: Path
+) -> None:
+    """Not those of no weight; but a part that was packed anew: the same scans, whose figures said nothing."""
+    elsewhere, again = tmp_path / "elsewhere", tmp_path / "again"
+    north = se3.exp([0, 0, 0, 0, 100, 0])
+    write_packed(elsewhere / "world", [s._replace(pose=north @ s.pose) for s in samples], {"source": "boxes"})
+    write_packed(again / "world", [samples[i] for i in (0, 1, 5)], {"source": "boxes"})
     tree = {
         "network": TINY, "validation_pairs": 2, "pairs": 1, "data": {"groups": 1, "frames": 2, "workers": 0},
         "optimiser": {"steps": 1, "compile": False, "warmup": 0},
     }  # fmt: skip
     (tmp_path / "asked.yaml").write_text(json.dumps(tree))
-    for number, (weight, validation, said) in enumerate([(1, packed, 1), (0, packed, 0), (1, elsewhere, 0)]):
+    cases = [(1, packed, 1), (0, packed, 0), (1, elsewhere, 0), (1, again, 1)]
+    for number, (weight, validation, said) in enumerate(cases):
         drives = json.dumps({str(packed): weight, **({} if weight else {str(elsewhere): 1})})
         call = ("train", "phase1", "--config", tmp_path / "asked.yaml", "--out", tmp_path / f"out{number}")
         done = dpm2(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
         assert done.returncode == 0, done.stderr
-        assert notes(done.stderr) == [f"note: validation {packed} is what the network learns from"] * said
+        assert notes(done.stderr) == [f"note: validation {validation} is what the network learns from"] * said
 
 
 @pytest.mark.weights
