@@ -20,18 +20,17 @@ from rosgraph_msgs.msg import Clock
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag, open_bag
-from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUDS
+from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS
+from dpm2_core.data.messages import rigid_parts
 from dpm2_core.data.prefetch import prefetch
-from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
-from dpm2_ros.checks import MOST_TRANSFORMS
-from dpm2_ros.conversions import stamp_to_msg
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
 from dpm2_ros.recorded_results import TF, is_result, odometry_frames, published_here, without_frames
 from dpm2_ros.runtime import STOP, end_ros, ros_context
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.stamps import stamp_to_msg
+from dpm2_ros.tf_message import MOST_TRANSFORMS, TFMessage
 
 CLOCK = "/clock"
 LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
@@ -170,7 +169,7 @@ class BagPlayer:
         for stamped in message.transforms:
             child = stamped.child_frame_id
             try:
-                transform_matrix(stamped.transform)
+                rigid_parts(stamped.transform)
             except UsageError as error:
                 log.warning(f"{topics.TF_STATIC}: {printable(child)} is left out: {error}", once=True)
             else:

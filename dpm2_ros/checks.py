@@ -12,11 +12,10 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError, check_pose
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_ros.conversions import check_frame
+from dpm2_ros.tf_message import MOST_TRANSFORMS
 
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 2000
-MOST_TRANSFORMS = 500
-"""In a message that is read."""
 
 
 def check_header(header: Any) -> None:

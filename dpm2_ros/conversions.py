@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.rows import MAX_ID
+from dpm2_ros.stamps import stamp_to_msg
 
 _KEYFRAME = re.compile(
     r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}-?))?", re.ASCII
@@ -37,12 +37,6 @@ _KEYFRAME = re.compile(
 EARLIER = "-"
 _FRAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")
 _SWAP = np.roll(np.eye(6), 3, axis=0)  # [rotation, translation] to [translation, rotation], and its own inverse
-
-
-def stamp_to_msg(stamp: int) -> Time:
-    """ns to builtin_interfaces/Time; a stamp beyond its 32-bit seconds is held at the limit."""
-    seconds, nanoseconds = divmod(stamp, 10**9)
-    return Time(sec=int(np.clip(seconds, -(2**31), 2**31 - 1)), nanosec=nanoseconds)
 
 
 def header(stamp: int, frame_id: str) -> Header:

@@ -18,7 +18,7 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dpm2_core.data.bag_file import Bag
-from dpm2_core.data.bag_topics import CAMERA_INFO, CLOUDS, FIX, IMAGES, IMU
+from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS, FIX, IMAGES, IMU
 from dpm2_core.data.messages import serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import SWEEP, RawMessage, clouds_after_others, passed
 from dpm2_core.errors import Dpm2Error

@@ -26,7 +26,7 @@ from dpm2_ros.guard import GuardedNode
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import STEADY
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from dpm2_ros.transform_history import TransformHistory
 
 WAIT = 0.1

@@ -34,7 +34,7 @@ from dpm2_ros.losses import Losses
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 OTHER_FRAME = 2.0
 """s without a cloud after which one in another frame begins another drive."""

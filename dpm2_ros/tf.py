@@ -1,20 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/tf, where tf2_msgs is there: part of every ROS installation, built by `dpm2_ros.build_tf2_msgs` for ROS from pip."""
+"""/tf, where its message is there."""
 
 from __future__ import annotations
-
-from contextlib import suppress
-from typing import Any
 
 from rclpy.node import Node
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import transform_to_msg
-
-TFMessage: Any = None
-with suppress(ImportError):
-    from tf2_msgs.msg import TFMessage  # type: ignore[no-redef]
+from dpm2_ros.tf_message import TFMessage
 
 
 class TransformBroadcaster:

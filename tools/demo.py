@@ -31,7 +31,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import corrected
 from dpm2_core.tables import FigureTable
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from tools.replay import Replay, replay
 
 QUEUE = 50

@@ -181,7 +181,7 @@ class _Listener:
         from sensor_msgs.msg import PointCloud2
 
         from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
-        from dpm2_ros.tf import TFMessage
+        from dpm2_ros.tf_message import TFMessage
 
         ros_context([])
         self._node = rclpy.create_node("replay_listener")

@@ -12,19 +12,10 @@ from dpm2_core.data import topics
 from dpm2_core.data.bag_file import Bag
 from dpm2_core.data.frames import CameraTopic
 from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside, is_depth
-from dpm2_core.data.livox import LIVOX
+from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS, FIX, IMAGES, IMU, TRUTHS
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
-
-CLOUD = "sensor_msgs/msg/PointCloud2"
-CLOUDS = (CLOUD, *LIVOX)
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-IMU = "sensor_msgs/msg/Imu"
-FIX = "sensor_msgs/msg/NavSatFix"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-PATH = "nav_msgs/msg/Path"
-_TRUTH = ("nav_msgs/msg/Odometry", PATH)
 
 
 class TopicChoice:
@@ -106,7 +97,7 @@ class TopicChoice:
 
     def truth(self) -> str:
         """Topic of the ground truth, empty without any."""
-        asked, found = self._settings.ground_truth_topic, self._bag.topics(*_TRUTH)
+        asked, found = self._settings.ground_truth_topic, self._bag.topics(*TRUTHS)
         if asked and asked not in found:
             raise UsageError(f"{self._path}: no Odometry or Path messages on {asked}; {self._contents()}")
         return next((topic for topic in (asked, *topics.TRUTHS) if topic in found), "")

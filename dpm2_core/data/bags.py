@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
-from dpm2_core.data.bag_topics import CLOUDS, IMAGES, PATH, TopicChoice
+from dpm2_core.data.bag_topics import TopicChoice
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
+from dpm2_core.data.message_kinds import CLOUDS, IMAGES, PATH
 from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import AHEAD, JUMP, SWEEP, Beside, RawMessage, clouds_after_others, is_due
 from dpm2_core.data.settings import InputSettings

@@ -34,6 +34,20 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
+def rigid_parts(transform: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """geometry_msgs/Transform or Pose to its quaternion (4,), x, y, z, w, and translation (3,).
+
+    Raises:
+        UsageError: the quaternion is zero or anything is not finite.
+    """
+    t = transform.translation if hasattr(transform, "translation") else transform.position
+    q = transform.rotation if hasattr(transform, "rotation") else transform.orientation
+    quaternion, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
+    if not (np.linalg.norm(quaternion) > 1e-6 and np.isfinite(quaternion).all() and np.isfinite(translation).all()):
+        raise UsageError(f"no rigid transform: rotation {quaternion.tolist()}, translation {translation.tolist()}")
+    return quaternion, translation
+
+
 STAMP_END = 2**31 * 1_000_000_000
 """ns before which the stamp of a header is: in 2038."""
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.data.messages import rigid_parts
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -23,11 +24,7 @@ def transform_matrix(transform: Any) -> Array:
     Raises:
         UsageError: the quaternion is zero or anything is not finite.
     """
-    t = transform.translation if hasattr(transform, "translation") else transform.position
-    q = transform.rotation if hasattr(transform, "rotation") else transform.orientation
-    quaternion, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
-    if not (np.linalg.norm(quaternion) > 1e-6 and np.isfinite(quaternion).all() and np.isfinite(translation).all()):
-        raise UsageError(f"no rigid transform: rotation {quaternion.tolist()}, translation {translation.tolist()}")
+    quaternion, translation = rigid_parts(transform)
     return se3.make(Rotation.from_quat(quaternion).as_matrix(), translation)
 
 

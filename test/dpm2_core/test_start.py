@@ -64,6 +64,16 @@ def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(en
     assert "passive 20000 1" in output
 
 
+def test_a_player_of_bags_starts_without_what_reads_their_messages() -> None:
+    """Nor what registers them: it took two thirds of its start."""
+    output = python(
+        "import sys; from dpm2_ros.executables import bag_player\n"
+        "assert bag_player(['nowhere']) == 2\n"
+        "print('imported', {'numba', 'scipy', 'gtsam', 'cv2', 'torch'} & set(sys.modules))"
+    )
+    assert "imported set()" in output
+
+
 def test_what_the_user_chose_stays() -> None:
     output = python(
         "import os; os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'] = 'active', '2'\n"

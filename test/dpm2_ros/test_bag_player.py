@@ -30,7 +30,7 @@ from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import exit_code
 from dpm2_ros.bag_player import BagPlayer, Options, main
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from tools.replay import ros_environment, start
 
 LATCHED_DEPTH = 10

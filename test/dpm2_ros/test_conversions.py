@@ -20,6 +20,7 @@ from dpm2_core.frame import Array, Fix
 from dpm2_core.geometry import se3
 from dpm2_core.slam.registration.texture import Texture, textured
 from dpm2_ros import conversions
+from dpm2_ros.stamps import stamp_to_msg
 from test.helpers.corridor import frame, random_paint
 
 tangents = hnp.arrays(np.float64, 6, elements=st.floats(-1.5, 1.5))
@@ -71,7 +72,7 @@ def test_poses_and_transforms_survive(xi: np.ndarray) -> None:
 
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
 def test_stamps_survive(stamp: int) -> None:
-    message = conversions.stamp_to_msg(stamp)
+    message = stamp_to_msg(stamp)
     assert message.sec * 10**9 + message.nanosec == stamp
 
 

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry
 
 from dpm2_ros import feed
 from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 from ..helpers.mapping import OTHER, S, core, keyframes, mapped, send_all
 

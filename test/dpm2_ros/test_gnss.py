@@ -17,7 +17,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import geodesy, se3
 from dpm2_ros.conversions import header, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 from ..helpers.diagnostics import having
 

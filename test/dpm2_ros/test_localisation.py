@@ -27,7 +27,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from tools.replay import ros_environment, start
 
 from ..helpers.command import dpm2

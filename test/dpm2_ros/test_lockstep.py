@@ -24,8 +24,8 @@ from dpm2_core.commands.run import run
 from dpm2_core.config import load_settings
 from dpm2_core.data import bag_messages, topics
 from dpm2_core.data.bag_file import open_bag
-from dpm2_core.data.bag_topics import IMU
 from dpm2_core.data.bags import BagSource
+from dpm2_core.data.message_kinds import IMU
 from dpm2_core.data.messages import restamped, serialized_stamp, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory

@@ -30,7 +30,7 @@ from dpm2_ros import mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import WIRE, descriptors_to_msg, payload_to_msgs
 from dpm2_ros.subscriptions import LAST_ONE
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 from ..helpers.mapping import S, core, keyframes, mapped, points, rejections, send_all
 

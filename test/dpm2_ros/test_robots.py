@@ -29,7 +29,7 @@ from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.keyframe_messages import descriptors_from_msg, descriptors_to_msg, payload_to_msgs
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from tools.replay import ros_environment, start
 
 GEOMETRIC = ("-p", "slam.registration:=geometric", "-p", "slam.loops.descriptors:=false")

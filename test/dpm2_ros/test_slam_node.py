@@ -26,9 +26,10 @@ from visualization_msgs.msg import MarkerArray
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_ros.active_map import ActiveMap
-from dpm2_ros.conversions import EARLIER, stamp_to_msg
+from dpm2_ros.conversions import EARLIER
 from dpm2_ros.keyframe_messages import BUDGET, received_to_msg
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.stamps import stamp_to_msg
+from dpm2_ros.tf_message import TFMessage
 from dpm2_ros.unsent import KeyframeFile, left_behind
 from test.helpers.rig import ACCURATE, Rig
 

@@ -18,9 +18,10 @@ from dpm2_core.data.messages import cloud_fields, decode_points
 from dpm2_core.data.topics import POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.geometry import se3
-from dpm2_ros.conversions import cloud_to_msg, header, stamp_to_msg
+from dpm2_ros.conversions import cloud_to_msg, header
 from dpm2_ros.slam_node import SlamNode
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.stamps import stamp_to_msg
+from dpm2_ros.tf_message import TFMessage
 from test.helpers.rig import ACCURATE, Rig, publish_static
 
 from ..helpers.diagnostics import figures, having, saying

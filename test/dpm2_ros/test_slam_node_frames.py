@@ -19,7 +19,7 @@ from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_ros.conversions import cloud_to_msg, transform_to_msg
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 from test.helpers.rig import ACCURATE, Rig, publish_static
 
 from ..helpers.diagnostics import figures, saying

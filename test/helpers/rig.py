@@ -12,9 +12,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.topics import IMAGE, KITTI, POINTS
-from dpm2_ros.conversions import stamp_to_msg, transform_to_msg
+from dpm2_ros.conversions import transform_to_msg
 from dpm2_ros.slam_node import SlamNode
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.stamps import stamp_to_msg
+from dpm2_ros.tf_message import TFMessage
 from test.helpers.diagnostics import having
 
 ACCURATE = 0.05  # m: the scans are exact, sampled at 0.35 m, and averaged into voxels of 0.5 m

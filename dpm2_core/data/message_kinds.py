@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Types of the messages that a bag is read for. Apart: a player knows them without the loops that read the messages."""
+
+from __future__ import annotations
+
+from dpm2_core.data.livox import LIVOX
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUDS = (CLOUD, *LIVOX)
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMU = "sensor_msgs/msg/Imu"
+FIX = "sensor_msgs/msg/NavSatFix"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+PATH = "nav_msgs/msg/Path"
+TRUTHS = ("nav_msgs/msg/Odometry", PATH)
