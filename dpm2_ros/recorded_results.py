@@ -11,7 +11,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dpm2_core.data.bag_file import Bag
 from dpm2_ros.lockstep import ODOMETRY
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 TF = "/tf"
 

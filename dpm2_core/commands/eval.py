@@ -1,25 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 eval`: evaluate a trajectory file against ground truth, and print how it was evaluated."""
+"""`dpm2 eval`: evaluate a trajectory file against ground truth, and print how it was evaluated.
+
+What does the work is imported by the function that needs it: `--help` and the shell's completion are there at once.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from dpm2_core.commands.options import InputOverrides, JsonFile, note, parse_lengths, show
-from dpm2_core.data.kitti import read_calib
-from dpm2_core.data.open import is_drive, open_source
-from dpm2_core.data.settings import input_settings
-from dpm2_core.data.trajectory import Trajectory, matched, read_trajectory, stamps_of
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.ground_truth import in_other_frame
-from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
-from dpm2_core.evaluation.metrics import evaluate, have_other_axes
-from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.geometry import se3
+
+if TYPE_CHECKING:
+    from dpm2_core.data.trajectory import Trajectory
 
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
 FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
@@ -50,6 +46,12 @@ def eval_(
     settings: InputOverrides = None,
 ) -> None:
     """Evaluate a trajectory: KITTI metric, APE, RPE and final drift."""
+    from dpm2_core.data.open import is_drive
+    from dpm2_core.data.trajectory import matched, read_trajectory, stamps_of
+    from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
+    from dpm2_core.evaluation.metrics import evaluate, have_other_axes
+    from dpm2_core.evaluation.report import metrics_table
+
     if settings and not is_drive(gt):
         raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is none")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
@@ -75,6 +77,14 @@ def eval_(
 def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
     """True poses of all frames of a drive, NaN where there is none, as `dpm2 run` writes its own: by stamp, or by frame
     number; of the LiDAR, or of the left camera where its place is known. And which of these, in words."""
+    import numpy as np
+
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import input_settings
+    from dpm2_core.data.trajectory import Trajectory
+    from dpm2_core.evaluation.ground_truth import in_other_frame
+    from dpm2_core.evaluation.kitti_metric import known
+
     source = open_source(path, input_settings([*settings, "input.images=false"]))
     if source.poses is None:
         raise UsageError(f"{path}: the drive has no ground truth")
@@ -95,6 +105,10 @@ def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tu
 
 def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:
     """LiDAR poses to poses of the left camera; the world stays, which alignment makes up for."""
+    from dpm2_core.data.kitti import read_calib
+    from dpm2_core.data.trajectory import Trajectory
+    from dpm2_core.geometry import se3
+
     if not calib.is_file():
         raise UsageError(f"{calib}: no such file")
     T_cam_lidar = read_calib(calib).get("Tr")

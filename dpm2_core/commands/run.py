@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 run`: a recording through the SLAM at full speed, without ROS."""
+"""`dpm2 run`: a recording through the SLAM at full speed, without ROS.
+
+What does the work is imported by the function that needs it: `--help` and the shell's completion are there at once.
+"""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.localise import parse_hint, run_localized
 from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console, progress_bar
-from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
-from dpm2_core.data.source import Source, parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.live_view import LiveView
-from dpm2_core.evaluation.report import metrics_table
-from dpm2_core.evaluation.run_folder import TRAJECTORY, set_aside
-from dpm2_core.evaluation.run_result import Result, save_config
 from dpm2_core.files import make_folder
 from dpm2_core.interrupt import interrupt_deferred
-from dpm2_core.pipeline import OfflineRun, Watch, open_recording
-from dpm2_core.slam.session import MapMode
-from dpm2_core.slam.settings import Config
-from dpm2_core.slam.system import SlamResult
+
+if TYPE_CHECKING:
+    from dpm2_core.data.source import Source
+    from dpm2_core.evaluation.run_result import Result
+    from dpm2_core.pipeline import OfflineRun, Watch
+    from dpm2_core.slam.session import MapMode
+    from dpm2_core.slam.settings import Config
+    from dpm2_core.slam.system import SlamResult
 
 
 def run(
@@ -64,6 +64,12 @@ def run(
     json_file: JsonFile = None,
 ) -> None:
     """Run the SLAM on a recording and write trajectory, map, image, timing and metrics."""
+    from dpm2_core.commands.localise import parse_hint, run_localized
+    from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
+    from dpm2_core.data.source import parse_range
+    from dpm2_core.pipeline import OfflineRun, open_recording
+    from dpm2_core.slam.settings import Config
+
     chosen = load_settings(Config, config, settings or [])
     corruption = None if corrupt is None else parse_corruption(corrupt)
     span = parse_range(frames)
@@ -90,18 +96,36 @@ def run(
             raise Dpm2Error(f"the map cannot be read everywhere: {problem}")
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
-    with ExitStack() as open_things:
-        drive = open_things.enter_context(OfflineRun(source, chosen, span, gt, map_file, mode))
+    with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         make_folder(out)  # the recording may go there
-        if resume and (out / TRAJECTORY).exists():
-            first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
-            before = set_aside(out, f"before_{first}")
-            note(f"{before}: the results so far; those of this run begin at frame {first}")
+        if resume:
+            _keep_what_is_there(drive, out)
+        _map(drive, chosen, out, (view, record), json_file)
+
+
+def _keep_what_is_there(drive: OfflineRun, out: Path) -> None:
+    """The results of the run that was cut off, beside those that are written now."""
+    from dpm2_core.evaluation.run_folder import TRAJECTORY, set_aside
+
+    if (out / TRAJECTORY).exists():
+        first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
+        before = set_aside(out, f"before_{first}")
+        note(f"{before}: the results so far; those of this run begin at frame {first}")
+
+
+def _map(drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path | None], json_file: Path | None) -> None:
+    """The drive from its first frame to its results; `shown`: in a viewer, and to a file."""
+    from dpm2_core.evaluation.live_view import LiveView
+    from dpm2_core.evaluation.run_folder import TRAJECTORY
+    from dpm2_core.evaluation.run_result import save_config
+
+    with ExitStack() as open_things:
+        view, record = shown
         live = None
         if view or record is not None:
             live = open_things.enter_context(LiveView(drive.source.name, view, record))
         if not (out / TRAJECTORY).exists():  # else it is beside the results of a run before until there are others
-            save_config(chosen, out)  # now: whatever becomes of the run, it says how it was made
+            save_config(config, out)  # now: whatever becomes of the run, it says how it was made
         with interrupt_deferred():  # after the drive, too: it would cost all that this gave
             _report(_drive(drive, None if live is None else live.add), out, json_file)
 
@@ -136,6 +160,8 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
     Raises:
         Dpm2Error: the map file is not complete.
     """
+    from dpm2_core.evaluation.report import metrics_table
+
     console, source = Console(stderr=True), result.source
     if result.interrupted:
         console.print(f"interrupted after {len(result)} frames; writing what there is", style="yellow")

@@ -64,6 +64,18 @@ def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(en
     assert "passive 20000 1" in output
 
 
+@pytest.mark.parametrize("name", ["run", "eval"])
+def test_the_help_of_what_is_called_most_imports_no_slam(name: str) -> None:
+    """Nor does the shell's completion of its options: they took a second and a half."""
+    output = python(
+        "import sys; from dpm2_core.cli import main\n"
+        f"try: main(['{name}', '--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "print('imported', {'numpy', 'scipy', 'numba', 'gtsam', 'torch', 'cv2'} & set(sys.modules))"
+    )
+    assert "imported set()" in output
+
+
 def test_a_player_of_bags_starts_without_what_reads_their_messages() -> None:
     """Nor what registers them: it took two thirds of its start."""
     output = python(

@@ -21,7 +21,7 @@ from sensor_msgs.msg import PointCloud2
 from dpm2_core.data.topics import POINTS
 from dpm2_ros.bag_player import BagPlayer
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, transform_to_msg
-from dpm2_ros.tf import TFMessage
+from dpm2_ros.tf_message import TFMessage
 
 from .test_bag_player import OPTIONS
 
