@@ -269,9 +269,14 @@ def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.M
 
 
 @cache
+def car_park() -> World:
+    return build_world("loop", "car_park", seed=902, length=120.0)
+
+
+@cache
 def in_the_car_park(s: float) -> tuple[Array, Points, Descriptors | None]:
     """Pose at `s` m of the way, what a robot there sees, and its descriptors."""
-    world = build_world("loop", "car_park", seed=902, length=120.0)
+    world = car_park()
     lidar, T = Lidar(real_sensor(LidarConfig(beams=16, height=0.8))), world.pose_at(s, height=0.8)
     points = lidar.scan(world, T, 0.5 * s, np.random.default_rng(int(s))).points
     cloud = points[voxel_first(points, 0.3, far=40.0)]
