@@ -166,7 +166,7 @@ class Harness:
 
     def _spin(self) -> None:
         while not self._ended.is_set():
-            self._executor.spin_once(timeout_sec=0.05)
+            self._executor.spin_once(timeout_sec=1.0)  # what is added and the end wake it
 
     def add(self, node: Node) -> Any:
         """Spin and in the end close a node."""
@@ -291,6 +291,7 @@ class Harness:
                 node.close()
         finally:
             self._ended.set()
+            self._executor.wake()
             self._thread.join()
             self._executor.shutdown()
             end_ros(*self._closing, self.node)
