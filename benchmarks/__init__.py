@@ -6,9 +6,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-from benchmarks.harness import Options, Report
 from dpm2_core.errors import UsageError
+
+if TYPE_CHECKING:
+    from benchmarks.harness import Options, Report
 
 
 @dataclass(frozen=True)

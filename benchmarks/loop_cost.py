@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
-from benchmarks.memory import resident_mb
+from benchmarks.resident import resident_mb
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import NO_POINTS, Array

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +10,8 @@ from rich.console import Group
 from rich.progress import track
 
 from benchmarks.harness import Options, Report, drives, settings_of
-from dpm2_core.errors import Dpm2Error, UsageError
+from benchmarks.resident import resident_mb
+from dpm2_core.errors import UsageError
 from dpm2_core.slam.build import make_slam
 from dpm2_core.tables import FigureTable
 
@@ -53,19 +52,6 @@ def levelling(samples: list[tuple[int, float]]) -> dict[str, Any]:
         "growth_mb_per_1000_frames_second_half": None if slope is None else 1000 * slope,
         "samples": samples,
     }
-
-
-def resident_mb() -> float:
-    """Resident set of this process, MB.
-
-    Raises:
-        Dpm2Error: the system is not Linux.
-    """
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        raise Dpm2Error("the memory benchmark reads /proc/self/statm, which only Linux has") from None
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
 def _table(results: dict[str, Any]) -> FigureTable:

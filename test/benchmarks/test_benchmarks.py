@@ -179,7 +179,7 @@ def test_the_resident_set_follows_what_is_allocated() -> None:
     """In a process of its own: what other tests have left is freed at any time, by a collection or by a thread."""
     program = (
         "import numpy as np\n"
-        "from benchmarks.memory import resident_mb\n"
+        "from benchmarks.resident import resident_mb\n"
         "before = resident_mb()\n"
         "block = np.ones(2**23)\n"
         "print(resident_mb() - before)\n"
