@@ -162,11 +162,15 @@ class Synchronizer:
 
     def _came_at_once(self, bundle: Bundle, following: Bundle | None) -> bool:
         """Whether one that is ahead came a period after the last, and the one after it at the pace of their stamps: the
-        clock was set; where clouds were lost or kept on the way one of the two is not so."""
+        clock was set; where clouds were lost or kept on the way one of the two is not so. Where none follows, as in
+        lockstep, /clock alone tells.
+        """
         last = self._newest
-        if last is None or following is None or bundle.stamp < last.stamp:
+        if last is None or bundle.stamp < last.stamp:
             return False
-        return is_due((bundle.arrival - last.arrival) * 1e9, self._period) and self._on_pace(following, bundle)
+        passed = bundle.clock - last.clock if last.clock else bundle.arrival - last.arrival
+        told = bool(last.clock) if following is None else self._on_pace(following, bundle)
+        return told and is_due(passed * 1e9, self._period)
 
     def _on_pace(self, bundle: Bundle, last: Bundle) -> bool:
         """Whether the stamps have gone on from that cloud by as much as has passed."""
