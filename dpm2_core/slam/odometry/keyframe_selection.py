@@ -28,7 +28,7 @@ class KeyframeSettings(Settings):
     distance: float = Field(5.0, ge=0)
     """Motion after which a scan becomes a keyframe, m."""
     angle: float = Field(25.0, ge=0)
-    """Turn after which a scan becomes a keyframe, degrees."""
+    """Turn after which a scan becomes a keyframe, degrees, unless one that was taken near by looks the same way."""
     residual: float = Field(0.0, ge=0)
     """Residual of registrations, m, at which `distance` shrinks to 1 m; without one it grows to twice its value, as in
     DeepPointMap. 0: it stays as it is."""
@@ -58,6 +58,7 @@ class KeyframeSelector:
         """Forget everything."""
         self.use(self._settings)
         self._last: Keyframe | None = None
+        self._near: list[Array] = []  # T_odom_kf of those that the robot has not left since
         self._uncertainty = np.zeros((6, 6))
         self._left_open = np.zeros((3, 3))  # root of the covariance, m, of the way since along what scenes left open
         self._weakest: Registration | None = None  # the least certain one since the last keyframe
@@ -77,6 +78,7 @@ class KeyframeSelector:
     def add_uncertainty(self, covariance: Array) -> None:
         """The odometry was broken by that much (6, 6): the next edge is to be no firmer."""
         self._uncertainty = self._uncertainty + covariance
+        self._near = [] if self._last is None else [self._last.T_odom_kf]  # where others are from here is not known
 
     def leave_open(self, step: Array) -> None:
         """A step was registered whose covariance (3, 3), m, is this much along what the scene leaves open.
@@ -108,11 +110,11 @@ class KeyframeSelector:
         if s.residual:
             self._spacing.registered(registration.rmse)
         if last is not None:
-            T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
-            meters, degrees = se3.magnitude(T_last_this)
-            if not self._requested and meters < self._spacing.meters and degrees < s.angle:
+            if self._is_known(T_odom_lidar) and not self._requested:
                 return None
-            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * max(meters, 1.0)
+            T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
+            way = max(se3.magnitude(T_last_this)[0], 1.0)
+            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * way
             covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
             covariance[3:, 3:] += self._left_open @ self._left_open
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
@@ -129,7 +131,14 @@ class KeyframeSelector:
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
         self._weakest, self._left_open = None, np.zeros((3, 3))
+        self._near.append(T_odom_lidar)
         return keyframe
+
+    def _is_known(self, T_odom_lidar: Array) -> bool:
+        """Whether a keyframe shows what is seen there: one that turns on the spot sees the same with each turn."""
+        moved = [(T, se3.magnitude(se3.inverse(T) @ T_odom_lidar)) for T in self._near]
+        self._near = [T for T, (meters, _) in moved if meters < self._spacing.meters]
+        return any(meters < self._spacing.meters and degrees < self._settings.angle for _, (meters, degrees) in moved)
 
     def _trace_fix(self, frame: Frame, T_odom_lidar: Array) -> None:
         """Note the way, and where on it a fix was measured: it comes late, and between two scans."""

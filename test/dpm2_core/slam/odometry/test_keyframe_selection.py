@@ -35,6 +35,32 @@ def test_by_the_residual_the_spacing_settles(rmse: float, spacing: float) -> Non
     assert np.diff(at)[-3:] == pytest.approx(spacing, abs=1.01)  # a scan per meter
 
 
+def turning(steps: list[tuple[float, float]], broken: int | None = None) -> list[int]:
+    """Of which steps (m ahead, degrees of heading), each where the robot is then, keyframes are made.
+
+    `broken`: the step before which the odometry broke.
+    """
+    selector, scan, out = KeyframeSelector(KeyframeSettings()), Scan(np.zeros((5, 4), np.float32)), []
+    for n, (x, heading) in enumerate(steps):
+        if n == broken:
+            selector.add_uncertainty(np.eye(6))
+        T = se3.make(se3.rotation(np.array([0, 0, np.radians(heading)])), [x, 0, 0])
+        if selector.select(Frame(n, scan.points), scan, T, Registration(T, np.eye(6) * 1e-4)):
+            out.append(n)
+    return out
+
+
+def test_a_robot_that_turns_on_the_spot_makes_the_keyframes_of_one_turn() -> None:
+    """Each turn more of a LiDAR on a turntable, or of a robot that looks around, would be a map more. 30 degrees are
+    more than the angle of the settings; where the robot has been away, or the odometry broke, there is a place anew."""
+    turn = [(0.0, 30.0 * step) for step in range(12)]
+    assert turning(turn * 5) == list(range(12))
+    to_and_fro = [(0.0, 0.0), (0.0, 30.0)] * 20
+    assert turning(to_and_fro) == [0, 1]
+    assert turning([*turn, (6.0, 0.0), *turn]) == list(range(25))
+    assert turning([*to_and_fro, *to_and_fro], broken=len(to_and_fro)) == [0, 1, 40]
+
+
 def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
     """Scans that leave the way open for a while enter the map; the next one fits there, and knows no more."""
     selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
