@@ -59,8 +59,23 @@ def _measured(distance: Array, seed: int) -> Points:
 
 ROOM = np.array([[-2.5, -2, 0], [2.5, 2, 2.6]])
 FURNITURE = boxes((-2.3, -1.9), (2.0, 1.5), 6, np.array([0.6, 0.4, 0.9]))
+HALL = np.array([[-3, -2, 0], [3, 2, 2.6]])
+_CORNER = np.array([[[-3, -2, 0], [-2.4, -0.5, 0.8]], [[-1, -2, 0], [0.4, -1.5, 1.9]]])
+BOTH_ENDS = np.concatenate([_CORNER, np.sort(_CORNER * [-1, -1, 1], axis=1)])
+"""Things in the hall, which looks the same from its other end."""
+CABINET = np.array([[[-3, 1.2, 0], [-2.2, 2, 1.2]]])  # by which the ends of the hall are told apart
+ROUND = [
+    (-1.5, -1, 0), (-0.5, -1, 0), (0.5, -1, 0), (1.5, -1, 0), (1.5, 0, 90), (1.5, 1, 90),
+    (1.5, 1, 180), (0.5, 1, 180), (-0.5, 1, 180), (-1.5, 1, 180), (-1.5, 1, 270), (-1.5, 0, 270),
+]  # fmt: skip
+"""A way round the hall: x and y, m, and heading, degrees."""
 STREET = np.array([[-80, -20, 0], [200, 20, 500.0]])
 HOUSES = boxes((-70, -16), (190, 16), 40, np.array([6, 4, 7.0]), 1)
+
+
+def standing(x: float, y: float, heading: float) -> Array:
+    """(4, 4) of a LiDAR 0.6 m above the floor; the heading in degrees."""
+    return se3.make(se3.rotation(np.array([0, 0, np.radians(heading)])), [x, y, 0.6])
 
 
 def frames(poses: Array, street: bool = False, start: int = 0) -> list[Frame]:

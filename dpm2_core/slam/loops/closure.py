@@ -26,7 +26,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain, margin
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
-from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, objection_of_others
+from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, looks_elsewhere, objection_of_others
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
@@ -217,9 +217,9 @@ class LoopCloser:
 
 
 def _is_elsewhere(one: Edge, other: Edge, poses: Array) -> bool:
-    """Whether the new keyframe is at another place of the map (N, 4, 4) by one loop than by the other.
+    """Whether the new keyframe is at another place of the map (N, 4, 4), or turned, by one loop than by the other.
 
     What nothing ties to the map yet counts as elsewhere: a place there that fits as well leaves both in doubt.
     """
-    here, there = ((poses[loop.from_node] @ loop.T_from_to)[:3, 3] for loop in (one, other))
-    return bool(np.linalg.norm(here - there) > SAME_PLACE)
+    here, there = (poses[loop.from_node] @ loop.T_from_to for loop in (one, other))
+    return bool(np.linalg.norm(here[:3, 3] - there[:3, 3]) > SAME_PLACE) or looks_elsewhere(here, there)

@@ -26,7 +26,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-from dpm2_core.slam.loops.verification import SAME_PLACE, Along, Verifier, objection_of_others
+from dpm2_core.slam.loops.verification import SAME_PLACE, Along, Verifier, looks_elsewhere, objection_of_others
 from dpm2_core.slam.registration.texture import VisualSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
@@ -209,13 +209,15 @@ def _unique(places: Sequence[Registration]) -> Registration:
         return nowhere(objection)
     for other in others:  # which of two equal storeys fits better depends on where the keyframes were taken
         beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
-        if beside <= SAME_PLACE and other.ok and not objection_of_others(other, []):
+        storey = beside <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
+        if storey and other.ok and not objection_of_others(other, []):
             return nowhere(f"{other.confidence:.0%} of the points fit on another storey, too")
     return best
 
 
 def _is_elsewhere(place: Registration, other: Registration) -> bool:
-    return bool(_distance(place.T_target_source, other.T_target_source) > SAME_PLACE)
+    T, T_other = place.T_target_source, other.T_target_source
+    return bool(_distance(T, T_other) > SAME_PLACE) or looks_elsewhere(T, T_other)
 
 
 def _distance(poses: Array, pose: Array) -> Array:

@@ -27,7 +27,9 @@ _CLEARLY = 0.5  # of what does not fit at the second best place, at most so much
 _LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
 _ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
 _MOST_TURNED = 5.0  # degrees, from the proposed pose
-SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place
+SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place...
+_SAME_HEADING = 30.0
+"""...and so little turned, degrees: in the middle of a room that looks the same from its other end, both ways fit."""
 
 
 Along = Callable[[Registration], Registration]
@@ -84,6 +86,11 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
     if second == _ELSEWHERE:
         return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
     return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
+
+
+def looks_elsewhere(one: Array, other: Array) -> bool:
+    """Whether two poses (4, 4) are turned so far from each other that they are two answers, not one less exact."""
+    return se3.magnitude(se3.inverse(one) @ other)[1] > _SAME_HEADING
 
 
 class Verifier:
