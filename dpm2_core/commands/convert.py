@@ -11,9 +11,6 @@ import typer
 from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console, progress_bar
-from dpm2_core.data.open import open_source
-from dpm2_core.data.source import parse_range
-from dpm2_core.slam.settings import Config
 
 
 def convert(
@@ -31,6 +28,9 @@ def convert(
     is included where there is some.
     """
     from dpm2_core.data.convert import convert as write_bag  # rosbags is slow to import for the other commands
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.source import parse_range
+    from dpm2_core.slam.settings import Config
 
     chosen, span = load_settings(Config, config, settings or []).input, parse_range(frames)
     console = Console(stderr=True)

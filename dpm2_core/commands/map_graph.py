@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from dpm2_core.commands.options import JsonFile, show
@@ -58,7 +58,7 @@ def optimize(
         "rejected": int((~solution.kept).sum()),
         "chi2_before": total_chi2(data, data.poses),
         "chi2_after": total_chi2(data, poses, solution.kept),
-        "chi2_per_dof": fit if np.isfinite(fit) else None,
+        "chi2_per_dof": fit if math.isfinite(fit) else None,
         "covariance_scale": scale,
         "seconds": seconds,
     }
@@ -109,7 +109,7 @@ def _table(graph: Path, figures: dict[str, Any], ignored: dict[str, int]) -> Fig
     table = FigureTable(str(graph), names=["what"], text=["value"], header=False)
     for name, value in figures.items():
         note = {"chi2_before": ", with every loop", "chi2_after": ", with the loops kept"}.get(name, "")
-        text = f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else str(value)
+        text = f"{value:.4g}" if isinstance(value, float) and math.isfinite(value) else str(value)
         table.add_row(name.replace("_", " "), text + note)
     for tag, count in ignored.items():
         table.add_row("ignored", f"{count} lines {tag}")

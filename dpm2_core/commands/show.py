@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from dpm2_core.commands.options import note
-from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
-from dpm2_core.data.open import open_source
-from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.source import Source, frame_at
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Frame
+
+if TYPE_CHECKING:
+    from dpm2_core.data.source import Source
+    from dpm2_core.frame import Frame
 
 
 def show(
@@ -38,6 +37,9 @@ def show(
 
     With weights that have a camera, also what a reference point reads from the image.
     """
+    from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import InputSettings
     from dpm2_core.evaluation.image_attention import image_attention
     from dpm2_core.evaluation.matches import compared_png
     from dpm2_core.network.pretrained import load_network
@@ -59,6 +61,8 @@ def show(
 
 
 def _frame(source: Source, src: Path, position: int) -> Frame:
+    from dpm2_core.data.source import frame_at
+
     if position >= len(source):
         raise UsageError(f"frame {position}: {src} has {len(source)} frames")
     frame = frame_at(source, position)

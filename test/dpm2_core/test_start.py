@@ -64,7 +64,7 @@ def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(en
     assert "passive 20000 1" in output
 
 
-@pytest.mark.parametrize("name", ["run", "eval"])
+@pytest.mark.parametrize("name", ["run", "eval", "map", "show", "convert"])
 def test_the_help_of_what_is_called_most_imports_no_slam(name: str) -> None:
     """Nor does the shell's completion of its options: they took a second and a half."""
     output = python(

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map export`: a map in other formats."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from dpm2_core.commands.map_figures import graph_of, say_what_is_missing, unplaced
+from dpm2_core.commands.options import note
+from dpm2_core.data.pcd import write_las, write_pcd
+from dpm2_core.data.ply import write_ply
+from dpm2_core.data.trajectory import write_kitti, write_tum
+from dpm2_core.errors import UsageError
+from dpm2_core.files import write_json
+from dpm2_core.frame import Points
+from dpm2_core.slam.mapping.tiles import write_tiles
+from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, trajectory, ways
+from dpm2_core.slam.store.map_store import MapStore
+
+
+def export_map(
+    path: Path, out: Path, format: str, voxel: float | None, resolution: float | None, tiles: float | None
+) -> None:
+    """Write a map file in another format; the arguments are the options of the command.
+
+    Raises:
+        UsageError: they do not go together, or the map has nothing of the kind.
+    """
+    if tiles is not None:
+        if format or voxel is not None or resolution is not None:
+            raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
+        with MapStore.open(path) as store:
+            count = write_tiles(_tied(_loaded(store), out), out, tiles)
+        note(f"{out} written: {count} tiles")
+        return
+    kind = format or _ENDINGS.get(out.suffix.lower(), "")
+    if kind not in _EXPORTS:
+        raise UsageError(f"{out}: choose --format from {', '.join(_EXPORTS)}")
+    spacing = {"voxel": voxel, "resolution": resolution}
+    write, requested = _EXPORTS[kind]
+    if ignored := [name for name, value in spacing.items() if value is not None and name != requested]:
+        raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
+    if kind == "occupancy" and out.suffix not in (".yaml", ".pgm"):
+        out = out.with_name(f"{out.name}.yaml")
+    if out.exists() and out.samefile(path):
+        raise UsageError(f"{out}: is the map itself")
+    with MapStore.open(path) as store:
+        write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
+    note(f"{out} written")
+
+
+def _loaded(store: MapStore) -> MapData:
+    """The map without descriptors.
+
+    Raises:
+        UsageError: it is empty.
+    """
+    say_what_is_missing(store)
+    data = load_map(store, descriptors=False)
+    if not len(data):
+        raise UsageError(f"{store.path}: no keyframe in it yet")
+    return data
+
+
+def _tied(data: MapData, out: Path) -> MapData:
+    """What is tied to the first keyframe; says what is not, and is left out of a file."""
+    from dpm2_core.slam.mapping.parts import first_part
+
+    tied = first_part(data)
+    whole, left = (Counter({drive: len(poses) for drive, (_, poses) in ways(d).items()}) for d in (data, tied))
+    for drive, count in sorted((whole - left).items()):
+        _say_without(out, drive, count, whole[drive], "no loop ties them to the first keyframe")
+    return tied
+
+
+def _say_without(out: Path, drive: tuple[str, int], count: int, total: int, reason: str) -> None:
+    """Say that keyframes of a drive (robot, session) are not in a file."""
+    robot, session = drive
+    name = f"session {session} of {robot}" if robot else f"session {session}"
+    note(f"{out}: without {count} of the {total} keyframes of {name}: {reason}")
+
+
+def _cloud(data: MapData, out: Path, voxel: float) -> Points:
+    tied = _tied(data, out)
+    return map_cloud(tied.clouds, tied.poses, voxel)
+
+
+def _export_geojson(data: MapData, out: Path) -> None:
+    from dpm2_core.geometry import geodesy
+    from dpm2_core.slam.mapping.parts import placed_on_earth
+
+    placed, features = placed_on_earth(data), []
+    if np.isnan(placed.poses).all():
+        raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
+    for (robot, session), (_, poses) in ways(placed).items():
+        way = poses[:, :3, 3]
+        known = np.isfinite(way).all(axis=1)
+        if not known.all():
+            reason = "neither their own fixes nor those of what loops tie them to tell where they are"
+            _say_without(out, (robot, session), int((~known).sum()), len(way), reason)
+        if not known.any():
+            continue
+        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in geodesy.geodetic(way[known]).tolist()]
+        geometry = {"type": "LineString", "coordinates": line if len(line) > 1 else line * 2}
+        features.append({"type": "Feature", "properties": {"robot": robot, "session": session}, "geometry": geometry})
+    write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def _export_page(data: MapData, out: Path, voxel: float) -> None:
+    from dpm2_core.evaluation.map_page import write_map_page
+
+    write_map_page(out, _tied(data, out), voxel)
+
+
+def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
+    from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid, why_of_no_use, write_grid
+    from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
+
+    tied = _tied(data, out)
+    settings = OccupancySettings(resolution=resolution)
+    write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings, tied.clouds.origin))
+    if (tilt := ground_tilt(tied.clouds, tied.poses, tied.clouds.origin)) > _STEEP:
+        why = "as of a LiDAR mounted at an angle: an IMU, or its mounting in /tf_static, makes a level one"
+        note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
+    if why := why_of_no_use(tied.poses):
+        note(f"{out}: {why}")
+
+
+_STEEP = 10.0  # degrees that the ground of a whole map may be tilted against the place where it begins
+_SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
+"""Default of each option that is a spacing, m."""
+_EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
+    "ply": (lambda data, out, voxel: write_ply(out, _cloud(data, out, voxel)), "voxel"),
+    "pcd": (lambda data, out, voxel: write_pcd(out, _cloud(data, out, voxel)), "voxel"),
+    "las": (lambda data, out, voxel: write_las(out, _cloud(data, out, voxel)), "voxel"),
+    "html": (_export_page, "voxel"),
+    "occupancy": (_export_occupancy, "resolution"),
+    "tum": (lambda data, out, _: write_tum(out, *trajectory(_tied(data, out))), ""),
+    "kitti": (lambda data, out, _: write_kitti(out, trajectory(_tied(data, out))[1]), ""),
+    "geojson": (lambda data, out, _: _export_geojson(data, out), ""),
+    "g2o": (lambda data, out, _: graph_of(data).write_g2o(out), ""),
+}
+"""How each kind is written, and the option that is its spacing."""
+_ENDINGS = {
+    ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
+    ".g2o": "g2o", ".geojson": "geojson", ".html": "html",
+}  # fmt: skip

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is in a map: the figures of `dpm2 map info`, its pose graph, and what a file of it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dpm2_core.commands.options import note
+from dpm2_core.database import size_with_log
+from dpm2_core.frame import Array
+from dpm2_core.slam.mapping.parts import parts_of
+from dpm2_core.slam.mapping.restore import restore_solved
+from dpm2_core.slam.store.map_data import MapData, ways
+from dpm2_core.slam.store.map_file import missing_log
+from dpm2_core.slam.store.map_store import MapStore
+
+if TYPE_CHECKING:
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+
+
+def say_what_is_missing(store: MapStore) -> None:
+    """Say that the last keyframes of a map may be in a file that is no longer beside it."""
+    if missing := missing_log(store.path):
+        note(f"{store.path}: {missing}")
+
+
+def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
+    loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
+    parts = parts_of(data)
+    placed, session = parts == parts[:1], np.array(data.session, np.int64)
+    return {
+        "map": str(path),
+        "keyframes": len(data),
+        "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
+        "with_descriptors": with_descriptors,
+        "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
+        "pruned": len(data.trail),
+        "robots": sorted({robot for robot, _ in drives}),
+        "length_m": _length(drives.values()),
+        "extent_m": np.ptp(data.poses[placed, :3, 3], axis=0).tolist() if len(data) else [],
+        "loops_accepted": sum(edge.ok for edge in loops),
+        "loops_tried": len(loops),
+        "georeference": _georeference_figures(data),
+        "bytes": size_with_log(path),
+        "sessions": [
+            {
+                "session": s.number,
+                "keyframes": int((session == s.number).sum()),
+                "untied": int(((session == s.number) & ~placed).sum()),
+                "started": s.started,
+                "program": s.program,
+                "weights": s.weights,
+            }
+            for s in data.sessions
+        ],
+    }
+
+
+def _georeference_figures(data: MapData) -> dict[str, Any] | None:
+    """Where on Earth the map is, with what certainty; None where that is not known.
+
+    The certainty is that of the whole graph, which is built for it: 0.8 s for 2,000 keyframes with a fix each. A file
+    that had it would have to have it anew with every keyframe.
+    """
+    if data.georeference is None:
+        return None
+    graph = graph_of(data)
+    covariance, (used, count) = graph.georeference_covariance(), graph.fixes
+    T, sigmas = data.georeference.T_enu_map, None if covariance is None else np.sqrt(np.diag(covariance))
+    return {
+        "origin": data.georeference.origin.tolist(),
+        "T_enu_map": T.tolist(),
+        "heading_deg": float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))),
+        "heading_sigma_deg": None if sigmas is None else float(np.degrees(sigmas[2])),
+        "position_sigma_m": None if sigmas is None else sigmas[3:].tolist(),
+        "fixes_used": used,
+        "fixes": count,
+    }
+
+
+def unplaced(data: MapData) -> str:
+    """Why a map without a georeference has none, in words; empty where it has no fixes."""
+    parts, fixes = parts_of(data), np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
+    tied = int(fixes[parts == parts[:1]].sum())
+    elsewhere = int(fixes.sum()) - tied
+    why = "the way is too short or too straight, or half of them or more are off it, as by another clock"
+    reasons = [f"{tied} fixes do not tell it: {why}"] if tied else []
+    if elsewhere:
+        reasons.append(f"{elsewhere} fixes are of keyframes that no loop ties to the first")
+    return "; ".join(reasons)
+
+
+def georeference_text(figures: dict[str, Any] | None, unplaced: str) -> str:
+    if figures is None:
+        return f"- ({unplaced})" if unplaced else "-"
+    latitude, longitude, altitude = figures["origin"]
+    heading = f"{figures['heading_deg']:.2f} deg from east to north"
+    where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"
+    if figures["position_sigma_m"] is None:
+        return f"{where}; how certain is not known: too few fixes are tied to the first keyframe"
+    east, north, up = figures["position_sigma_m"]
+    return (
+        f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
+        f"{figures['fixes_used']} of {figures['fixes']} fixes used"
+    )
+
+
+def _length(drives: Iterable[tuple[list[int], Array]]) -> float:
+    """Of the ways of all drives, m."""
+    steps = (np.diff(poses[:, :3, 3], axis=0) for _, poses in drives)
+    return float(sum(np.linalg.norm(step, axis=1).sum() for step in steps))
+
+
+def graph_of(data: MapData) -> PoseGraph:
+    """The pose graph of a map, with the poses that it has."""
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+    from dpm2_core.slam.graph.robust import RobustSettings
+
+    graph = PoseGraph(RobustSettings())
+    restore_solved(graph, data)
+    return graph

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`dpm2 map merge`: one map of several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dpm2_core.commands.options import note
+from dpm2_core.config import load_settings
+from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.frame import Array
+from dpm2_core.geometry import se3
+from dpm2_core.network.pretrained import weights_id
+from dpm2_core.slam.mapping.merge import merge_maps, off_by_satellites, tie_of
+from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.store.map_data import MapData, check_new, load_map, save_as
+from dpm2_core.slam.store.map_store import MapStore
+
+_OFF = 30.0  # m from where satellites have a map: receivers err by meters, and over its length so does a heading
+
+
+def merge_files(
+    paths: list[Path],
+    out: Path,
+    transform: Sequence[str] | None,
+    config: Path | None,
+    settings: Sequence[str] | None,
+) -> None:
+    """Join map files; the arguments are the options of the command.
+
+    Raises:
+        UsageError: they do not go together. Dpm2Error: a map shares no place with the others.
+    """
+    check_new(out)
+    given = [parse_transform(text) for text in transform or ()]
+    if len(paths) < 2 or (given and len(given) != len(paths) - 1):
+        raise UsageError("merge: want two or more maps, and no --transform or one for each but the first")
+    if given and (config is not None or settings):
+        raise UsageError("merge: --config and --set say how places are found; known transforms need no settings")
+    chosen = load_settings(Config, config, settings or ()).slam
+    with ExitStack() as stack:
+        maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
+        described = {session.weights for data in maps for session in data.sessions if session.weights}
+        if not given:
+            described.add(weights_id(chosen.neural.weights))
+        if len(described) > 1:
+            raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
+        named = list(zip(paths, maps, strict=True))
+        _say_what_is_there_twice(named)
+        first = maps[0] if given else _joined_by_places(named, chosen)
+        for (path, other), T in zip(named[1:], given, strict=False):
+            if (off := off_by_satellites(first, other, T)) > _OFF:
+                doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
+                note(f"{path}: {doubt}")
+            first = merge_maps(first, other, T, tie_of(first, other, T))
+        save_as(first, out)
+    note(f"{out}: {len(first)} keyframes")
+
+
+def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
+    """Drives that several of the maps hold, as of a file that is named twice, or of two that were continued apart."""
+    known = set[tuple[str, int, bytes]]()
+    for path, data in maps:
+        own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
+        if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
+            said = f"{count} of its {len(data)} keyframes are in a map before it, too: they will be there twice"
+            note(f"{path}: {said}")
+        known |= own
+
+
+def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:
+    """The first map with the others, in the order in which they share places with what is joined already.
+
+    Raises:
+        Dpm2Error: one shares none.
+    """
+    from dpm2_core.slam.build import make_loops
+    from dpm2_core.slam.graph.pose_graph import PoseGraph
+    from dpm2_core.slam.mapping.merge import align, loops_by, merge_maps, optimized
+
+    (_, first), *waiting = maps
+    while waiting:
+        tried = (align(first, other, loops_by(make_loops(settings))) for _, other in waiting)
+        number, found = next(((i, fit) for i, fit in enumerate(tried) if fit is not None), (0, None))
+        if found is None:
+            names = ", ".join(str(path) for path, _ in waiting)
+            raise Dpm2Error(f"{names}: nothing of the other maps was found there; --transform says where they are")
+        (path, other), (T, loops) = waiting.pop(number), found
+        merged = merge_maps(first, other, T, loops)
+        first = optimized(merged, PoseGraph(settings.pose_graph))
+        note(f"{path}: {len(loops)} loops to what came before")
+        checked = zip(merged.edges, first.edges, strict=True)
+        if rejected := [f"{now.from_node} and {now.to_node}" for was, now in checked if was.ok and not now.ok]:
+            said = "loops that contradict the rest are rejected, those of the new map's keyframes"
+            note(f"{path}: {said} {', '.join(rejected)}")
+    return first
+
+
+def parse_transform(text: str) -> Array:
+    """`x y z yaw` (m, degrees) or `x y z qx qy qz qw` to (4, 4).
+
+    Raises:
+        UsageError: it is neither.
+    """
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+        if len(numbers) not in (4, 7) or not np.isfinite(numbers).all():
+            raise ValueError
+        angles = numbers[3:]
+        R = Rotation.from_euler("z", angles[0], degrees=True) if len(angles) == 1 else Rotation.from_quat(angles)
+    except ValueError:
+        raise UsageError(f'--transform "{text}": want "x y z yaw" or "x y z qx qy qz qw"') from None
+    return se3.make(R.as_matrix(), numbers[:3])
