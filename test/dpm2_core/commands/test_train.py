@@ -16,7 +16,7 @@ from ...helpers.command import dpm2
 from ...helpers.networks import TINY
 from ..tasks.conftest import labelled_drive, write_pairs
 
-QUICK = ("epochs=1", "warmup=0", "window=2", "every=1", "batch=1")
+QUICK = ("epochs=1", "optimiser.warmup=0", "window=2", "every=1", "batch=1")
 GROUND = ("network.cells=32", "network.cell=2", "network.channels=4")
 RANGE = (
     "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 60}",
