@@ -178,7 +178,7 @@ def map_poses(source: BagSource, result: Replay, found: list[int]) -> Array:
         position = {stamp: n for n, stamp in enumerate(found)}
         known = [n for n, stamp in enumerate(keyframes.keys.tolist()) if stamp in position]
         at = np.array([position[keyframes.keys[n]] for n in known], np.intp)
-        T_odom_base = corrected(T_odom_base, at, keyframes.poses[known])
+        T_odom_base = corrected(T_odom_base, at, keyframes.poses[known] @ se3.inverse(T_odom_base[at]))
     if result.base_frame == source.lidar_frame:
         return T_odom_base
     T_base_lidar = source.transforms.lookup(result.base_frame, source.lidar_frame)
