@@ -14,8 +14,7 @@ from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
-    cells,
-    failed_note,
+    add_runs,
     missing_note,
     own_part,
     peer_names,
@@ -65,8 +64,7 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
         for rows in (table, speed):
-            note = failed_note(name, sequences, figures)
-            rows.add(name, cells(name, sequences, figures, list(rows.figures)), note=note)
+            add_runs(rows, name, sequences, figures)
     table.add("DeepPointMap2", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
     notes = missing_note(sequences, TESTED)
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
@@ -83,8 +81,7 @@ def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outco
     table = ResultTable(title, [*sequences, MEAN], _APE, caption)
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
-        note = failed_note(name, sequences, figures)
-        table.add(name, cells(name, sequences, figures, list(_APE)), note=note)
+        add_runs(table, name, sequences, figures)
     for name, ape in (("DeepPointMap2", 26.00), ("DeepPointMap", 93.77)):
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)

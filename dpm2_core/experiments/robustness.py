@@ -15,8 +15,7 @@ from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
-    cells,
-    failed_note,
+    add_runs,
     missing_note,
     own_part,
     present,
@@ -87,15 +86,14 @@ def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     changes: dict[str, float | None] = {}
     whole: float | None = None
     for name, _, corrupt in variants:
-        table.add(name, cells(name, sequences, figures, list(SHOWN)))
+        add_runs(table, name, sequences, figures)
         mean = table.value(table.rows[-1], MEAN, "t_err_percent")
         whole = mean if corrupt is None else whole
         change = 100 * (mean / whole - 1) if mean is not None and whole else None
-        notes = [failed_note(name, sequences, figures)]
         if corrupt is not None:
             changes[name] = change
-            notes = ["" if change is None else f"{change:+.0f} %", *notes]
-        table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, notes)))
+            said = ["" if change is None else f"{change:+.0f} %", table.rows[-1].note]
+            table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, said)))
     table.add("DeepPointMap2, whole", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
     for kind, means in _PAPER_MEAN.items():
         for share, mean in zip(SHARES, means, strict=True):

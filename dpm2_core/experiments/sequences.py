@@ -13,13 +13,13 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, drive_content, has_sequence
-from dpm2_core.experiments.table import Cells
+from dpm2_core.experiments.table import ResultTable
 from dpm2_core.fleet.part import Figures, Part
 
 SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
 """Figures of the KITTI metric, and how they are printed."""
 FAILED = "Failed: frames that were only predicted, or have no pose and so no part in the figures."
-"""What `failed_note` means."""
+"""What `add_runs` says beside a row."""
 
 
 def reading(request: Request, sequence: str, settings: Sequence[str] = ()) -> list[str]:
@@ -102,19 +102,24 @@ def peer_names(request: Request) -> list[str]:
     return [text.partition("=")[0] for text in request.peers]
 
 
-def cells(name: str, sequences: Sequence[str], figures: Mapping[str, Figures], shown: Sequence[str]) -> Cells:
-    """The figures of a row."""
-    return {
-        sequence: {figure: figures[f"{_folder(name)}/{sequence}"].get(figure) for figure in shown}
-        for sequence in sequences
-    }
+def add_runs(
+    table: ResultTable,
+    name: str,
+    sequences: Sequence[str],
+    figures: Mapping[str, Figures],
+    label: str = "",
+    about: str = "",
+) -> None:
+    """The row of what ran on the sequences, and beside it how many frames have no pose of their own, see `FAILED`.
 
-
-def failed_note(name: str, sequences: Sequence[str], figures: Mapping[str, Figures]) -> str:
-    """What is to be said beside a row: how many frames of which sequences have no pose of their own."""
+    Args:
+        label: of the row; `name` without. about: what else is to be said beside it.
+    """
     of = {sequence: figures[f"{_folder(name)}/{sequence}"] for sequence in sequences}
-    found = [f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in of.items() if f["failed_frames"]]
-    return f"failed: {', '.join(found)}" if found else ""
+    failed = [f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in of.items() if f["failed_frames"]]
+    notes = [about, f"failed: {', '.join(failed)}" if failed else ""]
+    cells = {sequence: {figure: f.get(figure) for figure in table.figures} for sequence, f in of.items()}
+    table.add(label or name, cells, note="; ".join(filter(None, notes)))
 
 
 def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> list[tuple[str, Path]]:

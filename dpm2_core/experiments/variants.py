@@ -16,8 +16,7 @@ from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
-    cells,
-    failed_note,
+    add_runs,
     learned_note,
     missing_note,
     own_part,
@@ -113,10 +112,8 @@ class VariantTable:
             table = ResultTable(self.title, [*sequences, MEAN], SHOWN, caption)
             for variant in self.variants:
                 random = len(figures[self._training(variant)]["random_at_start"])
-                name = self._name(variant)
-                about = [f"{random} tensors began at random" if random else "", failed_note(name, sequences, figures)]
-                note = "; ".join(filter(None, about))
-                table.add(variant, cells(name, sequences, figures, list(SHOWN)), note=note)
+                about = f"{random} tensors began at random" if random else ""
+                add_runs(table, self._name(variant), sequences, figures, variant, about)
             for variant, row in self.paper.items():
                 there = {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True) if s in sequences}
                 table.add(variant, there, "the paper")
