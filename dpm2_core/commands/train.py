@@ -175,6 +175,7 @@ def ablation(
     report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
 ) -> None:
     """The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike; continues."""
+    from dpm2_core.data.packed import open_packed, scans_of
     from dpm2_core.evaluation.record import write_record
     from dpm2_core.experiments.ablation import AblationSettings, ablation_tables, gains
     from dpm2_core.experiments.ablation import ablation as compare
@@ -184,8 +185,10 @@ def ablation(
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:
         raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
+    packed = chosen.training.data.packed
+    learned = scans_of(drive for folder, weight in packed.items() if weight for drive in open_packed(Path(folder)))
     for name, folder in chosen.measure.items():
-        say_packed(f"measure.{name}", Path(folder), chosen.training.data.packed)
+        say_packed(f"measure.{name}", Path(folder), learned)
     found = compare(chosen, out)
     results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
     write_record(report, "ablation", results)
@@ -198,7 +201,7 @@ def _begin(
     out: Path, resume: bool, settings: ImageTrainingSettings | RegistrationTrainingSettings | OverlapTrainingSettings
 ) -> None:
     """Ready `out` for a training on packed drives, see `begin_or_resume`."""
-    from dpm2_core.data.packed import open_packed, packed_digest
+    from dpm2_core.data.packed import open_packed, packed_digest, scans_of
     from dpm2_core.learning.begun import begin_or_resume
     from dpm2_core.network.pretrained import weights_path
 
@@ -208,22 +211,16 @@ def _begin(
     read = [weights_path(settings.start)] if settings.start else []
     begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
     if validation := getattr(settings, "validation", ""):  # the training of the image branch has none
-        say_packed(f"validation {validation}", Path(validation), settings.data.packed)
+        learned = scans_of(d for folder, found in drives.items() if settings.data.packed[folder] for d in found)
+        say_packed(f"validation {validation}", Path(validation), learned)
 
 
-def say_packed(what: str, folder: Path, packed: Mapping[str, float]) -> None:
-    """Say which packed drives below a folder hold scans that are learned from, also where these were packed anew.
-
-    Args:
-        packed: folders that are learned from, with their weights; those of none are not.
-    """
+def say_packed(what: str, folder: Path, learned: Collection[bytes]) -> None:
+    """Say which packed drives below a folder hold scans that are learned from, see `scans_of`."""
     from dpm2_core.data.packed import open_packed, scans_of
 
-    learned = {
-        scan for of, weight in packed.items() if weight for drive in open_packed(Path(of)) for scan in scans_of(drive)
-    }
     measured = open_packed(folder)
-    both = {drive.folder.resolve() for drive in measured if not learned.isdisjoint(scans_of(drive))}
+    both = {drive.folder.resolve() for drive in measured if not scans_of([drive]).isdisjoint(learned)}
     say_learned(f"{what} is what the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
 
 

@@ -221,11 +221,11 @@ def open_packed(root: Path) -> list[PackedDrive]:
     return found
 
 
-def scans_of(drive: PackedDrive) -> set[bytes]:
+def scans_of(drives: Iterable[PackedDrive]) -> set[bytes]:
     """What tells each scan from all others, also where a part of the drive is packed again: where it was taken, and how
     many points it has. Those at the origin do not count, at which many drives begin."""
-    counts = np.diff(drive.offsets)
-    return {t.tobytes() + n.tobytes() for t, n in zip(drive.poses[:, :3, 3], counts, strict=True) if t.any()}
+    scans = ((t, n) for d in drives for t, n in zip(d.poses[:, :3, 3], np.diff(d.offsets), strict=True))
+    return {t.tobytes() + n.tobytes() for t, n in scans if t.any()}
 
 
 def packed_digest(drives: Iterable[PackedDrive]) -> str:
