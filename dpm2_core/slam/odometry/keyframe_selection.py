@@ -124,8 +124,9 @@ class KeyframeSelector:
             T_lidar_scan = se3.inverse(T_scan_lidar)
             cloud = se3.transform(T_lidar_scan, cloud)
             known = None if known is None else known.moved(T_lidar_scan)
-        keyframe = Keyframe(self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known)
-        keyframe = replace(keyframe, up=frame.up)
+        keyframe = Keyframe(
+            self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known, up=frame.up
+        )
         if self._fix is not None:
             fix, T_odom_then = self._fix
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
@@ -136,9 +137,10 @@ class KeyframeSelector:
 
     def _is_known(self, T_odom_lidar: Array) -> bool:
         """Whether a keyframe shows what is seen there: one that turns on the spot sees the same with each turn."""
-        moved = [(T, se3.magnitude(se3.inverse(T) @ T_odom_lidar)) for T in self._near]
-        self._near = [T for T, (meters, _) in moved if meters < self._spacing.meters]
-        return any(meters < self._spacing.meters and degrees < self._settings.angle for _, (meters, degrees) in moved)
+        moved = [(T, *se3.magnitude(se3.inverse(T) @ T_odom_lidar)) for T in self._near]
+        near = [(T, degrees) for T, meters, degrees in moved if meters < self._spacing.meters]
+        self._near = [T for T, _ in near]
+        return any(degrees < self._settings.angle for _, degrees in near)
 
     def _trace_fix(self, frame: Frame, T_odom_lidar: Array) -> None:
         """Note the way, and where on it a fix was measured: it comes late, and between two scans."""
