@@ -19,9 +19,8 @@ from dpm2_core.frame import Array
 from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, loop_errors, mahalanobis, total_chi2
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
-# Tighter than where the covariances are only believed. A few steps of the solver tell most wrong loops; to go on to an
-# optimum that has them in it takes minutes.
-_SETTINGS = RobustSettings(odometry_sigmas=5.0, iterations=10)
+_SETTINGS = RobustSettings(odometry_sigmas=5.0)  # tighter than where the covariances are only believed
+_STEPS = 10  # of the solver tell most wrong loops; to go on to an optimum that has them in it takes minutes
 _QUANTILE, _AMONG_RIGHT = 0.2, 0.3  # of all loops, and which one of the right ones it is where a third is wrong
 _LEAST = 8  # loops; fewer do not say how large the covariances are
 _APART = 10  # nodes; nearer ones often repeat the odometry
@@ -95,7 +94,7 @@ def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], No
     most = np.inf if first > _TOO_FIRM else max(first, 1.0)  # where wrong loops were kept, they would let in others
     for stage in range(_STAGES):
         report(f"stage {stage + 1}: covariances times {scale:.3g}")
-        solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used)
+        solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used, _STEPS)
         fitting = min(most, _ROOM * chi2_per_dof(graph, solution.poses, solution.kept, dof))
         if not 0 < fitting < np.inf or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
             break

@@ -40,7 +40,7 @@ _SHARED = 0.6
 """Loops per place: at 0.5 no two share one, and wrong ones may have their way where all are solved at once."""
 _WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
 _ROUNDS = 8  # of solving and judging, at most
-_STEPS = 50  # of the plain least squares, at most
+_STEPS = 50  # of Levenberg-Marquardt in each round, at most
 _FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
 
 
@@ -54,8 +54,6 @@ class RobustSettings(Settings):
     wrong ones hundreds off: the room between is for covariances that promise too much."""
     odometry_sigmas: float = Field(20.0, gt=0)
     """A loop starts out set aside if the odometry between its ends is more than so many standard deviations off."""
-    iterations: int = Field(50, ge=1)
-    """At most so many Levenberg-Marquardt steps in each round of solving and judging."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +94,15 @@ def _solvable() -> Iterator[None]:
 
 
 @_solvable()
-def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_] | None = None) -> Solution:
+def optimize(
+    graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_] | None = None, steps: int = _STEPS
+) -> Solution:
     """Optimize and check the loops; deterministic.
 
     Args:
         used: (E,) loops to begin with, from poses that agree with them; without it those that the odometry does not
             contradict.
+        steps: of the solver in each round of solving and judging, at most.
 
     Raises:
         Dpm2Error: the system is singular.
@@ -122,7 +123,7 @@ def optimize(graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_]
         starts = [poses]
         if afar and count == 1:
             starts += _linear(factors, poses, next(_anchors(graph, condensed, ends[used])))
-        poses = _solved(factors, starts, settings.iterations)
+        poses = _solved(factors, starts, steps)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
         settled = bool((kept == used).all())
@@ -216,10 +217,10 @@ def _linear(factors: Any, poses: Array, anchor: int) -> list[Array]:
     return [linear] if factors.error(_values(linear)) < _WORTH * factors.error(_values(poses)) else []
 
 
-def _solved(factors: Any, starts: Sequence[Array], iterations: int) -> Array:
+def _solved(factors: Any, starts: Sequence[Array], steps: int) -> Array:
     """The best of what the starts (N, 4, 4) lead to."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(iterations)
+    parameters.setMaxIterations(steps)
     solvers = [gtsam.LevenbergMarquardtOptimizer(factors, _values(start), parameters) for start in starts]
     solved = [solver.optimize() for solver in solvers]
     return _poses(min(solved, key=factors.error), len(starts[0]))
