@@ -24,10 +24,9 @@ from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
-from dpm2_core.slam.build import make_mapper
+from dpm2_core.slam.build import make_mapper, make_verifier
 from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.relocalization import Relocalizer
-from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
@@ -63,7 +62,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads)
-            verifier = Verifier(settings.verification, settings.geometric)
+            verifier = make_verifier(settings)
             known = KnownMap(data.keyframes, data.clouds, data.poses)
             verifiers = ByScale(verifier, verifier)
             relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, known)

@@ -21,9 +21,9 @@ from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import CameraConfig, PresetName
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.build import make_verifier
 from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.relocalization import Relocalizer
-from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
 
 WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
@@ -91,7 +91,7 @@ def _relocalised(
     poses = np.stack([place.T_map_lidar for place in known])
     clouds = [keyframe.cloud for keyframe in keyframes]
     in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
-    verifier = Verifier(settings.verification, settings.geometric)
+    verifier = make_verifier(settings)
     verifiers = ByScale(verifier, verifier)
     relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, in_map)
     rows = []

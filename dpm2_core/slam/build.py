@@ -99,7 +99,8 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
         UsageError: the network, or that of the filter, has no weights to run with.
     """
     preprocessor = Preprocessor(s.preprocess, make_filter(s.filter, s.threads))
-    geometric = GeometricScanRegistration(preprocessor, GeometricRegistration(s.geometric), LocalMap(s.local_map))
+    local_map = LocalMap(s.local_map, s.preprocess.map_voxel)
+    geometric = GeometricScanRegistration(preprocessor, GeometricRegistration(s.geometric), local_map)
     chosen: ScanRegistration = geometric
     if s.registration != "geometric":
         neural = NeuralScanRegistration(s.neural, preprocessor, _network(s))
@@ -150,7 +151,12 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
 
 
 def _verifiers(s: SlamSettings) -> ByScale[Verifier]:
-    return ByScale(*(Verifier(one.verification, one.geometric) for one in (s, s.indoors())))
+    return ByScale(*(make_verifier(one) for one in (s, s.indoors())))
+
+
+def make_verifier(s: SlamSettings) -> Verifier:
+    """Checks a proposed pose by the points."""
+    return Verifier(s.verification, s.geometric, s.preprocess)
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:
@@ -160,7 +166,7 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights to run with.
     """
     described = s.loops.enabled and s.loops.descriptors
-    ways = ByScale(*((one.loops, Verifier(one.verification, one.geometric)) for one in (s, s.indoors())))
+    ways = ByScale(*((one.loops, make_verifier(one)) for one in (s, s.indoors())))
     return LoopCloser(ways, _network(s) if described else None)
 
 

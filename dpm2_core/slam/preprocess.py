@@ -31,7 +31,7 @@ class PreprocessSettings(Settings):
     """What floats in the air (fog, dust, smoke, spray, snow) is dropped where it is this fraction of the returns within
     8 m, or more. Denser maps need less of it to be misled."""
     map_voxel: float = 0.5
-    """Spacing of the points that enter the local map, m."""
+    """Spacing of the points that are registered to, of the last scans or of the keyframes around a place, m."""
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True

@@ -17,6 +17,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.loops.probe import probed
+from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
@@ -39,10 +40,6 @@ Along = Callable[[Registration], Registration]
 class VerificationSettings(Settings):
     """What the pose of a loop, or of a place in a search, needs to be accepted."""
 
-    voxel: float = Field(0.8, gt=0)
-    """Spacing of the points that are registered, m, as in the odometry..."""
-    map_voxel: float = Field(0.5, gt=0)
-    """...and of those that they are registered to, m."""
     min_inliers: float = Field(0.6, ge=0, le=1)
     """Fraction of the points that must fit the map."""
     min_structure: float = Field(0.6, ge=0, le=1)
@@ -94,22 +91,27 @@ def looks_elsewhere(one: Array, other: Array) -> bool:
 
 
 class Verifier:
-    """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result."""
+    """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result.
 
-    def __init__(self, settings: VerificationSettings, registration: GeometricSettings) -> None:
-        self._settings = settings
+    Points are as dense as those of the odometry.
+    """
+
+    def __init__(
+        self, settings: VerificationSettings, registration: GeometricSettings, points: PreprocessSettings
+    ) -> None:
+        self._settings, self._points = settings, points
         self._registration = GeometricRegistration(registration)
 
     def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
         """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
-        local_map = LocalMap(LocalMapSettings(voxel=self._settings.map_voxel))
+        local_map = LocalMap(LocalMapSettings(), self._points.map_voxel)
         parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
         local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
 
     def source(self, cloud: Points) -> Array:
         """Those points (N, 3) of a cloud (M, 4) that are registered."""
-        return cloud[voxel_first(cloud, self._settings.voxel, far=self._settings.range), :3].astype(np.float64)
+        return cloud[voxel_first(cloud, self._points.source_voxel, far=self._settings.range), :3].astype(np.float64)
 
     def register(self, source: Array, around: LocalMap, T_proposed: Array, widen: float) -> Registration:
         """Points (N, 3) of `source` in a map, not verified."""

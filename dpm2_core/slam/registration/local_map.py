@@ -25,8 +25,6 @@ _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 class LocalMapSettings(Settings):
     """The local map of the odometry."""
 
-    voxel: float = Field(0.5, gt=0)
-    """Edge of the cells that hold one point each, m."""
     spacing: float = Field(2.0, ge=0)
     """A scan enters the map after this much motion, m (or a turn of 10 degrees)."""
     radius: float = Field(100.0, gt=0)
@@ -38,8 +36,9 @@ class LocalMapSettings(Settings):
 class LocalMap:
     """Points (M, 3) float64 in the odometry frame, empty until the first `insert`."""
 
-    def __init__(self, settings: LocalMapSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: LocalMapSettings, voxel: float) -> None:
+        """voxel: edge of the cells that hold one point each, m."""
+        self._settings, self._voxel = settings, voxel
         self.points: Array = np.zeros((0, 3))
         self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
         self._inserted = 0
@@ -50,7 +49,7 @@ class LocalMap:
 
     def fresh(self) -> LocalMap:
         """Another one, empty."""
-        return LocalMap(self._settings)
+        return LocalMap(self._settings, self._voxel)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -98,8 +97,8 @@ class LocalMap:
         kept = np.einsum("ij,ij->i", away, away) < self._settings.radius**2
         kept &= entered > self._inserted - self._settings.scans
         joined, entered = joined[kept], entered[kept]
-        first = voxel_first(joined, self._settings.voxel)
-        self._grid = PointGrid(joined[first], _CELL * self._settings.voxel)
+        first = voxel_first(joined, self._voxel)
+        self._grid = PointGrid(joined[first], _CELL * self._voxel)
         self.points, self._entered = self._grid.points, entered[first][self._grid.order]
         self._inserted += 1
         self._T_last, self._voxels = T_odom_lidar, None

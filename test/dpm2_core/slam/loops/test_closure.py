@@ -31,6 +31,7 @@ from dpm2_core.slam.build import make_loops
 from dpm2_core.slam.loops.closure import LoopCloser, LoopSettings
 from dpm2_core.slam.loops.place_recognition import AGREEING, PlaceRecognition, merged
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.settings import SlamSettings
 
@@ -69,7 +70,10 @@ def where(s: float, lateral: float = 0.0, heading: float = 0.0) -> Array:
 
 
 def closer(with_network: bool = True, **settings: object) -> LoopCloser:
-    way = LoopSettings.model_validate(settings), Verifier(VerificationSettings(), GeometricSettings())
+    way = (
+        LoopSettings.model_validate(settings),
+        Verifier(VerificationSettings(), GeometricSettings(), PreprocessSettings()),
+    )
     return LoopCloser(ByScale(way, way), network() if with_network else None)
 
 

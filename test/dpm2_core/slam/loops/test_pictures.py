@@ -21,6 +21,7 @@ from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier
+from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.registration.texture import VisualSettings
 
@@ -59,7 +60,7 @@ def in_map(keyframes: list[Keyframe]) -> KnownMap:
 
 
 def searching(known: KnownMap, visual: VisualSettings) -> Relocalizer:
-    verifier = Verifier(VerificationSettings(), GeometricSettings())
+    verifier = Verifier(VerificationSettings(), GeometricSettings(), PreprocessSettings())
     network = load_network("small", 1)
     return Relocalizer(RelocalizationSettings(), visual, ByScale(verifier, verifier), network, known)
 

@@ -21,7 +21,10 @@ def test_a_direction_is_open_only_where_the_scan_fits_as_well_a_meter_away(
     """Its covariance says open in both; in a street the scan fits clearly worse a meter away."""
     sigma = {}
     for name, drive in {"street": suburb_drive, "tunnel": tunnel_drive}.items():
-        registration, local_map = GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+        registration, local_map = (
+            GeometricRegistration(GeometricSettings()),
+            LocalMap(LocalMapSettings(), PreprocessSettings().map_voxel),
+        )
         scans = [Preprocessor(PreprocessSettings()).prepare(frame, np.zeros(6)) for frame in drive[0][:6]]
         for scan, T in zip(scans[:5], drive[1][:5], strict=True):
             local_map.insert(scan.cloud, T)

@@ -19,11 +19,11 @@ from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World
+from dpm2_core.slam.build import make_verifier
 from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import Relocalizer
-from dpm2_core.slam.loops.verification import Verifier
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import street
@@ -64,7 +64,7 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
         for i, cloud in enumerate(looks or clouds)
     ]
     s = SlamSettings()
-    verifiers = ByScale(*(Verifier(one.verification, one.geometric) for one in (s, s.indoors())))
+    verifiers = ByScale(*(make_verifier(one) for one in (s, s.indoors())))
     return Relocalizer(s.relocalise, s.visual, verifiers, network, KnownMap(keyframes, clouds, poses))
 
 

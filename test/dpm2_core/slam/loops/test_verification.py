@@ -16,6 +16,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.loops.verification import VerificationSettings, Verifier, objection_of_others
+from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricSettings
 
 
@@ -54,7 +55,7 @@ def suburb_scans() -> tuple[list[Points], Array]:
 
 
 def verifier() -> Verifier:
-    return Verifier(VerificationSettings(), GeometricSettings())
+    return Verifier(VerificationSettings(), GeometricSettings(), PreprocessSettings())
 
 
 @pytest.mark.slow
@@ -110,7 +111,7 @@ def test_a_proposal_that_is_off_along_a_street_is_moved_to_its_place(preset: Pre
     """It would stay beside it, where the covariance leaves the street open, or where half of what stands there fits:
     each is a reason to look 1 m to either side."""
     clouds, poses = scans_along(preset)
-    v = Verifier(VerificationSettings(max_moved=3.0), GeometricSettings())
+    v = Verifier(VerificationSettings(max_moved=3.0), GeometricSettings(), PreprocessSettings())
     others = [k for k in range(i - 3, min(i + 4, len(clouds))) if k != i]
     around = v.surroundings([clouds[k] for k in others], se3.inverse(poses[i]) @ poses[others])
     found = v.verify(clouds[i], around, se3.exp(np.array([0, 0, 0, meters, 0, 0])))

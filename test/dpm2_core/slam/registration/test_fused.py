@@ -61,7 +61,9 @@ class Case:
         self.oracle = Oracle()
         self.oracle.uses_images = images
         geometric = GeometricScanRegistration(
-            Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+            Preprocessor(PreprocessSettings()),
+            GeometricRegistration(GeometricSettings()),
+            LocalMap(LocalMapSettings(), PreprocessSettings().map_voxel),
         )
         self.registration = FusedScanRegistration(self.oracle, geometric, always)  # type: ignore[arg-type]
         for frame, T in zip(frames[:5], truth[:5], strict=True):

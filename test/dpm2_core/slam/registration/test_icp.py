@@ -25,7 +25,9 @@ Case = tuple[GeometricScanRegistration, Scan, Array]
 def make_registration() -> GeometricScanRegistration:
     """With the default settings, and an empty map."""
     return GeometricScanRegistration(
-        Preprocessor(PreprocessSettings()), GeometricRegistration(GeometricSettings()), LocalMap(LocalMapSettings())
+        Preprocessor(PreprocessSettings()),
+        GeometricRegistration(GeometricSettings()),
+        LocalMap(LocalMapSettings(), PreprocessSettings().map_voxel),
     )
 
 
@@ -147,7 +149,7 @@ def test_a_scan_without_points_fails(suburb_drive: Drive, information: Array | N
 def test_likelihood_is_greatest_at_the_truth(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     scan = Preprocessor(PreprocessSettings()).prepare(frames[4], np.zeros(6))
-    local_map = LocalMap(LocalMapSettings())
+    local_map = LocalMap(LocalMapSettings(), PreprocessSettings().map_voxel)
     local_map.insert(Preprocessor(PreprocessSettings()).prepare(frames[0], np.zeros(6)).cloud, np.eye(4))
     method = GeometricRegistration(GeometricSettings())
     fit = [method.likelihood(scan.source, local_map, truth[4] @ se3.exp([0, 0, 0, x, 0, 0])) for x in (0, 0.3, 1, 3)]
