@@ -59,7 +59,9 @@ def make_slam(
         UsageError: a network has no weights to run with, or the settings are others.
     """
     s = settings or SlamSettings()
-    return Slam(make_odometry(s, robot), *make_map(s, store, background), s.map.thumbnail, s.visual)
+    odometry = make_odometry(s, robot)
+    pictured = s.odometry.degraded_sigma if s.visual.enabled else None
+    return Slam(odometry, *make_map(s, store, background), s.map.thumbnail, pictured)
 
 
 def make_map(
@@ -109,7 +111,7 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
             if s.registration == "neural"
             else FusedScanRegistration(neural, geometric, s.registration == "refined")
         )
-    return VisualScanRegistration(s.visual, chosen) if s.visual.enabled else chosen
+    return VisualScanRegistration(s.visual, chosen, s.odometry.degraded_sigma) if s.visual.enabled else chosen
 
 
 def make_mapper(s: SlamSettings, store: MapStore | None = None, background: bool = False) -> Mapper:

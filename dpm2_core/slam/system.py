@@ -18,7 +18,6 @@ from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
-from dpm2_core.slam.registration.texture import VisualSettings
 
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
@@ -73,17 +72,18 @@ class Slam:
         mapper: Mapper,
         localizer: Localizer | None = None,
         thumbnail_width: int = 0,
-        visual: VisualSettings | None = None,
+        pictured: float | None = None,
     ) -> None:
         """Put the parts together.
 
         Args:
             thumbnail_width: of the image that every keyframe carries into a map file, pixels; 0: none.
-            visual: which keyframes carry one by which their place is found again; None: none.
+            pictured: standard deviation of the position in its worst direction, m, above which keyframes carry one by
+                which their place is found again; None: none does.
         """
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
         self._thumbnail_width = thumbnail_width
-        self._visual = visual if visual is not None and visual.enabled else None
+        self._pictured = pictured
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
 
@@ -129,10 +129,10 @@ class Slam:
     def _asks_pictures(self, result: OdometryResult) -> bool:
         """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""
         registration = result.registration
-        return self._visual is not None and (
+        return self._pictured is not None and (
             self.localizer is not None
             or registration.method in ("first", "visual")
-            or registration.worst_sigma > self._visual.sigma
+            or registration.worst_sigma > self._pictured
         )
 
     def map_step(self, keyframe: Keyframe) -> MapResult:

@@ -81,7 +81,7 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
     ros: Callable[..., Any], processes: list[Any], fast_camera: Path, drive: Any, tmp_path: Path
 ) -> None:
     """Bit for bit, images included: here every pose is moved by the image of its cloud."""
-    settings = ["slam.visual.sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
+    settings = ["slam.odometry.degraded_sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
     settings += ["slam.registration=geometric", "slam.loops.descriptors=false"]  # else the network would be loaded
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")

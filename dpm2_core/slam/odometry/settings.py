@@ -22,7 +22,8 @@ class OdometrySettings(Settings):
     """Standard deviation of the acceleration, m/s2 (and, in rad/s2, of the angular one): how far the prediction is
     trusted where the points do not constrain the pose, as along a tunnel. Elsewhere they outweigh it."""
     degraded_sigma: float = Field(0.08, gt=0)
-    """Standard deviation of the position in its worst direction above which the state is `degraded`, m."""
+    """Standard deviation of the position in its worst direction above which that direction counts as open, m: images
+    and intensities are asked (`visual`), and where they do not know either, the state is `degraded`."""
     lost_after: int = Field(5, ge=1)
     """Frames without a registration until the state is `lost`; `degraded` before."""
     restart_after: int = Field(10, ge=1)

@@ -30,8 +30,9 @@ _ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
 class VisualScanRegistration:
     """Any registration, and image or intensity along the direction that it leaves open."""
 
-    def __init__(self, settings: VisualSettings, registration: ScanRegistration) -> None:
-        self._settings = settings
+    def __init__(self, settings: VisualSettings, registration: ScanRegistration, open_sigma: float) -> None:
+        """open_sigma: standard deviation of the position, m, above which its worst direction counts as open."""
+        self._settings, self._open_sigma = settings, open_sigma
         self._registration = registration
         self._last: tuple[Scan, Array] | None = None  # a scan with images and where it was taken
         self._reference: Reference | None = None  # made of it when first needed
@@ -44,7 +45,7 @@ class VisualScanRegistration:
         return len(self._registration)
 
     def fresh(self) -> VisualScanRegistration:
-        return VisualScanRegistration(self._settings, self._registration.fresh())
+        return VisualScanRegistration(self._settings, self._registration.fresh(), self._open_sigma)
 
     def prepare(self, frame: Frame, motion: Array) -> Scan:
         twist = np.atleast_2d(motion)[0]
@@ -55,9 +56,9 @@ class VisualScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         result = self._registration.register(scan, prediction)
-        if result.ok and result.worst_sigma > self._settings.sigma:
+        if result.ok and result.worst_sigma > self._open_sigma:
             result = self._told(scan, result, prediction.information)
-        self._tied = result.ok and result.worst_sigma <= self._settings.sigma
+        self._tied = result.ok and result.worst_sigma <= self._open_sigma
         return result
 
     def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:

@@ -17,6 +17,7 @@ from dpm2_core.estimates import Registration, State
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry, make_registration, make_slam
+from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.registration.texture import VisualSettings
 from dpm2_core.slam.settings import SlamSettings
@@ -249,7 +250,7 @@ def test_points_images_and_intensities_of_a_real_drive_agree(kitti_root: Path) -
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = []
     for sigma in (0.08, 1e-4):
-        odometry = make_odometry(SlamSettings(visual=VisualSettings(sigma=sigma)))
+        odometry = make_odometry(SlamSettings(odometry=OdometrySettings(degraded_sigma=sigma)))
         tracks.append([odometry.process(frame) for frame in frames])
     methods = [tracked.registration.method for tracked in tracks[1][1:]]
     assert methods.count("visual") >= 4  # of 11: until there are scans enough to ask the intensities
