@@ -34,7 +34,6 @@ class Options:
 
     Attributes:
         sources: KITTI sequences or bags; by default the KITTI excerpt.
-        kitti: folder of the excerpt, packed (it holds unpack.py) or in KITTI layout; None looks for it.
         repetitions: of every method on every drive.
         threads: processors that every method may use.
         overrides: `key=value` settings of the SLAM, and of how drives are read.
@@ -46,7 +45,6 @@ class Options:
     """
 
     sources: Sequence[Path] = ()
-    kitti: Path | None = None
     repetitions: int = 3
     threads: int = 2
     overrides: Sequence[str] = ()
@@ -57,10 +55,11 @@ class Options:
     out: Path = Path("benchmarks")
     cache: Path = Path("out/bench")
 
-    @property
-    def excerpt(self) -> Path:
-        """Where the KITTI excerpt should be: as asked for, $DPM2_KITTI, or beside the repository."""
-        return self.kitti or Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
+
+def excerpt() -> Path:
+    """Where the KITTI excerpt should be, packed (it holds unpack.py) or in KITTI layout: $DPM2_KITTI, or beside the
+    repository."""
+    return Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
 
 
 def settings_of(options: Options, *more: str) -> SlamSettings:
@@ -108,9 +107,11 @@ def drives(options: Options, more: Sequence[Source] = ()) -> Iterator[dict[str, 
     if options.sources:
         yield _named([*(open_source(path, how) for path in options.sources), *more])
         return
-    kitti = options.excerpt
+    kitti = excerpt()
     if not kitti.is_dir():
-        raise UsageError(f"{kitti}: no KITTI excerpt; give --kitti, or --source with a drive such as `dpm2 sim` makes")
+        raise UsageError(
+            f"{kitti}: no KITTI excerpt; set DPM2_KITTI, or give --source with a drive such as `dpm2 sim` makes"
+        )
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_") as folder:
         root = kitti
         if (kitti / "unpack.py").is_file():

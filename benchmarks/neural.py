@@ -80,10 +80,9 @@ def bench_neural(options: Options) -> Report:
 
 def _options(options: Options) -> dict[str, Any]:
     """What all parts of a record have in common: those of other options are no rows of the same tables."""
-    named = {"kitti": options.kitti, "unseen": options.unseen}
     return {
         "sources": [path.name for path in options.sources],
-        **{key: path and path.name for key, path in named.items()},  # a record names no folders of a machine
+        "unseen": options.unseen and options.unseen.name,  # a record names no folders of a machine
         "overrides": list(options.overrides),
         "repetitions": options.repetitions,
         "threads": options.threads,

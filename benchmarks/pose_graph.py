@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Group
 from scipy.spatial import cKDTree
 
-from benchmarks.harness import Options, Report
+from benchmarks.harness import Options, Report, excerpt
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
@@ -38,10 +38,9 @@ def bench_pose_graph(options: Options) -> Report:
     Raises:
         UsageError: there are no KITTI pose graphs.
     """
-    folder = options.excerpt
-    folder = folder / "pose_graphs"
+    folder = excerpt() / "pose_graphs"
     if not (folder / "kitti_00_GT.g2o").is_file():
-        raise UsageError(f"{folder}: no kitti_00_GT.g2o; give --kitti")
+        raise UsageError(f"{folder}: no kitti_00_GT.g2o; set DPM2_KITTI")
     truth = read_g2o(folder / "kitti_00_GT.g2o").graph.poses
     kitti = {}
     for alpha in ("0.00", "0.30", "0.60"):

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, settings_of
+from benchmarks.harness import Options, Report, excerpt, settings_of
 from benchmarks.loops import check_loops
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
@@ -81,9 +81,9 @@ def road_files(options: Options) -> Sequence[Path]:
     """
     if options.sources:
         return options.sources
-    found = [options.excerpt / "gt_poses" / f"{name}.txt" for name in ROADS]
+    found = [excerpt() / "gt_poses" / f"{name}.txt" for name in ROADS]
     if missing := [path for path in found if not path.is_file()]:
-        raise UsageError(f"{missing[0]}: no such pose file; give --kitti, or --source with files of KITTI poses")
+        raise UsageError(f"{missing[0]}: no such pose file; set DPM2_KITTI, or give --source with files of KITTI poses")
     return found
 
 

@@ -100,10 +100,9 @@ class _Scans:
 
 def bench(
     out: Annotated[Path, typer.Option(help="Folder for robots.json.")] = Path("benchmarks"),
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI excerpt; by default as `dpm2 bench`.")] = None,
 ) -> int:
     """All keyframes in one map, and its error beside that of one robot that drives all of the road alone."""
-    path = next(path for path in road_files(Options(kitti=kitti)) if path.stem == ROAD)
+    path = next(path for path in road_files(Options()) if path.stem == ROAD)
     source = open_road(path)
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
         data, made, missed = _drive(source, Path(folder))

@@ -23,10 +23,11 @@ def bench(
         ),
     ] = None,
     source: Annotated[
-        list[Path] | None, typer.Option(help="A KITTI sequence or bag with ground truth, instead of the excerpt.")
-    ] = None,
-    kitti: Annotated[
-        Path | None, typer.Option(help="KITTI excerpt, packed or in KITTI layout; else $DPM2_KITTI, ../shared/kitti.")
+        list[Path] | None,
+        typer.Option(
+            help="A KITTI sequence or bag with ground truth; else the KITTI excerpt, packed or in KITTI layout, "
+            "in $DPM2_KITTI or ../shared/kitti."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for NAME.json.")] = Path("benchmarks"),
     repetitions: Annotated[
@@ -53,7 +54,7 @@ def bench(
 
     names = names or ["geometric"]
     every: dict[str, Any] = {
-        "source": source, "kitti": kitti, "repetitions": repetitions, "threads": threads, "set": settings,
+        "source": source, "repetitions": repetitions, "threads": threads, "set": settings,
         "weights": weights, "unseen": unseen, "pairs": pairs, "only": only,
     }  # fmt: skip
     given = {option: value for option, value in every.items() if value is not None}

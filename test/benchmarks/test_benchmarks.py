@@ -202,19 +202,22 @@ def test_drives_are_read_as_the_settings_say(sequence: Path) -> None:
         assert [source.vertical_angle_correction_deg for source in sources.values()] == [0.3]  # the recording says 0
 
 
-def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(sequence: Path, tmp_path: Path) -> None:
+def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DPM2_KITTI", str(tmp_path))
     unpack = tmp_path / "unpack.py"
     unpack.write_text(f"import shutil, sys\nshutil.copytree({str(sequence)!r}, sys.argv[1] + '/sequences/07')")
-    with drives(Options(kitti=tmp_path)) as sources:
+    with drives(Options()) as sources:
         assert [(name, len(source)) for name, source in sources.items()] == [("07", FRAMES)]
         frame = next(iter(sources["07"].frames(0, 1)))
     assert len(frame.points) == 36_000
     unpack.write_text("raise SystemExit('scan 3 is damaged')")
-    with pytest.raises(Dpm2Error, match=r"unpack\.py: .*scan 3 is damaged"), drives(Options(kitti=tmp_path)):
+    with pytest.raises(Dpm2Error, match=r"unpack\.py: .*scan 3 is damaged"), drives(Options()):
         pass
 
 
-def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
     for name, ignored in (("diffslam", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
@@ -223,10 +226,12 @@ def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path) -> 
             bench([name], out=tmp_path, **argument)
     with pytest.raises(UsageError, match="--only tasks: no such part"):
         bench(["finetune"], out=tmp_path, only="tasks")
+    monkeypatch.setenv("DPM2_KITTI", str(tmp_path / "none"))
     with pytest.raises(UsageError, match="none: no KITTI excerpt"):
-        bench(kitti=tmp_path / "none")
+        bench()
+    monkeypatch.setenv("DPM2_KITTI", str(tmp_path))
     with pytest.raises(UsageError, match=r"neither unpack\.py nor sequences"):
-        bench(kitti=tmp_path)
+        bench()
     with pytest.raises(UsageError, match="memory: give --source"):
         bench(["memory"])
     with pytest.raises(UsageError, match="nonsense"):

@@ -65,6 +65,7 @@ def test_an_answer_is_right_wrong_or_none() -> None:
     assert (result["right"], result["wrong"], result["no_answer"]) == (0.25, 2, 1)
 
 
-def test_missing_roads_are_an_error_of_use(tmp_path: Path) -> None:
+def test_missing_roads_are_an_error_of_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DPM2_KITTI", str(tmp_path))
     with pytest.raises(UsageError, match="no such pose file"):
-        road_files(Options(kitti=tmp_path))
+        road_files(Options())
