@@ -37,7 +37,6 @@ class Options:
         repetitions: of every method on every drive.
         threads: processors that every method may use.
         overrides: `key=value` settings of the SLAM, and of how drives are read.
-        weights: of the network, a name or a path; None: those of the settings.
         unseen: packed drives of worlds that the network has not seen; None makes some.
         pairs: of frames of each kind.
         only: part of a benchmark that has several; None: all that are not in its file yet.
@@ -48,7 +47,6 @@ class Options:
     repetitions: int = 3
     threads: int = 2
     overrides: Sequence[str] = ()
-    weights: str | None = None
     unseen: Path | None = None
     pairs: int = 60
     only: str | None = None
@@ -68,8 +66,7 @@ def settings_of(options: Options, *more: str) -> SlamSettings:
 
 
 def _configuration(options: Options, *more: str) -> Config:
-    weights = [] if options.weights is None else [f"slam.neural.weights={options.weights}"]
-    return load_settings(Config, None, [f"slam.threads={options.threads}", *weights, *options.overrides, *more])
+    return load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides, *more])
 
 
 def requested(options: Options, parts: Collection[str]) -> list[str]:

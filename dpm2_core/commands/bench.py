@@ -37,7 +37,6 @@ def bench(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
     ] = None,
-    weights: Annotated[str | None, typer.Option(help="Of the network: a name or a .safetensors file.")] = None,
     unseen: Annotated[
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
@@ -55,7 +54,7 @@ def bench(
     names = names or ["geometric"]
     every: dict[str, Any] = {
         "source": source, "repetitions": repetitions, "threads": threads, "set": settings,
-        "weights": weights, "unseen": unseen, "pairs": pairs, "only": only,
+        "unseen": unseen, "pairs": pairs, "only": only,
     }  # fmt: skip
     given = {option: value for option, value in every.items() if value is not None}
     check_options(names, given)

@@ -220,7 +220,7 @@ def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(
 def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match=r"speed: no such benchmark; choose from .*geometric, .*neural"):
         bench(["geometric", "speed"])
-    for name, ignored in (("diffslam", "source"), ("geometric", "weights"), ("pose-graph", "set"), ("map", "pairs")):
+    for name, ignored in (("diffslam", "source"), ("geometric", "unseen"), ("pose-graph", "set"), ("map", "pairs")):
         argument = {"settings" if ignored == "set" else ignored: [sequence]}
         with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} has no use for it; it takes --"):
             bench([name], out=tmp_path, **argument)
@@ -253,12 +253,13 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
 ) -> None:
     """With random weights: the classical methods beside it are right, and refined falls back on points."""
     save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true", "phase": "2"})
+    settings = [f"slam.neural.weights={tmp_path}/tiny.safetensors"]
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
     samples = [Sample(boxes(noise), T, (make_image(noise),)) for T in poses]
     write_packed(tmp_path / "unseen" / "world", samples, {})
     bench(
         ["neural"], source=[sequence], out=tmp_path, repetitions=1, threads=1, pairs=3,
-        weights=str(tmp_path / "tiny.safetensors"), unseen=tmp_path / "unseen",
+        settings=settings, unseen=tmp_path / "unseen",
     )  # fmt: skip
     path = tmp_path / "neural.json"
     record = json.loads(path.read_text())
@@ -288,7 +289,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     record["parts"]["real"]["seconds"] = record["parts"]["speed"]["seconds"] = -1
     path.write_text(json.dumps(record))
     again = {"source": [sequence], "out": tmp_path, "repetitions": 1, "threads": 1, "pairs": 3,
-             "weights": str(tmp_path / "tiny.safetensors"), "unseen": tmp_path / "unseen"}  # fmt: skip
+             "settings": settings, "unseen": tmp_path / "unseen"}  # fmt: skip
     bench(["neural"], **again)
     parts = json.loads(path.read_text())["parts"]
     assert "average_precision" in parts["overlap"]

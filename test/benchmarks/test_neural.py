@@ -43,7 +43,9 @@ def test_parts_of_other_options_are_measured_again(
 
     monkeypatch.setattr(neural, "PARTS", {"first": part, "second": part})
     save_weights(DeepPointMap2(tiny()), tmp_path / "tiny.safetensors", {"phase": "2"})
-    options = Options(out=tmp_path, weights=str(tmp_path / "tiny.safetensors"), threads=1, pairs=3)
+    weights = f"slam.neural.weights={tmp_path}/tiny.safetensors"
+    options = Options(out=tmp_path, overrides=[weights], threads=1, pairs=3)
+    other = {**other, "overrides": [weights, *other.get("overrides", ())]}
     neural.bench_neural(options)
     neural.bench_neural(options)
     assert len(measured) == 2

@@ -62,14 +62,16 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
 def test_other_weights_of_the_network_or_threads_are_another_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The figures of the weights before were shown as those of `--weights`, and the times of two threads beside one."""
+    """Figures of other weights were shown as theirs, and the times of two threads beside one."""
     monkeypatch.setattr(traffic, "PLACES", {})  # no drive: the recipe alone
     options = Options(threads=1, out=tmp_path)
     trained = tmp_path / "mine.safetensors"
     recipes = []
     for content in (b"weights", b"weights of another training"):
         trained.write_bytes(content)
-        recipes.append(traffic.bench_traffic(replace(options, weights=str(trained))).results["recipe"])
+        recipes.append(
+            traffic.bench_traffic(replace(options, overrides=[f"slam.neural.weights={trained}"])).results["recipe"]
+        )
     recipes += [traffic.bench_traffic(asked).results["recipe"] for asked in (options, replace(options, threads=2))]
     assert all(a != b for a, b in combinations(recipes, 2))
     assert traffic.bench_traffic(options).results["recipe"] == recipes[2]
