@@ -172,9 +172,11 @@ def ablation(
     config: ConfigOption = None,
     settings: SetOption = None,
     out: OutOption = Path("out/ablation"),
-    report: Annotated[Path, typer.Option("--json", help="Table to write.")] = Path("benchmarks/ablation.json"),
 ) -> None:
-    """The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike; continues."""
+    """The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike; continues.
+
+    The figures are written to ablation.json in --out.
+    """
     from dpm2_core.data.packed import open_packed, scans_of
     from dpm2_core.evaluation.record import write_record
     from dpm2_core.experiments.ablation import AblationSettings, ablation_tables, gains
@@ -191,6 +193,7 @@ def ablation(
         say_packed(f"measure.{name}", Path(folder), learned)
     found = compare(chosen, out)
     results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
+    report = out / "ablation.json"
     write_record(report, "ablation", results)
     for table in ablation_tables(found):
         Console().print(table)
