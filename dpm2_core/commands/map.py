@@ -71,21 +71,22 @@ def merge(
 def prune(
     path: MapFile,
     out: Annotated[Path, typer.Option(help="New map file.")],
-    distance: Annotated[
-        float, typer.Option(min=0, help="From an older keyframe, m; height counts four times; 0: only what borrows.")
-    ] = 3.0,
-    angle: Annotated[float, typer.Option(min=0, max=180, help="Between their headings, degrees.")] = 30.0,
 ) -> None:
-    """Take out the keyframes that revisits made redundant; what they constrain and where they were stays."""
+    """Take out the keyframes that revisits made redundant; what they constrain and where they were stays.
+
+    Redundant is one within 3 m (a meter of height counts for four) and 30 degrees of an older one.
+    """
     from dpm2_core.slam.mapping.prune import prune as pruned
     from dpm2_core.slam.mapping.prune import redundant_nodes
+    from dpm2_core.slam.mapping.redundancy import RedundancySettings
     from dpm2_core.slam.store.map_data import check_new, load_map, save_as
     from dpm2_core.slam.store.map_store import MapStore
 
     check_new(out)
+    near = RedundancySettings()
     with MapStore.open(path) as store:
         data = load_map(store)
-        less = pruned(data, redundant_nodes(data, distance, angle))
+        less = pruned(data, redundant_nodes(data, near.distance, near.angle))
         save_as(less, out)
     note(f"{out}: {len(less)} keyframes of {len(data)}")
 
