@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import write_json
 from dpm2_core.frame import Points
 from dpm2_core.slam.mapping.tiles import write_tiles
-from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, trajectory, ways
+from dpm2_core.slam.store.map_data import MapData, Way, load_map, map_cloud, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
 
 
@@ -71,17 +72,19 @@ def _tied(data: MapData, out: Path) -> MapData:
     from dpm2_core.slam.mapping.parts import first_part
 
     tied = first_part(data)
-    whole, left = (Counter({drive: len(poses) for drive, (_, poses) in ways(d).items()}) for d in (data, tied))
-    for drive, count in sorted((whole - left).items()):
-        _say_without(out, drive, count, whole[drive], "no loop ties them to the first keyframe")
+    _say_without(out, ways(data), ways(tied), "no loop ties them to the first keyframe")
     return tied
 
 
-def _say_without(out: Path, drive: tuple[str, int], count: int, total: int, reason: str) -> None:
-    """Say that keyframes of a drive (robot, session) are not in a file."""
-    robot, session = drive
-    name = f"session {session} of {robot}" if robot else f"session {session}"
-    note(f"{out}: without {count} of the {total} keyframes of {name}: {reason}")
+def _say_without(out: Path, drives: Iterable[Way], written: Iterable[Way], reason: str) -> None:
+    """Say which keyframes of the drives are not in a file, which has those of `written`."""
+    whole, left = Counter[tuple[str, int]](), Counter[tuple[str, int]]()
+    for count, some in ((whole, drives), (left, written)):
+        for way in some:
+            count[way.robot, way.session] += len(way.poses)
+    for (robot, session), missing in sorted((whole - left).items()):
+        name = f"session {session} of {robot}" if robot else f"session {session}"
+        note(f"{out}: without {missing} of the {whole[robot, session]} keyframes of {name}: {reason}")
 
 
 def _cloud(data: MapData, out: Path, voxel: float) -> Points:
@@ -96,17 +99,16 @@ def _export_geojson(data: MapData, out: Path) -> None:
     placed, features = placed_on_earth(data), []
     if np.isnan(placed.poses).all():
         raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
-    for (robot, session), (_, poses) in ways(placed).items():
-        way = poses[:, :3, 3]
-        known = np.isfinite(way).all(axis=1)
-        if not known.all():
-            reason = "neither their own fixes nor those of what loops tie them to tell where they are"
-            _say_without(out, (robot, session), int((~known).sum()), len(way), reason)
-        if not known.any():
-            continue
-        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in geodesy.geodetic(way[known]).tolist()]
+    drives = ways(placed)
+    known = [replace(way, poses=way.poses[np.isfinite(way.poses).all(axis=(1, 2))]) for way in drives]
+    reason = "neither their own fixes nor those of what loops tie them to tell where they are"
+    _say_without(out, drives, known, reason)
+    for way in (way for way in known if len(way.poses)):
+        places = geodesy.geodetic(way.poses[:, :3, 3]).tolist()
+        line = [[round(lon, 9), round(lat, 9), round(up, 3)] for lat, lon, up in places]
         geometry = {"type": "LineString", "coordinates": line if len(line) > 1 else line * 2}
-        features.append({"type": "Feature", "properties": {"robot": robot, "session": session}, "geometry": geometry})
+        about = {"robot": way.robot, "session": way.session}
+        features.append({"type": "Feature", "properties": about, "geometry": geometry})
     write_json(out, {"type": "FeatureCollection", "features": features})
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from dpm2_core.commands.options import note
 from dpm2_core.database import size_with_log
-from dpm2_core.frame import Array
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.mapping.restore import restore_solved
-from dpm2_core.slam.store.map_data import MapData, ways
+from dpm2_core.slam.store.map_data import MapData, Way, ways
 from dpm2_core.slam.store.map_file import missing_log
 from dpm2_core.slam.store.map_store import MapStore
 
@@ -39,8 +38,8 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
         "with_descriptors": with_descriptors,
         "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),
-        "robots": sorted({robot for robot, _ in drives}),
-        "length_m": _length(drives.values()),
+        "robots": sorted({way.robot for way in drives}),
+        "length_m": _length(drives),
         "extent_m": np.ptp(data.poses[placed, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
@@ -109,9 +108,9 @@ def georeference_text(figures: dict[str, Any] | None, unplaced: str) -> str:
     )
 
 
-def _length(drives: Iterable[tuple[list[int], Array]]) -> float:
+def _length(drives: Iterable[Way]) -> float:
     """Of the ways of all drives, m."""
-    steps = (np.diff(poses[:, :3, 3], axis=0) for _, poses in drives)
+    steps = (np.diff(way.poses[:, :3, 3], axis=0) for way in drives)
     return float(sum(np.linalg.norm(step, axis=1).sum() for step in steps))
 
 

@@ -99,8 +99,8 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
 
 
 def _tracks(data: MapData, middle: Array) -> list[list[list[float]]]:
-    """The way of each session, through keyframes that were pruned as well."""
-    return [(poses[:, :3, 3] - middle).round(3).tolist() for _, poses in ways(data).values()]
+    """The way of each drive, through keyframes that were pruned as well."""
+    return [(way.poses[:, :3, 3] - middle).round(3).tolist() for way in ways(data)]
 
 
 def _loop(edge: Edge) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -286,16 +286,38 @@ def _thinned(clouds: Sequence[Points], voxel: float) -> Points:
     return cloud[voxel_first(cloud, voxel)]
 
 
-def ways(data: MapData) -> dict[tuple[str, int], tuple[list[int], Array]]:
-    """Stamps (ns) and (K, 4, 4) T_map_kf of each drive (robot, session) as it went, those of pruned keyframes too.
+@dataclass(frozen=True, eq=False)
+class Way:
+    """Where a robot was in a session: stamps (K,) in ns and (K, 4, 4) T_map_kf."""
 
-    Ids tell the order, not stamps: a clock may be set back, and a recording be played again.
+    robot: str
+    session: int
+    stamps: list[int]
+    poses: Array
+
+
+def ways(data: MapData) -> list[Way]:
+    """Each drive as it went, through keyframes that were pruned as well; of a robot and session in turn.
+
+    A session has several where the odometry began anew, as after a recording that was played again; of keyframes that
+    were pruned that is not known. Ids tell the order, not stamps: a clock may be set back.
     """
-    steps = [(k.robot, s, k.id, k.stamp, T) for k, s, T in zip(data.keyframes, data.session, data.poses, strict=True)]
-    steps += [(p.robot, p.session, p.id, p.stamp, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
+    led = odometry_by_node(data.edges)
+    steps: list[tuple[str, int, int, int, int | None, Array]] = [
+        (k.robot, session, k.id, k.stamp, node, data.poses[node])
+        for node, (k, session) in enumerate(zip(data.keyframes, data.session, strict=True))
+    ]
+    steps += [(p.robot, p.session, p.id, p.stamp, None, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
     steps.sort(key=lambda step: step[:4])
-    drives = {drive: list(way) for drive, way in groupby(steps, lambda step: step[:2])}
-    return {drive: ([step[3] for step in way], np.array([step[4] for step in way])) for drive, way in drives.items()}
+    found = []
+    for (robot, session), drive in groupby(steps, lambda step: step[:2]):
+        way = list(drive)
+        nodes = enumerate(pairwise([step[4] for step in way]), 1)
+        cuts = [at for at, (before, node) in nodes if None not in (before, node) and node not in led]
+        for start, end in pairwise([0, *cuts, len(way)]):
+            _, _, _, stamps, _, poses = zip(*way[start:end], strict=True)
+            found.append(Way(robot, session, list(stamps), np.array(poses)))
+    return found
 
 
 def trajectory(data: MapData) -> tuple[list[int], Array]:
@@ -304,11 +326,11 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
     The frame with which a drive was cut off and went on, a keyframe of both sessions, is there once.
     """
     stamps, poses, ends = list[int](), [data.poses[:0]], set[tuple[str, int]]()
-    for (robot, _), (at, T_map_kf) in sorted(ways(data).items(), key=lambda way: way[1][0][0]):
-        again = int((robot, at[0]) in ends)
-        ends.add((robot, at[-1]))
-        stamps += at[again:]
-        poses.append(T_map_kf[again:])
+    for way in sorted(ways(data), key=lambda way: way.stamps[0]):
+        again = int((way.robot, way.stamps[0]) in ends)
+        ends.add((way.robot, way.stamps[-1]))
+        stamps += way.stamps[again:]
+        poses.append(way.poses[again:])
     return stamps, np.concatenate(poses)
 
 

@@ -31,7 +31,7 @@ from dpm2_core.slam.mapping.merge import merge_maps, optimized
 from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as, ways
 from dpm2_core.slam.store.map_store import Change, MapStore
 
 from ...helpers.command import dpm2
@@ -204,6 +204,20 @@ def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
         figures = json.loads((tmp_path / f"{name}.json").read_text())
         assert figures["length_m"] == pytest.approx(2 * 110.0)
         assert figures["bytes"] == size
+
+
+def test_two_drives_of_a_session_are_two_ways(tmp_path: Path) -> None:
+    """The odometry began anew in it, as after a recording that was played again: 1 km from the end of the one to the
+    start of the other was length, and a line on the page and in GeoJSON."""
+    both = side_by_side({"one": ring(12), "two": ring(12)}, [])
+    poses = both.poses.copy()
+    poses[12:, 0, 3] += 1000
+    again = [replace(k, id=node, robot="") for node, k in enumerate(both.keyframes)]
+    save_as(replace(both, keyframes=again, session=[1] * 24, poses=poses), tmp_path / "map")
+    assert dpm2("map", "info", tmp_path / "map", "--json", tmp_path / "info.json").returncode == 0
+    one = np.linalg.norm(np.diff(ring(12).poses[:, :3, 3], axis=0), axis=1).sum()
+    assert json.loads((tmp_path / "info.json").read_text())["length_m"] == pytest.approx(2 * one)
+    assert [len(way.stamps) for way in ways(loaded(tmp_path / "map"))] == [12, 12]
 
 
 def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
