@@ -4,6 +4,7 @@
 An argument that is left empty is not given to the nodes: files and defaults decide.
 """
 
+import os
 import re
 from pathlib import Path
 
@@ -59,6 +60,11 @@ PARAMETERS = {
 SAVING = "120"
 """s after Ctrl-C until `launch` sends SIGTERM, and SIGKILL 5 s later; its own 5 s are not enough to save a map."""
 SHOWN = {"points_topic": "/kitti/velo/pointcloud", "image_topic": "/kitti/camera_color_left/image_raw"}
+
+
+def at_home(value: dict[str, str]) -> dict[str, str]:
+    """With ~ expanded in paths, which no shell does behind `:=`; the nodes do it with those that they are given."""
+    return value | {name: os.path.expanduser(value[name]) for name in ("bag", "params_file")}
 
 
 def parameters(value: dict[str, str]) -> dict[str, bool | str]:
@@ -134,7 +140,7 @@ def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue
 
 
 def _actions(context) -> list:
-    value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    value = at_home({name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS})
     common = {"package": "dpm2_ros", "output": "screen", "sigterm_timeout": SAVING}
     if value["lifecycle"] == "true":
         common["arguments"] = ["--lifecycle"]

@@ -280,6 +280,16 @@ def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> li
     return found
 
 
+def test_paths_may_begin_at_home(launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shell expands what stands behind `:=`: `params_file:=~/mine.yaml` was no such file, and so was the bag."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    file = write({}, tmp_path / "mine.yaml")
+    value = defaults(launch_file) | {"bag": "~/drive.mcap", "params_file": "~/mine.yaml", "rviz": "false"}
+    words = dict(commands(launch_file, value, tmp_path))
+    assert str(file) in words["slam_node"]
+    assert words["bag_player"][0] == str(tmp_path / "drive.mcap")
+
+
 @pytest.mark.slow
 def test_what_it_starts_with_lifecycle_is_managed_over_the_services(
     launch_file: ModuleType, ros: Callable[..., Any], drive: Any, tmp_path: Path
