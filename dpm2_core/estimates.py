@@ -192,8 +192,8 @@ class OdometryResult:
         twist: (6,) [rad/s, m/s] in the LiDAR frame.
         registration: how it was found.
         keyframe: set when this frame became one.
-        breaks: pauses so far across which the way is not known; since the last one the pose is a guess, `covariance` of
-            the frame in which it was given up says how good.
+        breaks: pauses and lifts so far across which the way is not known; since the last one the pose is a guess,
+            `covariance` of the frame in which it was given up says how good.
         seconds: wall time of each stage.
         comparison: with another odometry, where there is one and the frame was registered.
         imu: why the IMU was of no use, in words, empty where it was; None while there has been none.

@@ -147,7 +147,7 @@ class Diagnostics:
         """What else is to be said of the last result and of the clouds since the last message, and how bad that is."""
         topic, log, found = self._inputs.calibration.points_topic, self._node.get_logger(), list[tuple[bytes, str]]()
         if last.breaks:
-            found.append((OK, f"the way across {last.breaks} pause(s) is not known"))
+            found.append((OK, f"the way across {last.breaks} pause(s) or lift(s) is not known"))
         if self.frame_problem:
             found.append((ERROR, self.frame_problem))
         if self.tf_problem:

@@ -23,6 +23,9 @@ that of sound ones, the map took over a bias, a scale or a delay turn by turn: 7
 ANY_VELOCITY = 15.0**2 * np.eye(3)
 """Covariance (3, 3) of the velocity, m/s, until two scans are registered."""
 
+_RIDE = 3.0  # s: no lift comes to another storey sooner, and a crowd or a narrow place is passed
+_UP, _ASIDE = 30.0, 2.0  # m, standard deviations of the way that what encloses the LiDAR may have moved along
+
 
 class MotionState:
     """Pose and motion; poses are of the LiDAR in the odometry frame, at the middle of a sweep.
@@ -52,6 +55,7 @@ class MotionState:
         self.other: OtherMotion | None = None
         self._open = 0.0  # s, for which the scene has left a direction open
         self._started = False
+        self._enclosed: float | None = None  # s, since when all that is seen is near
 
     def start(self, up: Up | None) -> None:
         """Of the first frame: its pose has `up` (3,), of `Frame`, upwards. Later ones change nothing."""
@@ -173,6 +177,19 @@ class MotionState:
         self.twist = twist
         if self.other is not None:
             self.other.compare(T_step, registration.of_scene, seconds, led)
+
+    def opens(self, enclosed: bool, now: float) -> bool:
+        """Whether a registered frame, at `now` s, is the first outside of what may have moved along: as a lift does."""
+        since = self._enclosed
+        self._enclosed = None if not enclosed else now if since is None else since
+        return not enclosed and since is not None and now - since >= _RIDE
+
+    def carry(self) -> None:
+        """It may have moved along with what enclosed it: how far is not known."""
+        R = self.T[:3, :3]
+        along = np.zeros((6, 6))
+        along[3:, 3:] = R.T @ np.diag([_ASIDE, _ASIDE, _UP]) ** 2 @ R
+        self.covariance = self.covariance + along
 
     def register(self, registration: Registration, stamp: int | None, moved: bool) -> None:
         """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way."""

@@ -29,6 +29,7 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 
 _ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
+_CARRIED = "broken by what enclosed the LiDAR: it may have moved along, as a lift does"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 
@@ -139,6 +140,8 @@ class Odometry:
         if self._bridge is not None and registration.ok:
             registration = self._cross(self._bridge, scan, registration)
             T = registration.T_target_source
+        elif registration.ok and motion.opens(enclosed, self._clock.now):
+            registration = self._step_out(scan, registration)
         if motion.inertial is not None:
             T = motion.inertial.T_level_odom @ T
         T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
@@ -257,6 +260,17 @@ class Odometry:
         self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
+
+    def _step_out(self, scan: Scan, registration: Registration) -> Registration:
+        """Out of what enclosed the LiDAR: a break, and a map of what is seen there begins."""
+        motion = self._motion
+        motion.carry()
+        self._keyframes.add_uncertainty(motion.covariance)
+        self._keyframes.request()
+        self._breaks, self._broken = self._breaks + 1, self.next_keyframe
+        self._registration = self._registration.fresh()
+        self._registration.update(scan, motion.T)
+        return registration.because(_CARRIED)
 
     def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Match, float]:
         """A prepared frame, predicted at T_predicted (4, 4), in the map; and how long the period was, s: as stamped or,

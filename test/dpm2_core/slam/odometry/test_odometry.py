@@ -300,6 +300,30 @@ def test_within_what_may_move_along_nothing_is_tracked() -> None:
     assert "may move along" in results[-1].registration.reason
 
 
+@pytest.mark.parametrize(("closed", "breaks"), [(3, 0), (9, 1)], ids=["passed", "ridden"])
+def test_where_a_lift_opens_the_way_is_not_known(closed: int, breaks: int) -> None:
+    """On another storey, 3.5 m up: it was `tracking` with 1 cm of uncertainty, and its edge as firm."""
+    hall, pose = np.array([[-1.05, -1.1, 0], [1.05, 8, 2.4]]), se3.make(np.eye(3), [0, 0, 0.6])
+    front = np.array([[[-1.05, 1, 0], [-0.45, 1.1, 2.4]], [[0.45, 1, 0], [1.05, 1.1, 2.4]]])
+    shut = np.concatenate([front, [[[-0.45, 1, 0], [0.45, 1.1, 2.4]]]])
+    seen = [front] * 4 + [shut] * closed + [front] * 4
+    odometry = make_odometry(SlamSettings(preset="indoor"))
+    results = [
+        odometry.process(Frame(n * 4 * 10**8, rooms.scan(pose, hall, things, n), index=n))
+        for n, things in enumerate(seen)
+    ]
+    opened = results[4 + closed]
+    assert [result.breaks for result in results] == [0] * (4 + closed) + [breaks] * 4
+    assert results[-1].state is (State.DEGRADED if breaks else State.TRACKING)
+    up = float(np.sqrt(opened.covariance[5, 5]))
+    assert (up > 3.5) == bool(breaks)
+    if breaks:
+        assert "broken by what enclosed the LiDAR" in opened.registration.reason
+        assert opened.keyframe is not None
+        assert opened.keyframe.edge is not None
+        assert opened.keyframe.edge.covariance[5, 5] > 3.5**2
+
+
 def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
     """In a simulation without noise; also where the caller uses one array for all clouds."""
     frames, _ = suburb_drive
