@@ -14,6 +14,7 @@ from dpm2_core.frame import Array, Image
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
+from dpm2_core.slam.loops.verification import looks_elsewhere
 
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
 """(6, 6) [rad, m] covariance of an uninformative prior."""
@@ -127,27 +128,24 @@ class Localizer:
         tracking = self._state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if result.ok:
-            meters = self._apart(T_predicted, result)
-            near = meters <= self._allowed
-            repeated = self._far is not None and self._apart(self._far @ keyframe.T_odom_kf, result) <= self._allowed
+            near = self._says_same(T_predicted, result)
+            repeated = self._far is not None and self._says_same(self._far @ keyframe.T_odom_kf, result)
             if not tracking or near or (repeated and self._failures >= self._max_failures):
                 return self._located(keyframe, result, State.TRACKING if tracking and near else State.RELOCALIZED)
             self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf)
-            result = replace(result, ok=False, reason=f"found {meters:.1f} m away, not confirmed yet")
+            meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
+            reason = f"found {meters:.1f} m, {degrees:.0f} deg away, not confirmed yet"
+            result = replace(result, ok=False, reason=reason)
         elif tracking:
             result = rejected
         self._doubt()
         covariance = LOST if self._state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
         return LocalizationResult(T_predicted, covariance, self._state, result)
 
-    @property
-    def _allowed(self) -> float:
-        """How far two results may be apart that say the same, m: what the odometry may drift between them."""
-        return 2.0 + 0.02 * self._distrust
-
-    @staticmethod
-    def _apart(T_map_lidar: Array, result: Registration) -> float:
-        return se3.magnitude(se3.inverse(T_map_lidar) @ result.T_target_source)[0]
+    def _says_same(self, T_map_lidar: Array, result: Registration) -> bool:
+        """Whether a result is no farther from a pose (4, 4) than the odometry may drift since the map confirmed it."""
+        meters, _ = se3.magnitude(se3.inverse(T_map_lidar) @ result.T_target_source)
+        return meters <= 2.0 + 0.02 * self._distrust and not looks_elsewhere(T_map_lidar, result.T_target_source)
 
     def _doubt(self) -> None:
         """Its place, where it has one, is that of the odometry alone."""

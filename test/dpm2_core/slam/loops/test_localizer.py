@@ -97,6 +97,23 @@ def test_a_far_off_place_counts_when_it_is_found_again(found: tuple[float, ...],
     assert states == [State.RELOCALIZED, State.DEGRADED, State.DEGRADED, last]
 
 
+def test_a_place_that_is_turned_counts_when_it_is_found_again() -> None:
+    """In a small room that looks the same from its other end: half a turn away was near, and `tracking`, at once."""
+    about = se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+
+    class Turned(Places):
+        def find(self, *_: object, **__: object) -> Registration:
+            x = self._found.pop(0)
+            return Registration(at(0.5) @ about if x else at(0.0), FIRM, 0.95, 0.05, "relocalisation")
+
+    localizer = Localizer(Turned(0.0, 1.0, 0.0, 1.0, 1.0, 1.0))
+    results = [localizer.add(halt(node)) for node in range(3)]
+    assert [result.state for result in results] == [State.RELOCALIZED, State.DEGRADED, State.TRACKING]
+    assert "found 0.5 m, 180 deg away, not confirmed yet" in results[1].registration.reason
+    states = [localizer.add(halt(node)).state for node in range(3, 6)]
+    assert states == [State.DEGRADED, State.DEGRADED, State.RELOCALIZED]
+
+
 def test_after_the_odometry_was_lost_a_place_that_fits_is_not_enough() -> None:
     """In another aisle of a warehouse 90 % of the points fit; with a firm edge that was `tracking`, 22 m wrong."""
     localizer = Localizer(Places(0.0, 30.0, confirms=True))

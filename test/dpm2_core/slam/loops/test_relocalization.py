@@ -214,7 +214,7 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     elsewhere = replace(keyframe(9, 74.0, broken), cloud=keyframe(9, 95.0, broken).cloud)
     doubted = localizer.add(elsewhere)
     assert doubted.state is State.DEGRADED
-    assert re.search(r"found \d+\.\d m away, not confirmed yet", doubted.registration.reason)
+    assert re.search(r"found \d+\.\d m, \d+ deg away, not confirmed yet", doubted.registration.reason)
     assert not doubted.registration.ok
     assert (localizer.wants(9 + 10**9 - 1), localizer.wants(9 + 10**9)) == (False, True)
     assert localizer.found == 8
