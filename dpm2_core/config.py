@@ -62,6 +62,15 @@ class Settings(BaseModel):
                 raise ValueError("want a number")
         return value
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _over_the_default(cls, value: Any, info: ValidationInfo) -> Any:
+        """A part of which some keys are given has for the others what the default of its field sets."""
+        default = cls.model_fields[info.field_name or ""].default
+        if isinstance(value, Mapping) and isinstance(default, Settings):
+            return merged(default.model_dump(exclude_unset=True), value)
+        return value
+
 
 def _kinds(annotation: Any) -> Iterator[Any]:
     """The types that an annotation allows, at any depth."""

@@ -18,43 +18,6 @@ DRIVES, HELD_OUT, REHEARSAL = "drives", "held_out", "rehearsal"
 """Folders of packed drives below the one of the training."""
 
 
-class FinetuneOptimizer(OptimizerSettings):
-    """Optimization: a few small steps."""
-
-    steps: int = Field(default=300, gt=0)
-    """Batches."""
-    rate: float = Field(default=3e-4, gt=0)
-    """Peak learning rate."""
-    warmup: int = Field(default=20, ge=0)
-    """Steps of linear warm-up."""
-    ema: float = Field(default=0.98, ge=0, lt=1)
-    """Decay of the averaged weights, which are the ones that are kept."""
-    compile: bool = False
-    """torch.compile: takes minutes to start."""
-    save_every: int = Field(default=50, gt=0)
-    """Steps between checkpoints."""
-
-
-class FinetuneAugment(AugmentSettings):
-    """Augmentation; the beams stay those of the LiDAR that is learned."""
-
-    drop: float = Field(default=0.2, ge=0, lt=1)
-    """Points are dropped at a ratio drawn from 0 to this."""
-    beams: float = Field(default=0.0, ge=0, le=1)
-    """Probability that only every second or fourth elevation survives."""
-
-
-class RehearsalWorlds(GenerateSettings):
-    """Synthetic worlds with the LiDAR that the shipped weights come from."""
-
-    worlds: int = Field(default=6, gt=0)
-    """Worlds, each a folder."""
-    first_seed: int = Field(default=3000, ge=0)
-    """Seed of the first world; the others follow."""
-    frames: int = Field(default=40, gt=1)
-    """Scans of each world, at random places of its road."""
-
-
 class FinetuneSettings(Settings):
     """A fine-tuning."""
 
@@ -74,7 +37,7 @@ class FinetuneSettings(Settings):
     """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""
     rehearsal_share: float = Field(default=0.5, ge=0, lt=1)
     """Of the places of the batches."""
-    rehearsal_worlds: RehearsalWorlds = RehearsalWorlds()
+    rehearsal_worlds: GenerateSettings = GenerateSettings(worlds=6, first_seed=3000, frames=40)
     """The synthetic worlds."""
     held_out: float = Field(default=0.15, ge=0, lt=1)
     """Last part of each drive, to be measured on before and after."""
@@ -84,5 +47,9 @@ class FinetuneSettings(Settings):
     """Scans of each place, in the order of the road."""
     radius: float = Field(default=15.0, gt=0)
     """Farthest from the first one drawn, m."""
-    augment: FinetuneAugment = FinetuneAugment()
-    optimiser: FinetuneOptimizer = FinetuneOptimizer()
+    augment: AugmentSettings = AugmentSettings(drop=0.2, beams=0)
+    """Augmentation; the beams stay those of the LiDAR that is learned."""
+    optimiser: OptimizerSettings = OptimizerSettings(
+        steps=300, rate=3e-4, warmup=20, ema=0.98, compile=False, save_every=50
+    )
+    """Optimization: a few small steps."""

@@ -41,15 +41,6 @@ HARD = 40.0  # m: half of the negatives lie between OVERLAP and this
 FRAMES = 5  # a reference, two near it, one hard negative, one far
 
 
-class OverlapOptimiserSettings(OptimizerSettings):
-    """Optimization at a tenth of the rate and weight decay of the registration training (section 5.1)."""
-
-    steps: int = Field(600, gt=0)
-    rate: float = Field(1e-4, gt=0)
-    decay: float = Field(1e-5, ge=0)
-    warmup: int = Field(20, ge=0)
-
-
 class OverlapTrainingSettings(Settings):
     """The overlap training; the network is that of the registration training, with all its settings."""
 
@@ -61,7 +52,8 @@ class OverlapTrainingSettings(Settings):
     """Folder of packed drives of other worlds; empty: none."""
     validation_batches: int = Field(25, gt=0)
     """Batches of a validation."""
-    optimiser: OverlapOptimiserSettings = OverlapOptimiserSettings()
+    optimiser: OptimizerSettings = OptimizerSettings(steps=600, rate=1e-4, decay=1e-5, warmup=20)
+    """Optimization at a tenth of the rate and weight decay of the registration training (section 5.1)."""
 
 
 def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:

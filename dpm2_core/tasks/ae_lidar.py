@@ -13,19 +13,11 @@ from dpm2_core.network.perception.dslr import down, initialize, up
 from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSettings
 
 
-class AeLidarImage(RangeImageSettings):
-    """Range image of AE_lidar."""
-
-    scale: float = Field(default=50.0, gt=0)
-    """Distance that counts as one, m; points farther away are not used. The paper cuts KITTI at percentiles that lie
-    50 m from the sensor at most."""
-
-
 class AeLidarSettings(Settings):
     """Range image and size of the network; the default is the paper's."""
 
-    image: AeLidarImage = AeLidarImage()
-    """Geometry of the scans."""
+    image: RangeImageSettings = RangeImageSettings(scale=50)
+    """Geometry of the scans. The paper cuts KITTI at percentiles that lie 50 m from the sensor at most."""
     channels: int = Field(default=64, ge=4)
     """Of the first layer; the innermost has eight times as many."""
     latent: int = Field(default=512, ge=8)

@@ -21,15 +21,6 @@ _LEAST_DIVERGENCE = 5.0
 """Below this the divergence of a VAE costs no less, nats: the codes keep something to say."""
 
 
-class AeLidarOptimizer(TaskOptimizer):
-    """Optimisation."""
-
-    rate: float = Field(5e-4, gt=0)
-    """Peak learning rate."""
-    clip: float = Field(1000.0, gt=0)
-    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
-
-
 class AeLidarTraining(SlamTaskTraining):
     """A training of AE_lidar."""
 
@@ -39,7 +30,7 @@ class AeLidarTraining(SlamTaskTraining):
     """Passes over the windows (the original: 150)."""
     divergence_warmup: int = Field(default=150, ge=1)
     """Epochs until the divergence of a VAE counts in full."""
-    optimiser: AeLidarOptimizer = AeLidarOptimizer()
+    optimiser: TaskOptimizer = TaskOptimizer(rate=5e-4, clip=1000)  # the loss is a sum over 20 thousand values
     batch: int = Field(default=4, ge=1)
     """Windows of a step: means are over more than one place."""
 

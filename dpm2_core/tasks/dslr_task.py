@@ -25,13 +25,6 @@ _MOVED = 0.5
 """A slot whose distance differs by more from that of the static twin has something moving in it, m."""
 
 
-class DslrOptimizer(TaskOptimizer):
-    """Optimisation."""
-
-    clip: float = Field(1000.0, gt=0)
-    """Largest norm of the gradient; the loss is a sum over 20 thousand values."""
-
-
 class DslrTraining(SlamTaskTraining):
     """A training of DSLR: epochs of the autoencoder, then of the discriminator, and the rest adversarial."""
 
@@ -51,7 +44,7 @@ class DslrTraining(SlamTaskTraining):
     """The autoencoder learns from static scans alone. False: from the others, too, as the authors'."""
     batch: int = Field(default=4, ge=1)
     """Windows of a step: pairs of codes are of different places, and means are over more than one place."""
-    optimiser: DslrOptimizer = DslrOptimizer()
+    optimiser: TaskOptimizer = TaskOptimizer(clip=1000)  # the loss is a sum over 20 thousand values
 
     @property
     def third(self) -> int:

@@ -37,15 +37,6 @@ Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 there are."""
 
 
-class DynamicObjectOptimizer(TaskOptimizer):
-    """Optimisation."""
-
-    rate: float = Field(3e-3, gt=0)
-    """Peak learning rate."""
-    ema: float = Field(0.998, ge=0, lt=1)
-    """Decay of the averaged weights, which are the ones that are kept."""
-
-
 class DynamicObjectTraining(TaskTraining):
     """A training of the dynamic objects."""
 
@@ -55,7 +46,7 @@ class DynamicObjectTraining(TaskTraining):
     window: int = Field(default=2, ge=2)
     batch: int = Field(default=4, ge=1)
     every: int = Field(default=5, ge=1)
-    optimiser: DynamicObjectOptimizer = DynamicObjectOptimizer()
+    optimiser: TaskOptimizer = TaskOptimizer(rate=3e-3, ema=0.998)
     thin: float = Field(default=0.7, ge=0, lt=1)
     """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
     paste: float = Field(default=0.5, ge=0, le=1)

@@ -32,20 +32,13 @@ UNCOUNTED = (0, 1)
 """Unlabelled, outlier."""
 
 
-class AboveGroundSettings(SlamLossSettings):
-    """Odometry on what is above the ground, which is slow to converge from the identity."""
-
-    warm_start: bool = True
-    """Both trajectories start where that of the target scans has ended."""
-
-
 class GroundTraining(SlamTaskTraining):
     """A training of GndNet."""
 
     network: GroundSettings = GroundSettings()
     """Grid, network and loss."""
-    slam_loss: AboveGroundSettings = AboveGroundSettings()
-    """Odometry of the SLAM loss."""
+    slam_loss: SlamLossSettings = SlamLossSettings(warm_start=True)
+    """Odometry of the SLAM loss, on what is above the ground: slow to converge from the identity."""
     tilt: float = Field(default=3.0, ge=0, lt=45)
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
     gaps: float = Field(default=0.0, ge=0, le=1)

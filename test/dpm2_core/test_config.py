@@ -121,6 +121,11 @@ def test_a_mapping_changes_the_keys_of_a_part_that_it_has(tmp_path: Path) -> Non
     assert load_settings(Outer, path, ["middle={inner: {voxel: 3}}"]).middle.inner == Inner(voxel=3, names=("a",))
 
 
+def test_what_is_not_said_of_a_part_is_as_in_the_default_of_its_field() -> None:
+    """Not as in the defaults of its type: two parts of a type may differ."""
+    assert load_settings(Outer, None, ["second.color=blue"]).second == Inner(voxel=1.0, color=Color.BLUE)
+
+
 def test_an_empty_file_and_none_give_the_defaults(tmp_path: Path) -> None:
     assert load_settings(Outer, _file(tmp_path, "# nothing\n")) == load_settings(Outer) == Outer()
 

@@ -19,7 +19,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.learning.finetune import draw_road_segment, finetune, window_trajectories
 from dpm2_core.learning.finetune_data import Referenced, prepare, refer
-from dpm2_core.learning.finetune_settings import FinetuneOptimizer, FinetuneSettings
+from dpm2_core.learning.finetune_settings import FinetuneSettings
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.weights import load_model, read_metadata, save_weights
@@ -124,7 +124,7 @@ def settings(tmp_path: Path, packed: Path) -> FinetuneSettings:
     torch.manual_seed(0)
     path = tmp_path / "start.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"images": "false", "phase": "2"}, half=False)
-    optimizer = FinetuneOptimizer(steps=4, warmup=1, bf16=False, save_every=2, rate=1e-3)
+    optimizer = {"steps": 4, "warmup": 1, "bf16": False, "save_every": 2, "rate": 1e-3}
     chosen = {"rehearsal": str(packed), "pairs": 1.0, "groups": 1, "frames": 3, "optimiser": optimizer}
     return FinetuneSettings(weights=str(path), **chosen)  # type: ignore[arg-type]
 

@@ -13,12 +13,13 @@ from torch.distributions import Normal, kl_divergence
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import WEIGHTS
-from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings, LidarAutoencoder
+from dpm2_core.network.perception.range_image import RangeImageSettings
+from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.training import draw, load_task, measure, new_task, train_task
 
-SENSOR = AeLidarImage(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
+SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
 
 
 def network(**changes: object) -> AeLidarSettings:
@@ -43,7 +44,7 @@ def test_size_is_that_of_the_paper() -> None:
 @pytest.mark.parametrize(("rows", "columns"), [(16, 64), (24, 128), (32, 512), (64, 64)])
 def test_other_sensors_fit(rows: int, columns: int) -> None:
     """An odd and an even number of rows after three halvings."""
-    image = AeLidarImage(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
+    image = RangeImageSettings(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
     assert LidarAutoencoder(network(image=image)).eval()(torch.rand(2, 2, rows, columns))[0].shape[2:] == (
         rows,
         columns,
@@ -53,7 +54,7 @@ def test_other_sensors_fit(rows: int, columns: int) -> None:
 @pytest.mark.parametrize("rows", [8, 41])
 def test_rows_that_cannot_be_halved_are_rejected(rows: int) -> None:
     """The message gives the number."""
-    image = AeLidarImage(first=0, rows=rows)
+    image = RangeImageSettings(first=0, rows=rows)
     with pytest.raises(UsageError, match=f"images of {rows} rows; want a multiple of 8"):
         LidarAutoencoder(network(image=image))
 

@@ -17,11 +17,11 @@ from dpm2_core.network.perception.gndnet import GroundSettings
 from dpm2_core.network.perception.task_weights import write_weights
 from dpm2_core.tasks.dynamic_objects_task import (
     MOVABLE,
-    DynamicObjectOptimizer,
     DynamicObjectTask,
     DynamicObjectTraining,
 )
 from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import TaskOptimizer
 from dpm2_core.tasks.training import new_task, save_task, train_task
 
 SMALL = DynamicObjectTraining(
@@ -30,7 +30,7 @@ SMALL = DynamicObjectTraining(
     every=1,
     batch=1,
     thin=0.3,
-    optimiser=DynamicObjectOptimizer(ema=0.9),
+    optimiser=TaskOptimizer(rate=3e-3, ema=0.9),
 )
 
 
@@ -158,7 +158,7 @@ def test_the_average_of_the_weights_is_kept_where_one_is_asked_for(tmp_path: Pat
     scans = TaskScans([Drive(5)])
 
     def settings(average: float) -> DynamicObjectTraining:
-        optimiser = DynamicObjectOptimizer(warmup=1, ema=average)
+        optimiser = TaskOptimizer(rate=3e-3, warmup=1, ema=average)
         return SMALL.model_copy(update={"epochs": 4, "optimiser": optimiser})
 
     first = list(new_task("movers", settings(0)).parameters())

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from dpm2_core.errors import UsageError
+from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig
-from dpm2_core.tasks.ae_lidar import AeLidarImage, AeLidarSettings
+from dpm2_core.tasks.ae_lidar import AeLidarSettings
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.tasks.open import folders_of, names_of, open_scans
@@ -35,7 +36,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def task() -> AeLidarTask:
     """Untrained."""
     torch.manual_seed(0)
-    image = AeLidarImage(columns=128)
+    image = RangeImageSettings(scale=50, columns=128)
     return AeLidarTask(AeLidarTraining(network=AeLidarSettings(image=image, channels=4, latent=8))).eval()
 
 
