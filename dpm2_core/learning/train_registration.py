@@ -40,7 +40,7 @@ class RegistrationTraining(nn.Module):
         self.loss = loss
         self.model = DeepPointMap2(network)
         self.model.encoder.requires_grad_(encoder)
-        channels: list[int] = self.model.encoder.points.channels  # type: ignore[assignment]
+        channels = self.model.encoder.points.channels
         sizes = [stage.points for stage in network.points.stages]
         self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
         self.backbone_head = nn.Linear(channels[self.level], network.channels)

@@ -19,10 +19,10 @@ from dpm2_core.geometry.scale import scale_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.images import in_encoded_axes, small_image
-from dpm2_core.network.pointnext import Scale, view_axes
+from dpm2_core.network.pointnext import PointNeXt, Scale, view_axes
 from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop, tilt_of
-from dpm2_core.network.registry import image_backbone, point_backbone
+from dpm2_core.network.registry import image_backbone
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import paint
 from dpm2_core.network.tokens import Tokens
@@ -44,10 +44,10 @@ class Encoder(nn.Module):
         super().__init__()
         self.settings = settings
         self.painted = settings.fusion.kind == "point_painting" and settings.image.backbone != "none"
-        self.points = point_backbone(settings.points, self.painted)
+        self.points = PointNeXt(settings.points, self.painted)
         # A painted cloud carries its colors through the point backbone; images are read, but have no features.
         self.image: nn.Module | None = nn.Identity() if self.painted else image_backbone(settings.image)
-        channels: list[int] = self.points.channels  # type: ignore[assignment]
+        channels = self.points.channels
         self.fusion = Fusion(settings, channels) if settings.fusion.kind != "none" else None
         self.level = len(channels) - 1 - settings.points.upsample  # descriptors of the version without fusion
         if self.fusion is None and channels[self.level] != settings.channels:

@@ -1,37 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Backbones by name. A point backbone maps a PointBatch to Scales, an image backbone pixels to maps of features."""
+"""Image backbones by name: they map pixels to maps of features."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from torch import Tensor, nn
 
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.network.convnext import ConvNeXt, ImagePyramid
-from dpm2_core.network.pointnext import PointNeXt
-from dpm2_core.network.settings import ImageSettings, PointsSettings
-
-POINT_BACKBONES: dict[str, Callable[[PointsSettings, bool], nn.Module]] = {"pointnext": PointNeXt}
-"""Each takes whether its points come with colors, and has `channels`, a list with those of every scale it returns, fine
-to coarse."""
-
-IMAGE_BACKBONES: dict[str, Callable[[ImageSettings], nn.Module]] = {
-    "convnext": lambda s: ConvNeXt(s.depths, s.channels)
-}
-"""Each has `channels` and `strides` lists and returns one (B, C, h, w) map a stride, fine to coarse."""
-
-
-def point_backbone(settings: PointsSettings, painted: bool = False) -> nn.Module:
-    """The point backbone that the settings name; `painted`: its points come with colors.
-
-    Raises:
-        UsageError: no such backbone.
-    """
-    if settings.backbone not in POINT_BACKBONES:
-        raise UsageError(f"points.backbone {settings.backbone}: want one of {', '.join(POINT_BACKBONES)}")
-    return POINT_BACKBONES[settings.backbone](settings, painted)
+from dpm2_core.network.settings import ImageSettings
 
 
 def image_backbone(settings: ImageSettings) -> ImagePyramid | None:
@@ -44,10 +21,9 @@ def image_backbone(settings: ImageSettings) -> ImagePyramid | None:
         return None
     if settings.backbone.startswith("timm:"):
         return ImagePyramid(TimmBackbone(settings.backbone.removeprefix("timm:")), settings)
-    if settings.backbone not in IMAGE_BACKBONES:
-        names = ", ".join(["none", *IMAGE_BACKBONES, "timm:NAME"])
-        raise UsageError(f"image.backbone {settings.backbone}: want one of {names}")
-    return ImagePyramid(IMAGE_BACKBONES[settings.backbone](settings), settings)
+    if settings.backbone != "convnext":
+        raise UsageError(f"image.backbone {settings.backbone}: want one of none, convnext, timm:NAME")
+    return ImagePyramid(ConvNeXt(settings.depths, settings.channels), settings)
 
 
 class TimmBackbone(nn.Module):

@@ -37,8 +37,8 @@ class StageSettings(Settings):
 class PointsSettings(Settings):
     """The LiDAR side: preprocessing and point backbone."""
 
-    backbone: str = "pointnext"
-    """Name in the registry of point backbones."""
+    backbone: Literal["pointnext"] = "pointnext"
+    """The only one."""
     voxel: float = Field(0.3, gt=0)
     """Edge of the input voxel grid, m."""
     near: float = Field(1.0, ge=0)
@@ -72,7 +72,7 @@ class ImageSettings(Settings):
     """The camera side."""
 
     backbone: str = "convnext"
-    """Name in the registry of image backbones, `timm:NAME` with the optional extra, or `none`: LiDAR only."""
+    """`convnext`, `timm:NAME` with the optional extra, or `none`: LiDAR only."""
     size: tuple[int, int] = (128, 416)
     """Height and width that images are resized to, pixels."""
     depths: tuple[Annotated[int, Field(gt=0, le=64)], ...] = Field((1, 1, 2, 1), max_length=16)

@@ -20,13 +20,11 @@ from torch import nn
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
-from dpm2_core.network.heads import ConfidenceHead
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, settings_from
 
 T = TypeVar("T", bound=Settings)
 _LARGEST = 1 << 16  # no number in a description is greater: channels, points, pixels
-_CONFIDENCE = "decoder.confidence"
 _TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; other names of it are addresses
 
 
@@ -84,20 +82,13 @@ def read_metadata(path: Path) -> dict[str, str]:
     return read_tensors(path)[1]
 
 
-def _read_network(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """`read_tensors`; weights of before the confidence had a head get the one that a new network has."""
-    state, metadata = read_tensors(path)
-    new = {f"{_CONFIDENCE}.{name}": value for name, value in ConfidenceHead().state_dict().items()}
-    return ({**new, **state} if state.keys().isdisjoint(new) else state), metadata
-
-
 def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
     """Load strictly; returns the metadata.
 
     Raises:
         UsageError: missing file, another format, weights of another preset or shape.
     """
-    state, metadata = _read_network(path)
+    state, metadata = read_tensors(path)
     _fill(model, path, state, metadata)
     return metadata
 
@@ -156,7 +147,7 @@ def load_model(path: Path) -> DeepPointMap2:
 
 def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
     """`load_model`, and what was written about the weights beside them; the file is opened once."""
-    state, metadata = _read_network(path)
+    state, metadata = read_tensors(path)
     settings = _network_settings(path, metadata)
     check_fit(path, state, lambda: DeepPointMap2(settings))
     model = DeepPointMap2(settings)

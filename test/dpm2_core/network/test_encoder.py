@@ -67,8 +67,8 @@ def test_unknown_preset_and_backbone_are_rejected() -> None:
     """In one line that names the choices."""
     with pytest.raises(UsageError, match=r"network preset big: want one of small, base, paper, v1"):
         preset("big")
-    with pytest.raises(UsageError, match=r"points.backbone kpconv: want one of pointnext"):
-        Encoder(tiny(points={"backbone": "kpconv"}))
+    with pytest.raises(UsageError, match=r"points.backbone: input should be 'pointnext', got 'kpconv'"):
+        tiny(points={"backbone": "kpconv"})
     with pytest.raises(UsageError, match=r"image.backbone vgg: want one of none, convnext, timm:NAME"):
         Encoder(tiny(image={"backbone": "vgg"}))
 
