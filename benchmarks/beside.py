@@ -21,7 +21,7 @@ from dpm2_core.sim.simulated_drive import Ride, TurningRobot, wheel_odometry
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 WORLDS: dict[str, tuple[str, PresetName, int, float]] = {
     "suburb": ("loop", "suburb", 920, 4.0),
@@ -81,9 +81,6 @@ def _drive(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dic
 
 
 def _table(worlds: dict[str, Any]) -> FigureTable:
-    figures = [f"{figure}, {way}" for figure in ("map APE m", "frames led") for way in WAYS]
-    table = FigureTable(f"Beside an odometry with {100 * SLIP:g} % slip", names=["world"], figures=figures)
-    for name, r in worlds.items():
-        row = [f"{r[way]['map_ape_rmse_m']:.3f}" for way in WAYS] + [str(r[way]["frames_led"]) for way in WAYS]
-        table.add_row(name, *row)
-    return table
+    columns = {f"map APE m, {way}": f"{{{way}[map_ape_rmse_m]:.3f}}" for way in WAYS}
+    columns |= {f"frames led, {way}": f"{{{way}[frames_led]}}" for way in WAYS}
+    return record_table(f"Beside an odometry with {100 * SLIP:g} % slip", ["world"], columns, worlds)

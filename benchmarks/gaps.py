@@ -17,7 +17,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 _SECONDS = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
 _PLACES = 5
@@ -122,10 +122,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _table(results: dict[str, Any]) -> FigureTable:
-    figures = ("number", "silently wrong", "beyond 3 sigma", "bridged", "broken")
-    table = FigureTable("After a gap in the stream", names=["drive", "method", "gap"], figures=figures)
-    for drive, methods in results.items():
-        for method, result in methods.items():
-            for length, row in result["summary"].items():
-                table.add_row(drive, method, length, *(str(value) for value in row.values()))
-    return table
+    columns = {"number": "{gaps}", "silently wrong": "{silently_wrong}", "beyond 3 sigma": "{uncovered}",
+               "bridged": "{bridged}", "broken": "{broken}"}  # fmt: skip
+    rows = {drive: {name: method["summary"] for name, method in of.items()} for drive, of in results.items()}
+    return record_table("After a gap in the stream", ["drive", "method", "gap"], columns, rows)

@@ -29,7 +29,7 @@ from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
 """Segments of the KITTI metric, m: the excerpts are too short for those of the benchmark."""
@@ -210,7 +210,5 @@ def _table(results: dict[str, Any]) -> FigureTable:
 
 
 def _stages(drive: str, methods: dict[str, Any]) -> FigureTable:
-    table = FigureTable(f"Stages of {OURS} on {drive}, ms", names=["stage"], figures=["median", "p95"])
-    for stage, quantiles in methods[OURS]["stages_ms"].items():
-        table.add_row(stage, f"{quantiles['median']:.1f}", f"{quantiles['p95']:.1f}")
-    return table
+    columns = {"median": "{median:.1f}", "p95": "{p95:.1f}"}
+    return record_table(f"Stages of {OURS} on {drive}, ms", ["stage"], columns, methods[OURS]["stages_ms"])

@@ -18,7 +18,7 @@ from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 REGISTRATIONS = ("adaptive", "refined", "neural", "geometric")
 _SYNTHETIC_FRAMES = 80
@@ -57,7 +57,7 @@ def bench_hard(options: Options) -> Report:
                     progress.advance(task)
     options.out.mkdir(parents=True, exist_ok=True)
     draw(options.out / "hard.png", results)
-    return Report({"drives": results}, Group(_table(results), *_rates(results)))
+    return Report({"drives": results}, Group(_table(results), _rates(results)))
 
 
 def draw(path: Path, results: Mapping[str, Any]) -> None:
@@ -100,12 +100,8 @@ def _table(results: Mapping[str, Any]) -> FigureTable:
     return table
 
 
-def _rates(results: Mapping[str, Any]) -> list[FigureTable]:
-    figures = ("RPE m", "RPE deg", "drift %", "failed")
-    table = FigureTable("Few frames per second", names=["drive", "frames", "method"], figures=figures)
-    for drive, hard in results.items():
-        for rate in [rate for rate in _RATES if rate in hard]:
-            for name, row in hard[rate].items():
-                errors = [f"{row[key]:.3f}" for key in ("rpe_trans_m", "rpe_rot_deg", "final_drift_percent")]
-                table.add_row(drive, rate, name, *errors, str(row["failed_frames"]))
-    return [table]
+def _rates(results: Mapping[str, Any]) -> FigureTable:
+    columns = {"RPE m": "{rpe_trans_m:.3f}", "RPE deg": "{rpe_rot_deg:.3f}", "drift %": "{final_drift_percent:.3f}",
+               "failed": "{failed_frames}"}  # fmt: skip
+    rows = {drive: {rate: hard[rate] for rate in _RATES if rate in hard} for drive, hard in results.items()}
+    return record_table("Few frames per second", ["drive", "frames", "method"], columns, rows)

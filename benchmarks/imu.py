@@ -23,7 +23,7 @@ from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 WORLDS: dict[str, tuple[PresetName, int, float, float]] = {
     "building": ("indoor", 910, 1.2, 0.0),
@@ -92,11 +92,7 @@ def _tilt(poses: Array, truth: Array) -> NDArray[np.float64]:
 
 
 def _table(worlds: dict[str, Any]) -> FigureTable:
-    figures = [f"{figure}, {way}" for figure in ("APE m", "worst tilt deg") for way in WAYS]
-    table = FigureTable(
-        f"{LIDAR.beams} beams, turns of 100 deg/s", names=["world"], figures=[*figures, "with / without"]
-    )
-    for name, r in worlds.items():
-        row = [f"{r[way][key]:.3f}" for key in ("ape_rmse_m", "worst_tilt_deg") for way in WAYS]
-        table.add_row(name, *row, f"{r['ratio']:.2f}")
-    return table
+    columns = {f"APE m, {way}": f"{{{way}[ape_rmse_m]:.3f}}" for way in WAYS}
+    columns |= {f"worst tilt deg, {way}": f"{{{way}[worst_tilt_deg]:.3f}}" for way in WAYS}
+    columns |= {"with / without": "{ratio:.2f}"}
+    return record_table(f"{LIDAR.beams} beams, turns of 100 deg/s", ["world"], columns, worlds)

@@ -29,7 +29,7 @@ from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 HEIGHT = 0.8
 """Of the LiDAR above the floor, m."""
@@ -125,7 +125,5 @@ def relocalise_table(worlds: dict[str, Any], key: str, title: str) -> FigureTabl
 
 def join_table(worlds: dict[str, Any]) -> FigureTable:
     """What `joins` found."""
-    table = FigureTable("two thirds of a drive in one map", names=["world"], figures=("right", "apart", "wrong"))
-    for name, world in worlds.items():
-        table.add_row(name, *(str(world["joins"][kind]) for kind in ("right", "apart", "wrong")))
-    return table
+    columns = {kind: f"{{joins[{kind}]}}" for kind in ("right", "apart", "wrong")}
+    return record_table("two thirds of a drive in one map", ["world"], columns, worlds)

@@ -13,7 +13,7 @@ from benchmarks.harness import Options, Report, drives, settings_of
 from benchmarks.resident import resident_mb
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.build import make_slam
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 _EVERY = 50  # frames between two samples
 
@@ -55,10 +55,9 @@ def levelling(samples: list[tuple[int, float]]) -> dict[str, Any]:
 
 
 def _table(results: dict[str, Any]) -> FigureTable:
-    figures = ("frames", "keyframes", "start", "half way", "end", "growth per 1000 frames, second half")
-    table = FigureTable("Resident memory, MB", names=["drive"], figures=figures)
-    for drive, row in results.items():
-        rss, slope = row["rss_mb"], row["growth_mb_per_1000_frames_second_half"]
-        cells = [f"{rss[when]:.0f}" for when in ("start", "half", "end")] + ["-" if slope is None else f"{slope:.1f}"]
-        table.add_row(drive, str(row["frames"]), str(row["keyframes"]), *cells)
-    return table
+    columns = {
+        "frames": "{frames}", "keyframes": "{keyframes}", "start": "{rss_mb[start]:.0f}",
+        "half way": "{rss_mb[half]:.0f}", "end": "{rss_mb[end]:.0f}",
+        "growth per 1000 frames, second half": "{growth_mb_per_1000_frames_second_half:.1f}",
+    }  # fmt: skip
+    return record_table("Resident memory, MB", ["drive"], columns, results)

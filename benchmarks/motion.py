@@ -25,7 +25,7 @@ from dpm2_core.sim.simulated_drive import RIDES, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 WORLDS: dict[str, tuple[PresetName, int, int, tuple[str, ...]]] = {
     "suburb": ("suburb", 920, 32, tuple(RIDES)),
@@ -85,8 +85,5 @@ def _errors(poses: Array, truth: Array) -> dict[str, float]:
 
 def _table(rides: dict[str, Any]) -> FigureTable:
     methods = [*OURS, *([BASELINE] if all(BASELINE in r for r in rides.values()) else [])]
-    figures = [f"{unit}, {name}" for unit in ("m", "deg") for name in methods]
-    table = FigureTable("from scan to scan, root mean square", names=["ride"], figures=figures)
-    for ride, r in rides.items():
-        table.add_row(ride, *(f"{r[name][key]:.3f}" for key in ("rpe_m", "rpe_deg") for name in methods))
-    return table
+    columns = {f"{unit}, {name}": f"{{{name}[rpe_{unit}]:.3f}}" for unit in ("m", "deg") for name in methods}
+    return record_table("from scan to scan, root mean square", ["ride"], columns, rides)

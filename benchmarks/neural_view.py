@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 
 def view(parts: Mapping[str, Any]) -> Group:
@@ -50,15 +50,10 @@ def view(parts: Mapping[str, Any]) -> Group:
 
 def _reference_table(shares: Mapping[str, Any]) -> FigureTable:
     kinds = next(iter(next(iter(shares.values())).values()))
-    figures = [f"{within}, {apart}" for apart, row in kinds.items() for within in row if within != "pairs"]
+    columns = {f"{within}, {apart}": f"{{{apart}[{within}]:.2f}}"
+               for apart, row in kinds.items() for within in row if within != "pairs"}  # fmt: skip
     title = "Reference points that are near one of another frame, share"
-    table = FigureTable(title, names=["drive", "chosen by"], figures=figures)
-    for drive, rows in shares.items():
-        for name, row in rows.items():
-            values = [value for apart in row.values() for within, value in apart.items() if within != "pairs"]
-            table.add_row(drive, name, *("-" if value is None else f"{value:.2f}" for value in values))
-        table.add_section()
-    return table
+    return record_table(title, ["drive", "chosen by"], columns, shares, sections=True)
 
 
 def _pair_table(title: str, kinds: Mapping[str, Any]) -> FigureTable:
@@ -74,22 +69,16 @@ def _pair_table(title: str, kinds: Mapping[str, Any]) -> FigureTable:
 
 
 def _odometry_table(drive: str, methods: Mapping[str, Any]) -> FigureTable:
-    figures = ("RPE m", "deg", "APE m", "drift %", "failed", "ms", "p95", "ratio")
-    table = FigureTable(f"{drive}: odometry. Ratio: of median times to KISS-ICP's.", names=["method"], figures=figures)
-    for method, row in methods.items():
-        keys = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
-        errors = ["-" if row[key] is None else f"{row[key]:.3f}" for key in keys]
-        ms = row["frame_ms"]
-        times = [f"{ms['median']:.0f}", f"{ms['p95']:.0f}", f"{ms.get('ratio', float('nan')):.2f}"]
-        table.add_row(method, *errors, f"{row['failed_frames']:.0f}", *times)
-    return table
+    columns = {
+        "RPE m": "{rpe_trans_m:.3f}", "deg": "{rpe_rot_deg:.3f}", "APE m": "{ape_rmse_m:.3f}",
+        "drift %": "{final_drift_percent:.3f}", "failed": "{failed_frames:.0f}", "ms": "{frame_ms[median]:.0f}",
+        "p95": "{frame_ms[p95]:.0f}", "ratio": "{frame_ms[ratio]:.2f}",
+    }  # fmt: skip
+    return record_table(f"{drive}: odometry. Ratio: of median times to KISS-ICP's.", ["method"], columns, methods)
 
 
 def _stage_table(drive: str, row: Mapping[str, Any]) -> FigureTable:
     ratio = f" Ratio of medians to KISS-ICP's: {row['ratio']:.2f}." if "ratio" in row else ""
-    title = f"{drive}: encode and register, ms per frame.{ratio}"
-    table = FigureTable(title, names=["stage"], figures=["median", "p95"])
     extra = {name: row[name] for name in ("without_camera_ms", "kiss-icp") if name in row}
-    for stage, ms in {**row["stages_ms"], **extra}.items():
-        table.add_row(stage, f"{ms['median']:.1f}", f"{ms['p95']:.1f}")
-    return table
+    columns, stages = {"median": "{median:.1f}", "p95": "{p95:.1f}"}, {**row["stages_ms"], **extra}
+    return record_table(f"{drive}: encode and register, ms per frame.{ratio}", ["stage"], columns, stages)

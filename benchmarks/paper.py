@@ -18,7 +18,7 @@ from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 _OURS = ("slam.registration=neural", "slam.visual.enabled=false")
 _NEAREST = ("slam.neural.spacing=10", "slam.neural.residual=2.5", "slam.neural.frames=1")
@@ -90,11 +90,9 @@ def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> di
 
 
 def _table(results: dict[str, Any]) -> FigureTable:
-    figures = ("RPE m", "RPE deg", "ATE m", "drift %", "failed", "keyframes", "loops", "wrong")
-    table = FigureTable("The paper's ways, each put into ours", names=["drive", "way"], figures=figures)
-    for drive, ways in results.items():
-        for way, row in ways.items():
-            errors = [row[name] for name in _ERRORS]
-            counts = (row["failed_frames"], row["keyframes"], row["loops"]["accepted"], row["loops"]["wrong"])
-            table.add_row(drive, way, *(f"{error:.3f}" for error in errors), *map(str, counts))
-    return table
+    columns = {
+        "RPE m": "{rpe_trans_m:.3f}", "RPE deg": "{rpe_rot_deg:.3f}", "ATE m": "{ape_rmse_m:.3f}",
+        "drift %": "{final_drift_percent:.3f}", "failed": "{failed_frames}", "keyframes": "{keyframes}",
+        "loops": "{loops[accepted]}", "wrong": "{loops[wrong]}",
+    }  # fmt: skip
+    return record_table("The paper's ways, each put into ours", ["drive", "way"], columns, results)

@@ -23,7 +23,7 @@ from dpm2_core.slam.graph.g2o import read_g2o
 from dpm2_core.slam.graph.graph_data import GraphData, integrate
 from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
 from dpm2_core.slam.graph.worker import GraphWorker
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 _STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the made drive's odometry
 _LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
@@ -187,10 +187,8 @@ def _beside(truth: Array, graph: GraphData) -> dict[str, Any]:
 
 
 def _table(title: str, rows: dict[str, Any]) -> FigureTable:
-    figures = ("loops", "right kept", "wrong kept", "odometry ATE, m", "ATE, m", "s")
-    table = FigureTable(title, names=[""], figures=figures)
-    for name, row in rows.items():
-        kept = f"{row['right_kept']} of {row['right']}"
-        ate = (f"{row['odometry_ate_m']:.2f}", f"{row['ate_m']:.3f}", f"{row['seconds']:.2f}")
-        table.add_row(name, str(row["loops"]), kept, str(row["wrong_kept"]), *ate)
-    return table
+    columns = {
+        "loops": "{loops}", "right kept": "{right_kept} of {right}", "wrong kept": "{wrong_kept}",
+        "odometry ATE, m": "{odometry_ate_m:.2f}", "ATE, m": "{ate_m:.3f}", "s": "{seconds:.2f}",
+    }  # fmt: skip
+    return record_table(title, [""], columns, rows)

@@ -19,7 +19,7 @@ from dpm2_core.pipeline import OfflineRun
 from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 ROADS: dict[str, PresetName] = {
     "00": "suburb", "05": "suburb", "06": "city", "07": "city", "08": "suburb", "09": "rural",
@@ -100,12 +100,10 @@ def _summary(roads: dict[str, Any]) -> dict[str, Any]:
 
 
 def _table(roads: dict[str, Any]) -> FigureTable:
-    figures = ("t_err %", "r_err deg/100 m", "APE m", "loops", "wrong", "same", "reverse", "cross")
-    title = "Odometry alone -> SLAM; KITTI metric, APE after alignment"
-    table = FigureTable(title, names=["road"], figures=figures)
-    for name, road in roads.items():
-        errors = [f"{road['odometry'][e]:.3f} -> {road['slam'][e]:.3f}" for e in _ERRORS[:3]]
-        loops = road["loops"]
-        recalls = [f"{loops[kind]['found']}/{loops[kind]['revisits']}" for kind in ("same", "reverse", "cross")]
-        table.add_row(name, *errors, str(loops["accepted"]), str(loops["wrong"]), *recalls)
-    return table
+    columns = {
+        heading: f"{{odometry[{error}]:.3f}} -> {{slam[{error}]:.3f}}"
+        for heading, error in zip(("t_err %", "r_err deg/100 m", "APE m"), _ERRORS, strict=False)
+    }
+    columns |= {"loops": "{loops[accepted]}", "wrong": "{loops[wrong]}"}
+    columns |= {kind: f"{{loops[{kind}][found]}}/{{loops[{kind}][revisits]}}" for kind in ("same", "reverse", "cross")}
+    return record_table("Odometry alone -> SLAM; KITTI metric, APE after alignment", ["road"], columns, roads)

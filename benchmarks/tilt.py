@@ -20,7 +20,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 
 TILTS = (0, 15, 30)
 """Degrees of pitch, the same for all scans: as a LiDAR is mounted that looks down ahead."""
@@ -91,17 +91,7 @@ def _described(
 
 
 def _table(results: dict[str, Any]) -> FigureTable:
-    names = ["drive", "tilt deg", "heading", "axes"]
-    figures = [f"{name} {n} apart" for n in APART for name in ("success", "m")]
-    table = FigureTable("A tilted LiDAR: pairs by the network", names=names, figures=figures)
-    for drive, tilts in results.items():
-        for tilt, headings in tilts.items():
-            for heading, row in headings.items():
-                for axes, kinds in row.items():
-                    texts = [
-                        "-" if kinds[f"{n} apart"][name] is None else f"{kinds[f'{n} apart'][name]:.3g}"
-                        for n in APART
-                        for name in ("success", "median_m")
-                    ]
-                    table.add_row(drive, tilt, heading, axes, *texts)
-    return table
+    figures = {"success": "success", "m": "median_m"}
+    columns = {f"{name} {n} apart": f"{{{n} apart[{key}]:.3g}}" for n in APART for name, key in figures.items()}
+    title, names = "A tilted LiDAR: pairs by the network", ["drive", "tilt deg", "heading", "axes"]
+    return record_table(title, names, columns, results)

@@ -26,7 +26,7 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.filters import FilterKind, FilterSettings, make_filter
 from dpm2_core.slam.odometry.odometry import Odometry
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import record_table
 
 PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}
 """Kinds of places, and how many times the usual traffic they have: 20 to 40 % of the points are on it."""
@@ -159,14 +159,10 @@ def _report(drives: dict[str, Any], options: Options) -> Report:
     summary = summarized(drives)
     results = {"recipe": _recipe(options), "summary": summary, "drives": drives, "torch": torch.__version__,
                "measured_at": git_commit()}  # fmt: skip
-    title, figures = "RPE in dense traffic, mean over drives (median)", ["RPE m", "RPE deg", "diverged", "CPU ms"]
-    table = FigureTable(title, names=["registration", "filter"], figures=figures)
-    for registration, methods in summary.items():
-        for method, row in methods.items():
-            table.add_row(
-                registration, method, f"{row['rpe_m']:.4f} ({row['median_rpe_m']:.4f})",
-                f"{row['rpe_deg']:.4f} ({row['median_rpe_deg']:.4f})", f"{row['diverged']} of {row['drives']}",
-                f"{row['cpu_ms']:.0f}",
-            )  # fmt: skip
-        table.add_section()
+    columns = {
+        "RPE m": "{rpe_m:.4f} ({median_rpe_m:.4f})", "RPE deg": "{rpe_deg:.4f} ({median_rpe_deg:.4f})",
+        "diverged": "{diverged} of {drives}", "CPU ms": "{cpu_ms:.0f}",
+    }  # fmt: skip
+    title, names = "RPE in dense traffic, mean over drives (median)", ["registration", "filter"]
+    table = record_table(title, names, columns, summary, sections=True)
     return Report(results, Group(table))

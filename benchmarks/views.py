@@ -25,7 +25,7 @@ from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamResult
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, record_table
 from tools.browser import SOFTWARE, chromium
 
 _VOXEL = 0.3
@@ -126,12 +126,9 @@ def _looked_at(path: Path) -> dict[str, float]:
 
 
 def _table(results: dict[str, Any]) -> FigureTable:
-    figures = ("frames", "view's cost", "keyframes", "page MB", "first picture s", "all points s", "turned, frames/s")
-    table = FigureTable("Live view and map page", names=["drive"], figures=figures)
-    for drive, row in results.items():
-        page = row["page"]
-        table.add_row(
-            drive, str(row["frames"]), f"{row['view_cost']:.1%}", str(page["keyframes"]), f"{page['megabytes']:.1f}",
-            f"{page['seconds_to_first']:.2f}", f"{page['seconds_to_all']:.2f}", f"{page['frames_per_second']:.0f}",
-        )  # fmt: skip
-    return table
+    columns = {
+        "frames": "{frames}", "view's cost": "{view_cost:.1%}", "keyframes": "{page[keyframes]}",
+        "page MB": "{page[megabytes]:.1f}", "first picture s": "{page[seconds_to_first]:.2f}",
+        "all points s": "{page[seconds_to_all]:.2f}", "turned, frames/s": "{page[frames_per_second]:.0f}",
+    }  # fmt: skip
+    return record_table("Live view and map page", ["drive"], columns, results)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from string import Formatter
+from typing import Any
 
 from rich.box import SIMPLE
 from rich.cells import cell_len
@@ -97,6 +99,50 @@ class FigureTable:
                 table.add_row(Text(heading, style="bold"), *cells, end_section=number == self._names - 1)
             yield table
             first = last
+
+
+class _Figures(Formatter):
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        try:
+            return super().get_field(field_name, args, kwargs)
+        except (KeyError, TypeError):
+            return None, field_name
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        return "-" if value is None else format(value, format_spec)
+
+
+def cells_of(record: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
+    """Figures of a nested record as text, by columns such as "{loops[accepted]} of {loops[tried]}" or "{ape_m:.3f}";
+    "-" for one that is None or not there."""
+    return [_Figures().vformat(column, (), record) for column in columns]
+
+
+def record_table(
+    title: str, names: Sequence[str], columns: Mapping[str, str], record: Mapping[str, Any], sections: bool = False
+) -> FigureTable:
+    """A table of a nested record, whose keys, from the outermost on, are the `names`.
+
+    Args:
+        columns: headings of the figures, and how they are written, see `cells_of`. sections: a gap after each of the
+            outermost keys.
+    """
+    table = FigureTable(title, names=names, figures=list(columns))
+    for first, below in record.items():
+        for path, row in _leaves(below, len(names) - 1):
+            table.add_row(first, *path, *cells_of(row, columns.values()))
+        if sections:
+            table.add_section()
+    return table
+
+
+def _leaves(record: Any, depth: int) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Keys and value of all that is so deep in a nested record."""
+    if not depth:
+        yield (), record
+        return
+    for key, below in record.items():
+        yield from (((key, *path), value) for path, value in _leaves(below, depth - 1))
 
 
 def _total(widths: Sequence[int]) -> int:

@@ -19,12 +19,13 @@ from dpm2_core.evaluation.metrics import align
 from dpm2_core.evaluation.page import asset, escape, page
 from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
 from dpm2_core.frame import Array
+from dpm2_core.tables import cells_of
 
 _BINS = 300  # of the time along a drive
 _FIGURES = {
-    "t_err_percent": ("t_err %", ".3f"), "r_err_deg_per_100m": ("r_err deg/100 m", ".3f"),
-    "ape_rmse_m": ("APE rmse m", ".3f"), "ape_mean_m": ("APE mean m", ".3f"), "rpe_trans_m": ("RPE m", ".4f"),
-    "final_drift_percent": ("drift %", ".3f"), "failed_frames": ("failed", "d"), "breaks": ("breaks", "d"),
+    "t_err %": "{t_err_percent:.3f}", "r_err deg/100 m": "{r_err_deg_per_100m:.3f}", "APE rmse m": "{ape_rmse_m:.3f}",
+    "APE mean m": "{ape_mean_m:.3f}", "RPE m": "{rpe_trans_m:.4f}", "drift %": "{final_drift_percent:.3f}",
+    "failed": "{failed_frames:d}", "breaks": "{breaks:d}", "frames/s": "{timing[fps]:.1f}",
 }  # fmt: skip
 
 
@@ -153,17 +154,12 @@ def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
 
 
 def _figures(runs: Sequence[tuple[str, RunFolder]]) -> HtmlTable:
-    headings = ["run", "frames", *(heading for heading, _ in _FIGURES.values()), "frames/s", "loops", "rejected"]
+    headings = ["run", "frames", *_FIGURES, "loops", "rejected"]
     rows = []
     for name, run in runs:
-        values = [run.metrics.get(key) for key in _FIGURES]
-        shown = zip(values, (form for _, form in _FIGURES.values()), strict=True)
+        figures = cells_of({**run.metrics, "timing": run.timing}, _FIGURES.values())
         accepted = sum(loop.accepted for loop in run.loops)
-        fps = run.timing.get("fps")
-        rows.append([
-            name, str(len(run.trajectory)), *("-" if value is None else format(value, form) for value, form in shown),
-            "-" if fps is None else f"{fps:.1f}", str(accepted), str(len(run.loops) - accepted),
-        ])  # fmt: skip
+        rows.append([name, str(len(run.trajectory)), *figures, str(accepted), str(len(run.loops) - accepted)])
     return HtmlTable("Runs", headings, rows, "APE after SE(3) alignment, RPE and the KITTI metric unaligned.")
 
 

@@ -6,12 +6,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from dpm2_core.files import make_folder, write_json
 from dpm2_core.fleet.cluster import Cluster, Job, Status
 from dpm2_core.fleet.part import Figures, Part, do_part, figures_of, remove_attempts
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, cells_of
 
 SUMMARY = "fleet.json"
 """In the folder of the results: what became of each drive."""
@@ -99,23 +99,13 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
 
 def summary_table(title: str, outcomes: Sequence[Outcome]) -> FigureTable:
     """A row for each drive, those that failed last."""
-    figures = ("frames", "keyframes", "loops", "breaks", "t_err %", "APE m", "s", "MB")
-    table = FigureTable(title, names=["drive", "state"], figures=figures, text=["notes"])
-    order = sorted(outcomes, key=lambda outcome: outcome.state in ("failed", "stopped"))
-    for outcome in order:
-        table.add_row(outcome.name, outcome.state, *_cells(outcome.figures), outcome.reason)
+    columns = {
+        "frames": "{frames}", "keyframes": "{keyframes}", "loops": "{loops[accepted]}", "breaks": "{breaks}",
+        "t_err %": "{metrics[t_err_percent]:.2f}", "APE m": "{metrics[ape_rmse_m]:.2f}", "s": "{part[seconds]:.0f}",
+        "MB": "{part[peak_memory_mb]}",
+    }  # fmt: skip
+    table = FigureTable(title, names=["drive", "state"], figures=list(columns), text=["notes"])
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.state in ("failed", "stopped")):
+        cells = cells_of(outcome.figures or {}, columns.values())
+        table.add_row(outcome.name, outcome.state, *cells, outcome.reason)
     return table
-
-
-def _cells(figures: Figures | None) -> list[str]:
-    if figures is None:
-        return ["-"] * 8
-    metrics: Mapping[str, Any] = figures["metrics"] or {}
-    errors = [_number(metrics.get(name)) for name in ("t_err_percent", "ape_rmse_m")]
-    part = figures["part"]
-    counts = (figures["frames"], figures["keyframes"], figures["loops"]["accepted"], figures["breaks"])
-    return [*map(str, counts), *errors, f"{part['seconds']:.0f}", str(part["peak_memory_mb"])]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console, RenderableType
 
 from benchmarks import geometric, neural_view
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, cells_of
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTHS = (60, 80, 120)
@@ -128,3 +128,10 @@ def test_all_tables_are_of_this_kind() -> None:
     ]
     # the fleet's view shows drives while they run: bars, no figures
     assert sorted(others) == ["dpm2_core/fleet/view.py", "dpm2_core/tables.py"]
+
+
+def test_a_figure_that_is_not_there_is_a_dash() -> None:
+    """Also below what is not there; zero and text are figures."""
+    record = {"loops": {"tried": 0, "of two rooms": "no"}, "ape_m": None, "metrics": None}
+    columns = ("{loops[tried]} of {loops[of two rooms]}", "{ape_m:.3f}", "{metrics[rpe_m]:.1f}", "{seconds:.0f} s")
+    assert cells_of(record, columns) == ["0 of no", "-", "-", "- s"]
