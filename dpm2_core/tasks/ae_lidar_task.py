@@ -12,6 +12,7 @@ from torch import Tensor
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.chamfer import chamfer_figures
+from dpm2_core.tasks.figures import range_png
 from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
@@ -83,8 +84,6 @@ class AeLidarTask(Task):
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan and its reconstruction: range images, and seen from above."""
-        from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
-
         scans = self._reader.read([scan])
         rows = {"scan": scans, "reconstruction": self._made(scans)}
         range_png(path, rows, f"AE_lidar: {scan.sequence}, scan {scan.number}")

@@ -15,6 +15,7 @@ from torch.nn import functional
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings
 from dpm2_core.tasks.chamfer import chamfer_figures
+from dpm2_core.tasks.figures import range_png
 from dpm2_core.tasks.range_scans import RangeReader, RangeScans, image_error, slam_of, variety
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
@@ -97,9 +98,8 @@ class DslrTask(Task):
             made = network.decoder(torch.cat([codes, moved]))
             pairs = _adversarial_loss(network.discriminator(codes, codes[other]), 1.0)
             pairs = pairs + _adversarial_loss(network.discriminator(codes[other], moved), 0.0)
-            return image_error(
-                made, torch.cat([static.images, dynamic.images])
-            ) + self.settings.adversarial * pairs, None
+            error = image_error(made, torch.cat([static.images, dynamic.images]))
+            return error + self.settings.adversarial * pairs, None
         with torch.no_grad():
             codes = network.static_encoder(static.images)
         moved = network.dynamic_encoder(dynamic.images)
@@ -145,8 +145,6 @@ class DslrTask(Task):
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan, its translation and its static twin: range images, and seen from above."""
-        from dpm2_core.tasks.range_figure import range_png  # matplotlib is slow to import
-
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
         rows = {"scan": dynamic, "translated": self._made(dynamic), "static twin": static}
         range_png(path, rows, f"DSLR: {scan.sequence}, scan {scan.number}")

@@ -19,6 +19,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet, DynamicObjectNetSettings, occupancy, voxels
 from dpm2_core.network.precision import mixed_precision
 from dpm2_core.network.pretrained import DYNAMIC
+from dpm2_core.tasks.figures import dynamic_objects_png
 from dpm2_core.tasks.ground_task import UNCOUNTED
 from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import Task, TaskOptimizer, TaskTraining
@@ -127,8 +128,6 @@ class DynamicObjectTask(Task):
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan from above, what was found, missed and wrongly found in colors."""
-        from dpm2_core.tasks.dynamic_objects_figure import dynamic_objects_png  # matplotlib is slow to import
-
         points, movable, counted = _arrays(scan)
         dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > DYNAMIC, movable[counted])
 

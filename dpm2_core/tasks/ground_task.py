@@ -22,6 +22,7 @@ from dpm2_core.network.perception.gndnet import (
     ground_metrics,
     obstacle_weight,
 )
+from dpm2_core.tasks.figures import ground_png
 from dpm2_core.tasks.scan import RequiredData, TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskTraining
 from dpm2_core.tasks.training import mean_figures
@@ -122,8 +123,6 @@ class GroundTask(Task):
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """Predicted elevation beside the true one, both with what stands on it, seen from above."""
-        from dpm2_core.tasks.ground_figure import ground_png  # matplotlib is slow to import
-
         labels, known = elevation_labels(scan.points, ground_of(scan)[0], self.settings.network)
         truth = torch.where(known, labels, torch.nan)
         ground_png(path, self.net([scan.points])[0], truth, scan.points, self.settings.network)

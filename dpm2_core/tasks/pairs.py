@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,11 +53,6 @@ class ImageScan(TaskScan):
     static_image: Tensor
     mask: Tensor
     static_mask: Tensor
-
-    def to(self, device: torch.device) -> ImageScan:
-        """The scan on a device."""
-        names = ("points", "static", "image", "static_image", "mask", "static_mask")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
 
 def open_pairs(path: Path) -> list[ArrayPair]:

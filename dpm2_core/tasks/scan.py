@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -33,11 +33,10 @@ class TaskScan:
     sequence: str
     number: int
 
-    def to(self, device: torch.device) -> TaskScan:
+    def to(self, device: torch.device) -> Self:
         """The scan on a device."""
-        labels = None if self.labels is None else self.labels.to(device)
-        static = None if self.static is None else self.static.to(device)
-        return replace(self, points=self.points.to(device), labels=labels, static=static)
+        moved: dict[str, Any] = {name: v.to(device) for name, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
 
 
 class ScanSequence(Protocol):
