@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from dpm2_core.data.packed import PackedDrive
 from dpm2_core.diffslam.trajectory_loss import chained, trajectory_loss
@@ -117,8 +117,7 @@ def finetune(
             noise = torch.Generator().manual_seed(optimizer.seed * 1_000_003 + step)
             yield points, poses, (sample_set_pairs(poses, settings.frames, (1, 1), 20.0, noise),)
 
-    def save(averaged: nn.Module) -> None:
-        assert isinstance(averaged, Finetuned)
+    def save(averaged: Finetuned) -> None:
         about = read_metadata(start_from)
         about |= {"finetuned_from": start_from.stem, "finetuned_steps": str(optimizer.steps)}
         save_weights(averaged.model, weights, about)

@@ -167,8 +167,7 @@ def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False
     def batches(start: int, rank: int) -> Iterator[tuple[ImagePairs]]:
         return ((pairs,) for pairs in data.pairs(settings.points, start, rank))
 
-    def save(averaged: nn.Module) -> None:
-        assert isinstance(averaged, ImageTraining)
+    def save(averaged: ImageTraining) -> None:
         save_weights(averaged.model, weights, {"phase": "image", "steps": str(optimizer.steps)})
 
     Trainer(module, batches, optimizer, out, save).run(resume, until)

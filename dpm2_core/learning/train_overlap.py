@@ -157,8 +157,7 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
         found = data.batches(start, rank)
         return ((b.points, b.views, pair_distances(b.poses), pair_poses(b.poses)) for b in found)
 
-    def save(averaged: nn.Module) -> None:
-        assert isinstance(averaged, OverlapTraining)
+    def save(averaged: OverlapTraining) -> None:
         save_weights(averaged.model, weights, {**about, "phase": "2"})
 
     validate = validator(settings, network) if settings.validation else None
@@ -166,7 +165,9 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
     return weights
 
 
-def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Callable[[nn.Module], dict[str, float]]:
+def validator(
+    settings: OverlapTrainingSettings, network: NetworkSettings
+) -> Callable[[OverlapTraining], dict[str, float]]:
     """A function that measures the average precision on fixed batches of unseen worlds, by their images if they have
     any."""
     images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
@@ -175,8 +176,7 @@ def validator(settings: OverlapTrainingSettings, network: NetworkSettings) -> Ca
     batch = cache(lambda number: data[number, 0])
 
     @torch.inference_mode()
-    def validate(module: nn.Module) -> dict[str, float]:
-        assert isinstance(module, OverlapTraining)
+    def validate(module: OverlapTraining) -> dict[str, float]:
         device = next(module.parameters()).device
         scores, distances = [], []
         for points, views, poses in map(batch, range(settings.validation_batches)):

@@ -157,8 +157,7 @@ def train_registration(
         for step, (points, views, poses) in enumerate(data.batches(start, rank), start):
             yield points, views, set_pairs_of(poses, settings, step)
 
-    def save(averaged: nn.Module) -> None:
-        assert isinstance(averaged, RegistrationTraining)
+    def save(averaged: RegistrationTraining) -> None:
         about = {"phase": "1", "steps": str(optimizer.steps), "images": str(settings.data.images).lower()}
         if settings.partial:
             about |= {"start": Path(settings.start).stem, "random_at_start": ", ".join(random)}
@@ -171,14 +170,9 @@ def train_registration(
 
 def validator(
     settings: RegistrationTrainingSettings, network: NetworkSettings
-) -> Callable[[nn.Module], dict[str, float]]:
+) -> Callable[[RegistrationTraining], dict[str, float]]:
     """A function that measures a module on frame pairs of unseen worlds."""
     data = settings.data
     farthest = max(data.radius, FAR)
     pairs = PairSet(Path(settings.validation), settings.validation_pairs, network, data.images, farthest)
-
-    def validate(module: nn.Module) -> dict[str, float]:
-        assert isinstance(module, RegistrationTraining)
-        return pairs.measure(module.model)
-
-    return validate
+    return lambda module: pairs.measure(module.model)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from pydantic import Field
@@ -26,6 +26,7 @@ from dpm2_core.learning.checkpoint import CHECKPOINT, Log, load_checkpoint, save
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
+M = TypeVar("M", bound=nn.Module)
 _DIVERGED = 100  # steps in a row without a finite gradient: the weights, which none of them changes, do not recover
 
 
@@ -143,7 +144,7 @@ def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> No
 
 
 @dataclass(frozen=True)
-class Trainer:
+class Trainer(Generic[M]):
     """A training, from its batches to the averaged weights; under torchrun in several processes.
 
     Attributes:
@@ -156,12 +157,12 @@ class Trainer:
         validate: figures of the averaged module for the log.
     """
 
-    module: nn.Module
+    module: M
     batches: Callable[[int, int], Iterator[tuple[Any, ...]]]
     settings: OptimizerSettings
     out: Path
-    save: Callable[[nn.Module], None]
-    validate: Callable[[nn.Module], dict[str, float]] | None = None
+    save: Callable[[M], None]
+    validate: Callable[[M], dict[str, float]] | None = None
 
     def run(self, resume: bool = False, until: int | None = None) -> None:
         """Train, with `resume` on from the checkpoint; `until`: stop after this step, with a checkpoint.
@@ -207,7 +208,7 @@ class Trainer:
                 self.save(ema)
 
     def _step(
-        self, wrapped: nn.Module, ema: nn.Module, optimizer: torch.optim.Optimizer, batch: tuple[Any, ...], step: int
+        self, wrapped: nn.Module, ema: M, optimizer: torch.optim.Optimizer, batch: tuple[Any, ...], step: int
     ) -> dict[str, float]:
         """One step of the optimizer; figures for the log."""
         module, settings = self.module, self.settings
@@ -230,7 +231,7 @@ class Trainer:
                 value.data.copy_(before)
         return {name: float(value) for name, value in figures.items()} | {"norm": float(norm), "rate": rate}
 
-    def _keep(self, ema: nn.Module, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
+    def _keep(self, ema: M, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
         """Validation, then checkpoint, where they are due after so many steps: what is stopped is repeated."""
         if self.validate is not None and (last or done % self.settings.validate_every == 0):
             log.write(done - 1, self.validate(ema))

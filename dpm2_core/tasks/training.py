@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch import nn
 
 from dpm2_core.diffslam.trajectory_loss import SlamLoss
 from dpm2_core.diffslam.windows import ContiguousWindows
@@ -58,7 +57,7 @@ def train_task(
     def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:
         return _batches(task, scans, windows, start)
 
-    def save(averaged: nn.Module) -> None:
+    def save(averaged: Task) -> None:
         task.load_state_dict(averaged.state_dict())
         task.settle(scans)
         save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
@@ -69,19 +68,18 @@ def train_task(
 
 
 @torch.no_grad()
-def measure(module: nn.Module, scans: TaskScans) -> dict[str, float]:
+def measure(task: Task, scans: TaskScans) -> dict[str, float]:
     """`Task.evaluate` in eval mode; the mode is put back.
 
     Raises:
         UsageError: there are no scans, or they lack what the task needs.
     """
-    assert isinstance(module, Task)
-    was = module.training
-    module.eval()
+    was = task.training
+    task.eval()
     try:
-        return module.evaluate(scans)
+        return task.evaluate(scans)
     finally:
-        module.train(was)
+        task.train(was)
 
 
 @torch.no_grad()

@@ -10,6 +10,8 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import count, repeat
 from pathlib import Path
 
@@ -124,35 +126,46 @@ def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTra
         train_registration(fewer, tmp_path / "out", resume=True)
 
 
+class Toy(torch.nn.Module):
+    """A layer that is trained by a loss of what it is given and what it makes of that."""
+
+    def __init__(self, layer: torch.nn.Module, loss: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
+        super().__init__()
+        self.layer, self.loss = layer, loss
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        loss = self.loss(x, self.layer(x))
+        return loss, {"loss": loss.detach()}
+
+
+def line(loss: Callable[..., torch.Tensor] = lambda x, y: y.sum() ** 2) -> Toy:
+    """Of one weight for each of two numbers."""
+    return Toy(torch.nn.Linear(2, 1), loss)
+
+
+def trainer(module: Toy, out: Path, saved: list[Toy] | None = None, **steps: int) -> Trainer[Toy]:
+    """Batches are ones, 8 rows of two."""
+    settings = OptimizerSettings(compile=False, bf16=False, **steps)  # type: ignore[arg-type]
+    return Trainer(
+        module, lambda *_: repeat((torch.ones(8, 2),)), settings, out, [].append if saved is None else saved.append
+    )
+
+
 def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
     """Each step was skipped, and untrained weights were written as if all was well."""
-
-    class Broken(torch.nn.Linear):
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss = super().forward(x).sum() * torch.nan
-            return loss, {"loss": loss.detach()}
-
-    saved: list[torch.nn.Module] = []
-    steps = OptimizerSettings(steps=3, compile=False, bf16=False)
-    training = Trainer(Broken(2, 1), lambda start, rank: repeat((torch.ones(2),)), steps, tmp_path, saved.append)
+    saved: list[Toy] = []
     with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
-        training.run()
+        trainer(line(lambda x, y: y.sum() * torch.nan), tmp_path, saved, steps=3).run()
     assert not saved
 
 
 def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
     """The other steps were skipped, for hours, and weights of the few first ones written as if all was well."""
-
-    class Diverging(torch.nn.Linear):
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss = super().forward(x).square().sum() * (1.0 if float(x[0]) < 7 else torch.nan)
-            return loss, {"loss": loss.detach()}
-
-    saved: list[torch.nn.Module] = []
+    saved: list[Toy] = []
+    module = line(lambda x, y: y.square().sum() * (1.0 if float(x[0]) < 7 else torch.nan))
     batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
-    steps = OptimizerSettings(steps=400, compile=False, bf16=False)
     with pytest.raises(Dpm2Error, match="diverged: no finite gradient since step 7 of 400"):
-        Trainer(Diverging(2, 1), batches, steps, tmp_path, saved.append).run()
+        replace(trainer(module, tmp_path, saved, steps=400), batches=batches).run()
     assert not saved
 
 
@@ -162,16 +175,10 @@ def test_the_progress_of_a_training_is_that_of_every_command(
     """On stderr, without a terminal in lines, and not with --quiet; it was a bar among the results, whatever was asked
     for."""
 
-    class Line(torch.nn.Linear):
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss = super().forward(x).sum() ** 2
-            return loss, {"loss": loss.detach()}
-
     def shown(quiet: bool) -> tuple[str, list[str]]:
         token = QUIET.set(quiet)
         try:
-            steps = OptimizerSettings(steps=20, compile=False, bf16=False)
-            Trainer(Line(2, 1), lambda *_: repeat((torch.ones(2),)), steps, tmp_path / str(quiet), lambda m: None).run()
+            trainer(line(), tmp_path / str(quiet), steps=20).run()
         finally:
             QUIET.reset(token)
         out, err = capsys.readouterr()
@@ -185,45 +192,27 @@ def test_the_progress_of_a_training_is_that_of_every_command(
 
 def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None:
     """Those of the validation drives came into the weights: each figure was of a forward pass that learns."""
-
-    class Normed(torch.nn.BatchNorm1d):
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss = (super().forward(x) - x).square().mean()
-            return loss, {"loss": loss.detach()}
-
-    def validate(module: torch.nn.Module) -> dict[str, float]:
-        return {"seen": float(module(torch.full((8, 2), 100.0))[0])}
-
-    steps = OptimizerSettings(steps=2, compile=False, bf16=False, validate_every=1)
-    saved: list[torch.nn.Module] = []
-    for name, validator in (("with", validate), ("without", None)):
-        batches = lambda start, rank: repeat((torch.ones(8, 2),))  # noqa: E731
-        Trainer(Normed(2), batches, steps, tmp_path / name, saved.append, validator).run()
-    assert torch.equal(saved[0].running_mean, saved[1].running_mean)  # type: ignore[arg-type]
+    saved: list[Toy] = []
+    for name, validate in (("with", lambda m: {"seen": float(m(torch.full((8, 2), 100.0))[0])}), ("without", None)):
+        module = Toy(torch.nn.BatchNorm1d(2), lambda x, y: (y - x).square().mean())
+        replace(trainer(module, tmp_path / name, saved, steps=2, validate_every=1), validate=validate).run()
+    one, other = (module.layer.running_mean for module in saved)
+    assert torch.equal(one, other)  # type: ignore[arg-type]
 
 
 def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
     """The checkpoint said that its step was done, so the figures of the last steps were lost for good."""
-
-    class Line(torch.nn.Linear):
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss = super().forward(x).sum() ** 2
-            return loss, {"loss": loss.detach()}
-
     outcomes = iter([1.0, None, 2.0])
 
-    def validate(module: torch.nn.Module) -> dict[str, float]:
+    def validate(module: Toy) -> dict[str, float]:
         if (figure := next(outcomes)) is None:
             raise KeyboardInterrupt
         return {"figure": figure}
 
-    def train(resume: bool) -> None:
-        steps = OptimizerSettings(steps=4, compile=False, bf16=False, save_every=2, validate_every=2)
-        Trainer(Line(2, 1), lambda *_: repeat((torch.ones(2),)), steps, tmp_path, lambda m: None, validate).run(resume)
-
+    training = trainer(line(), tmp_path, steps=4, save_every=2, validate_every=2)
     with pytest.raises(KeyboardInterrupt):
-        train(False)
-    train(True)
+        replace(training, validate=validate).run()
+    replace(training, module=line(), validate=validate).run(resume=True)
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(row["step"], row["figure"]) for row in rows if "figure" in row] == [(1, 1.0), (3, 2.0)]
     assert list(losses(tmp_path)) == [0, 1, 2, 3]
