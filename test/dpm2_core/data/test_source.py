@@ -89,9 +89,9 @@ def test_prefetch_raises_what_the_reader_raised_after_the_items_before() -> None
 def test_closing_prefetch_ends_its_thread() -> None:
     ahead = prefetch(iter(range(1000)), depth=1)
     next(ahead)
-    assert any(thread.name == "prefetch" for thread in threading.enumerate())
+    assert any(thread.name.startswith("prefetch") for thread in threading.enumerate())
     ahead.close()  # type: ignore[attr-defined]
-    assert not any(thread.name == "prefetch" for thread in threading.enumerate())
+    assert not any(thread.name.startswith("prefetch") for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize("text", ["10:5", "3:3", ":0"])
