@@ -6,8 +6,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
+from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,9 +18,11 @@ from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.messages import point_cloud
 from dpm2_core.data.ply import read_vertices
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import IndexedSource
+from dpm2_core.data.text import date_ns
 from dpm2_core.errors import UsageError, one_line
 from dpm2_core.extras import needs
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import NO_POINTS, Frame
 
 SUFFIXES = (".pcd", ".ply")
 _LONGEST = 30_000_000_000  # ns from one scan to the next: beyond it numbers count something else, such as ms
@@ -30,15 +31,13 @@ _PACKED = 100  # times longer than packed: LZF makes at most 264 bytes of 3
 _MOST_COLUMNS = 1000  # of a PCD file; a normal and its curvature are 4, a histogram of features is 308
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
 """Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
-_DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
-"""2023-11-14_22-13-20_750, or 20231114_221320.750: a date, taken to be in UTC, and decimals of the second."""
 _EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
 """From, to, ns: a number in a name that is a time since 1970 after 1973."""
 
 _USUALLY = 3  # numbers whose steps are more than so many times the least are no count: milliseconds of a clock
 
 
-class CloudFolder:
+class CloudFolder(IndexedSource):
     """Scans in the order of the numbers in their names. See `Source`; neither images nor ground truth.
 
     Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
@@ -49,16 +48,12 @@ class CloudFolder:
         UsageError: no such file in the folder, or what reads PCD is not installed.
     """
 
-    T_cam_lidar: Array | None = None
-    poses: Array | None = None
-    truth = ""
-
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         folder, settings = Path(path), settings or InputSettings()
-        self.name, self.notes = folder.resolve().name, list[str]()
         found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
         if not found:
             raise UsageError(f"{folder}: no .pcd or .ply file in this folder")
+        super().__init__(folder.resolve().name, len(found))
         times = name_times(found)
         if times:
             self._files = [found[i] for i in np.argsort(times)]
@@ -73,22 +68,17 @@ class CloudFolder:
             _pcd_types()  # now, rather than at the first scan
         self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position; one whose file cannot be read has `problem` set."""
-        for index in range(*slice(start, stop).indices(len(self))):
-            stamp = int(self.stamps[index])
-            try:
-                frame = self._frames.frame(stamp, _cloud(self._files[index], stamp), index)
-            except UsageError as error:
-                self.notes.append(str(error))
-                yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=str(error))
-                continue
-            if self._frames.time_problem and not any(self._frames.time_problem in note for note in self.notes):
-                self.notes.append(f"{self._files[index]}: {self._frames.time_problem}")
-            yield frame
+    def frame(self, position: int) -> Frame:
+        """As `IndexedSource`."""
+        file, stamp = self._files[position], int(self.stamps[position])
+        try:
+            frame = self._frames.frame(stamp, _cloud(file, stamp), position)
+        except UsageError as error:
+            self.notes.append(str(error))
+            return Frame(stamp, NO_POINTS, index=position, problem=str(error))
+        if self._frames.time_problem and not any(self._frames.time_problem in note for note in self.notes):
+            self.notes.append(f"{file}: {self._frames.time_problem}")
+        return frame
 
 
 def _cloud(path: Path, stamp: int) -> Any:
@@ -164,23 +154,13 @@ def _numbers(file: Path) -> list[Decimal]:
     return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
 
 
-def _of_date(match: re.Match[str]) -> int:
-    """ns since 1970 of a `_DATE`; 0 of a day that there is not."""
-    year, month, day, hour, minute, second = (int(match[i]) for i in range(1, 7))
-    try:
-        seconds = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
-    except ValueError:
-        return 0
-    return int(seconds) * 10**9 + int((match[7] or "0").ljust(9, "0"))
-
-
 def name_times(files: list[Path]) -> list[int]:
     """ns of each file by its name; empty where they are not all times since 1970, each another one, of one drive."""
-    dates = [match for file in files if (match := _DATE.fullmatch(file.stem))]
+    dates = [date for file in files if (date := date_ns(file.stem)) is not None]
     pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
     widths = {len(match[2]) for match in pairs}
     if len(dates) == len(files):
-        found = [_of_date(match) for match in dates]
+        found = dates
     elif len(pairs) == len(files) and (max(widths) == 9 or widths in ({6}, {3})):
         found = [int(match[1]) * 10**9 + int(match[2]) * 10 ** (9 - max(widths)) for match in pairs]
     else:

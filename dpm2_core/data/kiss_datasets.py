@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,16 @@ import numpy as np
 
 from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import IndexedSource
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import NO_POINTS, Array, Frame
 
 _SWEEP = 0.1  # s, a turn of the LiDAR
 _OWN = ("generic", "mcap", "ouster", "rosbag")  # read without it, with times and intensities
 
 
-class KissSource:
+class KissSource(IndexedSource):
     """A drive by the loader `input.dataset` of KISS-ICP. See `Source`; there are no images and no intensities.
 
     The times of the points are, as KISS-ICP takes them, fractions of the sweep, whose end is the stamp.
@@ -33,11 +33,8 @@ class KissSource:
         UsageError: no such loader, a package that it needs is missing, or it cannot read the folder.
     """
 
-    T_cam_lidar: Array | None = None
-
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings, self.path = settings or InputSettings(), Path(path)
-        self.name, self.notes = self.path.resolve().stem, list[str]()
         self._printed = ""  # by the loader when it was made, perhaps what it lacks
         kind = self._settings.dataset
         with needs("datasets", f"input.dataset={kind}"):
@@ -47,27 +44,23 @@ class KissSource:
             raise UsageError(f"input.dataset={kind}: there is no such loader; there are {', '.join(names)}")
         arguments = {"data_dir": self.path, "sequence": self._settings.sequence}
         self._set = self._asked(lambda: dataset_factory(kind, **arguments))
-        self._count = int(self._asked(lambda: len(self._set)))
+        super().__init__(self.path.resolve().stem, int(self._asked(lambda: len(self._set))))
         if not self._count:
             raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
-        self._stamps, self.poses = self._times(), self._poses()
+        self.stamps, self.poses = self._times(), self._poses()
         self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
 
-    def __len__(self) -> int:
-        return self._count
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1; one that the loader cannot read has `problem` set."""
-        for index in range(*slice(start, stop).indices(self._count)):
-            points, offset, problem = np.empty((0, 4), np.float32), None, None
-            try:
-                xyz, times = self._asked(lambda index=index: self._set[index])
-                points = np.zeros((len(xyz), 4), np.float32)
-                points[:, :3] = np.asarray(xyz)[:, :3]
-                offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
-            except UsageError as error:
-                problem = str(error)
-            yield Frame(int(self._stamps[index]), points, offset, index=index, problem=problem)
+    def frame(self, position: int) -> Frame:
+        """As `IndexedSource`."""
+        stamp = int(self.stamps[position])
+        try:
+            xyz, times = self._asked(lambda: self._set[position])
+        except UsageError as error:
+            return Frame(stamp, NO_POINTS, index=position, problem=str(error))
+        points = np.zeros((len(xyz), 4), np.float32)
+        points[:, :3] = np.asarray(xyz)[:, :3]
+        offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
+        return Frame(stamp, points, offset, index=position)
 
     def _asked(self, what: Any) -> Any:
         """What the loader answers; it prints, exits and asserts where something is missing."""

@@ -12,18 +12,19 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.cloud_folder import name_times
-from dpm2_core.data.messages import scale_intensity
-from dpm2_core.data.scan_file import chosen, image_of, image_size, images_of, numbered_scans, read_scan
+from dpm2_core.data.scan_file import chosen
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.time_order import out_of_order
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction, correct_vertical_angle
+from dpm2_core.data.velodyne import VelodyneDrive
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
@@ -32,7 +33,7 @@ ROUNDED = 0.01
 """By so much a rotation in a calibration file may be off, as its numbers are rounded."""
 
 
-class KittiSource:
+class KittiSource(VelodyneDrive):
     """A sequence folder, or the root above it with `sequences/NN`. See `Source` for what it offers.
 
     Scans need not start at 0 nor follow each other. Images and poses are optional. A scan or image that cannot be read
@@ -42,50 +43,33 @@ class KittiSource:
         UsageError: there are no scans, or a text file is damaged; the message names file and line.
     """
 
+    swept = False
+
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
-        self._settings = settings or InputSettings()
-        self.path = _sequence_folder(Path(path), self._settings.sequence)
-        self.name = self.path.resolve().name
-        self.notes: list[str] = []
-        self.truth = ""
-        self._scans = numbered_scans(self.path / "velodyne")
-        if not self._scans:
-            raise UsageError(f"{self.path}: no scans (velodyne/NNNNNN.bin) in this folder")
-        self.numbers = np.array([int(scan.stem) for scan in self._scans])
+        settings = settings or InputSettings()
+        self.path = _sequence_folder(Path(path), settings.sequence)
+        super().__init__(self.path.resolve().name, self.path / "velodyne", self.path / "image_2", settings)
         self.vertical_angle_correction_deg = self._correction()
         calib = read_calib(self.path / "calib.txt")
-        self.T_cam_lidar: Array | None = calib.get("Tr")
+        self.T_cam_lidar = calib.get("Tr")
         if self.T_cam_lidar is None:
             lacks = "has no Tr" if (self.path / "calib.txt").is_file() else "is missing"
             self.notes.append(f"{self.path / 'calib.txt'} {lacks}: poses are of the LiDAR, not of the left camera")
         self.stamps = self._stamps()
-        self.poses: Array | None = self._poses()
+        self.poses = self._poses()
         self.camera = self._camera(calib)
         self.imu, self.R_lidar_imu = self._imu(calib)
         self.fixes = self._fixes(calib)
 
-    def __len__(self) -> int:
-        return len(self._scans)
-
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position; `Frame.index` is the number in the file name."""
+        """Frames start..stop-1 by position, with what IMU and receiver measured since the one before."""
         before, fixes = None, deque(self.fixes)
-        for scan, stamp in list(zip(self._scans, self.stamps, strict=True))[start:stop]:
-            imu, before = self._samples(before, int(stamp)), int(stamp)
-            fix = None
-            while fixes and fixes[0].stamp <= stamp:
+        for frame in super().frames(start, stop):
+            imu, fix = self._samples(before, frame.stamp), None
+            while fixes and fixes[0].stamp <= frame.stamp:
                 fix = fixes.popleft()
-            points, problem = read_scan(scan)
-            points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
-            yield Frame(
-                stamp=int(stamp),
-                points=correct_vertical_angle(points, self.vertical_angle_correction_deg),
-                images=images_of(self._image_path(scan), self.camera, self.notes),
-                index=int(scan.stem),
-                problem=problem,
-                imu=imu,
-                fix=fix,
-            )
+            before = frame.stamp
+            yield replace(frame, imu=imu, fix=fix)
 
     def _imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
         """All samples along the IMU's axes, and R_lidar_imu (3, 3); no samples where there are none to use."""
@@ -178,9 +162,8 @@ class KittiSource:
             return None
         self.truth = "/".join(path.parts[-2:])  # poses/04.txt, or SemanticKITTI's 04/poses.txt
         rows = self._of_each_scan(read_numbers(path, 12))
-        known = np.isfinite(rows).all(1)
-        if not known.all():
-            self.notes.append(f"{path}: {len(self) - known.sum()} of {len(self)} frames have no pose")
+        known = np.isfinite(rows[:, 0])
+        self._note_unposed(path, known)
         rigid = np.array([se3.is_rigid(se3.make(T[:, :3], T[:, 3]), ROUNDED) for T in rows.reshape(-1, 3, 4)], bool)
         if (wrong := np.logical_and(known, ~rigid)).any():
             first = self.numbers[int(np.argmax(wrong))]
@@ -209,14 +192,8 @@ class KittiSource:
 
     def _camera(self, calib: dict[str, Array]) -> Camera | None:
         """The left color camera, its size that of the first image that can be read; None without images."""
-        if not self._settings.images:
-            return None
-        paths = [path for path in map(self._image_path, self._scans) if path]
-        if not paths:
-            return None
-        size = image_size(paths)
+        size = self._image_size()
         if size is None:
-            self.notes.append(f"{paths[0].parent}: none of its images can be read")
             return None
         if self.T_cam_lidar is None:
             self.notes.append("images are left out: without Tr the camera's place is not known")
@@ -224,9 +201,6 @@ class KittiSource:
         if "P2" not in calib:
             raise UsageError(f"{self.path / 'calib.txt'}: no P2, which image_2 needs; without images it is not needed")
         return left_color_camera(calib["P2"], self.T_cam_lidar, size)
-
-    def _image_path(self, scan: Path) -> Path | None:
-        return image_of(scan, self.path / "image_2")
 
 
 def left_color_camera(P2: Array, T_cam_lidar: Array, size: tuple[int, int]) -> Camera:

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kitti import ROUNDED, left_color_camera
-from dpm2_core.data.kitti360 import SweptDrive, chosen_drive, read_keyed, required
+from dpm2_core.data.kitti360 import chosen_drive, read_keyed, read_timestamps, required
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import read_numbers
+from dpm2_core.data.velodyne import VelodyneDrive
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -26,7 +27,7 @@ _CALIBRATION = "calib_velo_to_cam.txt"
 _OXTS = 30  # numbers in a file of oxts
 
 
-class KittiRawSource(SweptDrive):
+class KittiRawSource(VelodyneDrive):
     """A synchronized and rectified drive, by its folder, or by the folder of its date and `input.sequence` (0009).
 
     The stamp is when the LiDAR faced forward. Numbers may be missing. Images are those of the left color camera,
@@ -39,11 +40,10 @@ class KittiRawSource(SweptDrive):
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         settings = settings or InputSettings()
         self.path = _find(Path(path), settings.sequence)
-        self.name, self.truth = self.path.absolute().name, ""
-        images = self.path / "image_02" / "data"
-        super().__init__(self.path / "velodyne_points", images, settings, HDL64_CORRECTION_DEG)
-        self.T_cam_lidar: Array | None = None
-        self.poses: Array | None = None
+        scans = self.path / "velodyne_points"
+        super().__init__(self.path.absolute().name, scans / "data", self.path / "image_02" / "data", settings)
+        self.vertical_angle_correction_deg = settings.angle_correction(HDL64_CORRECTION_DEG)
+        self.stamps = read_timestamps(scans / "timestamps.txt", self.numbers, settings, self.notes)
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
         date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
         if date is None:
@@ -66,8 +66,7 @@ class KittiRawSource(SweptDrive):
         if not known.any():
             return None
         self.truth = f"{self.name}/oxts"
-        if not known.all():
-            self.notes.append(f"{folder}: {(~known).sum()} of {len(self)} frames have no pose")
+        self._note_unposed(folder, known)
         poses = np.full((len(self), 4, 4), np.nan)
         poses[known] = _poses_of(np.concatenate(rows)) @ se3.inverse(_rigid(mounting))
         return poses

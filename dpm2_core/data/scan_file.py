@@ -58,9 +58,15 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def image_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Width and height of the first image that can be read; None if there is none."""
-    return next((pixels.shape[1::-1] for pixels in map(read_image, paths) if pixels is not None), None)
+def image_size(paths: Iterable[Path], notes: list[str]) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None without, which is noted where there are images."""
+    path = None
+    for path in paths:
+        if (pixels := read_image(path)) is not None:
+            return pixels.shape[1::-1]
+    if path is not None:
+        notes.append(f"{path.parent}: none of its images can be read")
+    return None
 
 
 def image_of(scan: Path, folder: Path) -> Path | None:

@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
@@ -46,6 +50,33 @@ class Source(Protocol):
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, read one at a time; an unreadable one comes with `problem` set."""
         ...
+
+
+class IndexedSource(ABC):
+    """A `Source` of frames that can be read in any order. What is None or empty here its kinds find, or do without."""
+
+    truth = ""
+    poses: Array | None = None
+    T_cam_lidar: Array | None = None
+
+    def __init__(self, name: str, count: int) -> None:
+        self.name, self.notes, self._count = name, list[str](), count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @abstractmethod
+    def frame(self, position: int) -> Frame:
+        """The frame at a position, the same whenever it is asked for; an unreadable one comes with `problem` set."""
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames start..stop-1 by position, read one at a time."""
+        return map(self.frame, range(self._count)[start:stop])
+
+    def _note_unposed(self, where: object, known: NDArray[np.bool_]) -> None:
+        """Say of how many frames there is no pose; `known` (len,)."""
+        if not known.all():
+            self.notes.append(f"{where}: {(~known).sum()} of {len(self)} frames have no pose")
 
 
 def frame_at(source: Source, position: int) -> Frame:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in text files, with errors that name file and line."""
+"""Numbers and times in text files, with errors that name file and line."""
 
 from __future__ import annotations
 
+import re
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 
 _LARGEST = 9e9  # s, of a stamp in ns as an integer: the year 2255; no place or focal length is as large
+_DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
 
 
 def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
@@ -48,3 +51,16 @@ def parse_row(text: str, count: int, where: str) -> Array:
     if np.abs(row).max(initial=0) > _LARGEST:
         raise UsageError(f"{where}: {np.abs(row).max():g} is no time, place or calibration")
     return row
+
+
+def date_ns(text: str) -> int | None:
+    """ns since 1970 of a text that ends in a date in UTC, as 2023-11-14_22-13-20_750 or 20231114_221320.750; None of
+    any other, and of a day that there is not."""
+    if (match := _DATE.fullmatch(text)) is None:
+        return None
+    year, month, day, hour, minute, second = (int(match[i]) for i in range(1, 7))
+    try:
+        seconds = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+    return int(seconds) * 10**9 + int((match[7] or "0").ljust(9, "0"))

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpm2_core.data.prefetch import prefetch
+from dpm2_core.data.source import IndexedSource
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
@@ -27,31 +27,23 @@ _FASTEST = np.radians(100.0)  # rad/s
 _RAMP = 0.25  # s in which it begins to turn
 
 
-class _Simulated(ABC):
-    """A `data.source.Source` of a LiDAR alone.
+class _Simulated(IndexedSource):
+    """A LiDAR alone.
 
     Attributes:
         world: what it drives through. times: (N,) s. poses: (N, 4, 4) T_world_lidar at these times, exact.
     """
 
-    T_cam_lidar = None
     truth = "simulation"
-    times: Array
     poses: Array
 
-    def __init__(self, name: str, world: World) -> None:
-        self.name, self.world, self.notes = name, world, list[str]()
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    @abstractmethod
-    def frame(self, i: int) -> Frame:
-        """Frame i, the same whenever it is asked for."""
+    def __init__(self, name: str, world: World, times: Array) -> None:
+        super().__init__(name, len(times))
+        self.world, self.times = world, times
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1, simulated ahead in another thread."""
-        return prefetch(map(self.frame, range(len(self))[start:stop]))
+        return prefetch(super().frames(start, stop))
 
 
 class SimulatedDrive(_Simulated):
@@ -63,18 +55,18 @@ class SimulatedDrive(_Simulated):
         Raises:
             UsageError: no such road or preset.
         """
-        super().__init__(name, build_world(road, preset, seed))
-        self.times = self.world.road.times
+        world = build_world(road, preset, seed)
+        super().__init__(name, world, world.road.times)
         self._lidar = Lidar(LidarConfig())
         height = self._lidar.config.height
         self.poses = np.stack([self.world.drive_pose(float(t), height) for t in self.times])
 
-    def frame(self, i: int) -> Frame:
-        """As `_Simulated`."""
-        time = float(self.times[i])
-        rng = np.random.default_rng([self.world.seed, _STREAM, i])
-        scan = self._lidar.scan(self.world, self.poses[i], time, rng)
-        return Frame(round(time * 1e9), scan.points, index=i)
+    def frame(self, position: int) -> Frame:
+        """As `IndexedSource`."""
+        time = float(self.times[position])
+        rng = np.random.default_rng([self.world.seed, _STREAM, position])
+        scan = self._lidar.scan(self.world, self.poses[position], time, rng)
+        return Frame(round(time * 1e9), scan.points, index=position)
 
 
 @dataclass(frozen=True)
@@ -123,38 +115,39 @@ class TurningRobot(_Simulated):
         rng = np.random.default_rng([world.seed, _IMU_STREAM])
         end = frames * FRAME_PERIOD + 1
         world = replace(world, road=_robot_progress(world.road, end, ride, rng))
-        super().__init__(f"{world.preset} {world.seed}", world)
+        times = 0.5 + np.arange(frames, dtype=np.float64) * FRAME_PERIOD
+        super().__init__(f"{world.preset} {world.seed}", world, times)
         self._lidar = Lidar(lidar)
         at = np.arange(0.0, end, _STEP)
         level = np.stack([self.world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
         self._T = level @ ride.shaken(at)
-        self.times = 0.5 + np.arange(frames, dtype=np.float64) * FRAME_PERIOD
         self.poses = self.pose(self.times)
         self._imu = None if imu is None else Imu(imu, rng)
         if self._imu is not None:
-            times = self._imu.times(0.1, end - 0.1)
-            self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(times, self.pose))
-            self._stamps = np.round(times * 1e9).astype(np.int64)
+            at = self._imu.times(0.1, end - 0.1)
+            self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(at, self.pose))
+            self._stamps = np.round(at * 1e9).astype(np.int64)
 
     def pose(self, times: Array) -> Array:
         """T_world_lidar (M, 4, 4) at times (M,) s."""
         k = np.floor(times / _STEP).astype(int)
         return se3.interpolated(self._T[k], self._T[k + 1], times / _STEP - k)
 
-    def frame(self, i: int) -> Frame:
-        """As `_Simulated`; its samples are those since the sweep before."""
-        time, T, offsets = float(self.times[i]), self.poses[i], self._lidar.beams.column_time.astype(float)
+    def frame(self, position: int) -> Frame:
+        """As `IndexedSource`; its samples are those since the sweep before."""
+        time, T = float(self.times[position]), self.poses[position]
+        offsets = self._lidar.beams.column_time.astype(float)
         turning = se3.inverse(T) @ self.pose(time + offsets)
-        rng = np.random.default_rng([self.world.seed, _STREAM, i])
+        rng = np.random.default_rng([self.world.seed, _STREAM, position])
         scan = self._lidar.scan(self.world, T, time, rng, turning)
         stamp, imu = round(time * 1e9), None
         if self._imu is not None:
             end = time + float(offsets.max())
             first, last = np.searchsorted(
-                self._stamps, [round((end - (FRAME_PERIOD if i else 1)) * 1e9), round(end * 1e9)]
+                self._stamps, [round((end - (FRAME_PERIOD if position else 1)) * 1e9), round(end * 1e9)]
             )
             imu = Inertial(self._stamps[first:last], self._rates[first:last], self._forces[first:last])
-        return Frame(stamp, scan.points, scan.time_offset, index=i, imu=imu)
+        return Frame(stamp, scan.points, scan.time_offset, index=position, imu=imu)
 
 
 def _moving(time: ArrayLike) -> Array:

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from dpm2_core.data.kitti360 import Kitti360Source, azimuth_time
+from dpm2_core.data.kitti360 import Kitti360Source
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
+from dpm2_core.data.velodyne import azimuth_time
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew

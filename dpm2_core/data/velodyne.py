@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives of KITTI's kind: a scan of the HDL-64E a file, and an image of the same number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpm2_core.data.messages import scale_intensity
+from dpm2_core.data.scan_file import image_of, image_size, images_of, numbered_scans, read_scan
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.source import IndexedSource
+from dpm2_core.data.vertical_angle import correct_vertical_angle
+from dpm2_core.errors import UsageError
+from dpm2_core.frame import Camera, Frame, Points
+
+_PERIOD = 0.1  # s, a turn of the LiDAR
+
+
+class VelodyneDrive(IndexedSource):
+    """What KITTI odometry, raw and KITTI-360 have in common. `Frame.index` is the number in the file name.
+
+    Attributes:
+        numbers: (len,) those in the file names. stamps: (len,) ns; who derives from it finds them.
+        camera: of its images; None where there are none, or none are wanted.
+        vertical_angle_correction_deg: added to the elevation of each point.
+        swept: whether scans are as measured: each point then has a time offset by its azimuth, see `azimuth_time`.
+    """
+
+    numbers: NDArray[np.int64]
+    stamps: NDArray[np.int64]
+    camera: Camera | None = None
+    vertical_angle_correction_deg: float
+    swept = True
+
+    def __init__(self, name: str, scans: Path, images: Path, settings: InputSettings) -> None:
+        """Find the scans, NNNNNN.bin, in a folder.
+
+        Raises:
+            UsageError: there are none.
+        """
+        self._scans, self._images, self._settings = numbered_scans(scans), images, settings
+        if not self._scans:
+            wanted = ": want a drive that is `_sync`" if self.swept else ""
+            raise UsageError(f"{scans.parent}: no scans ({scans.name}/NNNNNN.bin) in this folder{wanted}")
+        super().__init__(name, len(self._scans))
+        self.numbers = np.array([int(scan.stem) for scan in self._scans])
+
+    def frame(self, position: int) -> Frame:
+        """As `IndexedSource`."""
+        scan, stamp = self._scans[position], int(self.stamps[position])
+        points, problem = read_scan(scan)
+        points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
+        points = correct_vertical_angle(points, self.vertical_angle_correction_deg)
+        images = images_of(image_of(scan, self._images), self.camera, self.notes)
+        offset = azimuth_time(points) if self.swept else None
+        return Frame(stamp, points, offset, images, index=int(scan.stem), problem=problem)
+
+    def _image_size(self) -> tuple[int, int] | None:
+        """None without images, or where none are wanted."""
+        if not self._settings.images:
+            return None
+        return image_size((path for scan in self._scans if (path := image_of(scan, self._images))), self.notes)
+
+
+def azimuth_time(points: Points) -> Points:
+    """(N,) s from facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that turns clockwise, seen from above.
+
+    What is on the left was measured before what is on the right: so it is in KITTI-360's devkit (kitti360Scripts,
+    `curl_velodyne_data` moves a point on the left by a part of the way back to the previous pose) and in KISS-ICP's
+    reader of KITTI raw. In real scans of KITTI odometry, the same sensor, the rings have been moved that way by what
+    KITTI untwisted, and the world agrees best from scan to scan with it. Other converters call the rotation
+    counter-clockwise. No scan of KITTI-360 itself was at hand.
+    """
+    return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
