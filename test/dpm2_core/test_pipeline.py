@@ -77,7 +77,6 @@ def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
     np.testing.assert_array_equal(result.poses, recorder.poses(slam.mapper.poses))
     assert result.registered == [True] * FRAMES
     assert dict(result.methods) == {"first": 1, "geometric": FRAMES - 1}
-    assert result.metrics is not None
     assert result.metrics.ape_rmse_m < 0.03
 
 
@@ -116,7 +115,6 @@ def test_a_saved_result_is_every_file_and_reads_back(result: Result, tmp_path: P
     np.testing.assert_allclose(read_trajectory(out / "trajectory.tum").poses, result.poses, rtol=0, atol=1e-9)
     camera = read_trajectory(out / "trajectory_kitti.txt").poses
     np.testing.assert_allclose(camera, result.sensor_poses, rtol=0, atol=1e-9)  # as printed, with 13 digits
-    assert result.metrics is not None
     assert json.loads((out / "metrics.json").read_text()) == json.loads(result.metrics.model_dump_json())
     timing = json.loads((out / "timing.json").read_text())
     assert list(timing) == ["frames", "fps", "wall_s", "answers", "states", "breaks", "stages_ms"]
@@ -169,8 +167,6 @@ def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path
     assert alone.metrics is None
     stamped = OfflineRun(source, CONFIG, (2, 7), tmp_path / "truth.tum").run()
     given = OfflineRun(source, CONFIG, (2, 7), recording / "poses" / "00.txt").run()
-    assert stamped.metrics is not None
-    assert given.metrics is not None
     assert stamped.metrics.truth == str(tmp_path / "truth.tum")
     assert given.metrics.frames == stamped.metrics.frames == 5  # of the drive, not of the whole truth
     assert stamped.metrics.path_length_m == pytest.approx(given.metrics.path_length_m, abs=0.1)
@@ -220,8 +216,6 @@ def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: P
     source.T_cam_lidar = None  # type: ignore[misc]  # the poses of the LiDAR in either case
     given = OfflineRun(source, CONFIG, (1, 6)).run().metrics
     stamped = OfflineRun(source, CONFIG, (1, 6), tmp_path / "truth.tum").run().metrics
-    assert given is not None
-    assert stamped is not None
     assert (stamped.frames, stamped.failed_frames) == (given.frames, 0)
     # Of the truth between two frames that lie on a bend a part of a millimeter is missing.
     assert stamped.ape_rmse_m == pytest.approx(given.ape_rmse_m, abs=1e-3)
@@ -261,7 +255,6 @@ def test_a_run_is_over_once(recording: Path) -> None:
     result = drive.run()
     with pytest.raises(UsageError, match="00: it was run already; a second run needs another OfflineRun"):
         drive.run()
-    assert result.metrics is not None
     assert (len(result), result.metrics.frames) == (3, 3)
 
 

@@ -41,7 +41,6 @@ def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def truth(recording: Path) -> np.ndarray:
     """(N, 4, 4) T_map_lidar: the map's frame is that of the first scan."""
     poses = open_source(recording, InputSettings(images=False)).poses
-    assert poses is not None
     return np.asarray(se3.inverse(poses[0]) @ poses)
 
 

@@ -57,7 +57,6 @@ def sequence(recording: Path, tmp_path: Path) -> Path:
 def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
     """Its samples stop 0.05 s before the ninth frame, which still has some; the drive goes on, and both are said."""
     poses, imu = KittiSource(sequence).poses, Imu(ImuConfig(), np.random.default_rng(0))
-    assert poses is not None
     steps, times = se3.log(se3.inverse(poses[:-1]) @ poses[1:]), imu.times(0.0, 0.75)
 
     def pose(t: np.ndarray) -> np.ndarray:

@@ -65,7 +65,6 @@ def test_a_missing_extrinsic_is_an_error_never_identity(bags: Any, tmp_path: Pat
     ):
         BagSource(bag)
     camera = BagSource(bag, InputSettings(T_lidar_cam=(0.1, 0.2, 0.3, 0, 0, 0, 1))).camera
-    assert camera is not None
     np.testing.assert_allclose(camera.T_lidar_cam[:3, 3], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(camera.T_lidar_cam[:3, :3], np.eye(3))
     assert BagSource(bag, InputSettings(images=False)).camera is None
@@ -77,8 +76,6 @@ def test_the_extrinsic_comes_from_tf_static(bags: Any, tmp_path: Path) -> None:
                 (1, "/tf_static", bags.transform("base_link", "cam", (1.5, 0, 0))),
                 (1, "/tf_static", bags.transform("velo_link", "camera_gray_left", (0, 2, 0)))]  # fmt: skip
     source = BagSource(bags.write(tmp_path / "b", messages))
-    assert source.camera is not None
-    assert source.T_cam_lidar is not None
     np.testing.assert_allclose(source.camera.T_lidar_cam[:3, 3], [0.5, 0, 0])
     np.testing.assert_allclose(source.T_cam_lidar[:3, 3], [0, -2, 0])
     assert (source.camera.size, source.camera.K[0, 0]) == ((8, 6), 5)
@@ -138,7 +135,6 @@ def test_odometry_is_interpolated_at_the_clouds(bags: Any, tmp_path: Path, child
     bag = bags.write(tmp_path / "b", by_time(messages))
     assert BagSource(bag).poses is None  # only KITTI's topics are taken for truth unasked
     poses = BagSource(bag, InputSettings(ground_truth_topic="/truth")).poses
-    assert poses is not None
     np.testing.assert_allclose(poses[:3, 0, 3], np.array([10, 15, 20]) + (child == "base_link"), atol=1e-9)
     assert np.isnan(poses[3]).all()
 
@@ -148,7 +144,6 @@ def test_a_truth_of_the_lidar_with_a_leading_slash(bags: Any, tmp_path: Path, ch
     truth = [(t, "/ground_truth/odom", bags.odometry(t, t, child)) for t in (1, 2)]
     messages = [*((t, "/points", bags.cloud(t, frame=lidar)) for t in (1, 2)), *truth]
     poses = BagSource(bags.write(tmp_path / "b", messages)).poses
-    assert poses is not None
     assert poses[:, 0, 3].tolist() == [1, 2]
 
 
@@ -176,7 +171,6 @@ def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
     (note,) = source.notes
     assert note.startswith("/truth: 2 of 2 frames have no pose (poses from 38.000 to 38.500 s, clouds from 1.000")
     unstamped = BagSource(bag, InputSettings(ground_truth_topic="/unstamped")).poses
-    assert unstamped is not None
     np.testing.assert_allclose(unstamped[:, 0, 3], [10, 20])
 
 
@@ -192,7 +186,6 @@ def test_an_invalid_true_pose_costs_itself(bags: Any, tmp_path: Path, damaged: b
     file = bags.write(tmp_path / "b", by_time([*clouds(bags, [1, 1.5, 2]), *sent])) / "b.mcap"
     file.write_bytes(file.read_bytes().replace(b"no text", b"\xff" * 7))
     source = BagSource(file)
-    assert source.poses is not None
     np.testing.assert_allclose(source.poses[:, 0, 3], [0, 5, 10], atol=1e-9)
     (note,) = source.notes
     assert note.startswith("/ground_truth/odom: 1 poses left out (the first: ")
@@ -204,11 +197,9 @@ def test_a_path_is_ground_truth(bags: Any, tmp_path: Path) -> None:
                for o in (bags.odometry(1, 5.0), bags.odometry(2, 6.0))]  # fmt: skip
     path = bags.new("nav_msgs/Path", header=bags.header(1, "map"), poses=stamped)
     source = BagSource(bags.write(tmp_path / "b", [*clouds(bags, [1, 2]), (1, "/kitti/ground_truth/path", path)]))
-    assert source.poses is not None
     np.testing.assert_array_equal(source.poses[:, 0, 3], [5, 6])
     stamped[0].pose.orientation.w = 0.0
     source = BagSource(bags.write(tmp_path / "c", [*clouds(bags, [1, 2]), (1, "/kitti/ground_truth/path", path)]))
-    assert source.poses is not None
     np.testing.assert_array_equal(source.poses[:, 0, 3], [np.nan, 6])
     assert source.notes[0].startswith("/kitti/ground_truth/path: 1 poses left out")
     with pytest.raises(UsageError, match="no Odometry or Path messages on /odom"):

@@ -167,7 +167,6 @@ def test_beyond_sight_nothing_returns() -> None:
     for frame, clean in zip(corrupted(sight=25.0), Drive().frames(), strict=True):
         away = np.linalg.norm(clean.points[:, :3], axis=1)
         np.testing.assert_array_equal(frame.points, clean.points[away <= 25])
-        assert frame.time_offset is not None
         assert len(frame.time_offset) == len(frame.points)
 
 

@@ -42,10 +42,8 @@ def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
     assert isinstance(source, KissSource)
     first, second = source.frames()
     assert (len(source), len(first.points), first.points[0, 0], second.points[0, 0]) == (2, 65536, 10, 9)
-    assert first.time_offset is not None
     assert (first.time_offset[0], first.time_offset[-1]) == (pytest.approx(-0.1), 0.0)
     assert (first.stamp, second.stamp) == STAMPS
-    assert source.poses is not None
     np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
 
 
@@ -77,7 +75,6 @@ def test_velodyne_of_helipr(tmp_path: Path) -> None:
     first, second = source.frames()
     assert (first.stamp, second.stamp, second.points[0, 0]) == (*STAMPS, 9)
     assert first.time_offset is not None
-    assert source.poses is not None
     assert source.poses[1, 0, 3] == 1
     with pytest.raises(UsageError, match=r"KISS-ICP's loader helipr: "):
         open_source(tmp_path, InputSettings(dataset="helipr", sequence="Ouster"))

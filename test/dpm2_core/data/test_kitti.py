@@ -45,9 +45,7 @@ def test_any_subset(kitti_folder: MakeFolder, start: int, stop: int | None, want
 def test_camera_and_poses_are_of_the_lidar(kitti_folder: MakeFolder) -> None:
     """P2's last column moves the camera against camera 0; poses turn from camera to LiDAR axes."""
     source = KittiSource(kitti_folder())
-    assert source.camera is not None
     assert source.T_cam_lidar is not None
-    assert source.poses is not None
     point = np.array([8.0, 1.0, 0.5, 1.0])
     P2 = np.array([[50, 0, 20, 3], [0, 50, 15, 0.1], [0, 0, 1, 0.002]])
     want = P2 @ source.T_cam_lidar @ point  # KITTI's own projection of a LiDAR point
@@ -60,12 +58,10 @@ def test_numbers_need_not_start_at_zero_nor_follow_each_other(kitti_folder: Make
     folder = kitti_folder(numbers=[20, 21, 23])
     source = KittiSource(folder)
     assert [(f.index, f.stamp) for f in source.frames()] == [(20, 2 * 10**9), (21, 21 * 10**8), (23, 23 * 10**8)]
-    assert source.poses is not None
     np.testing.assert_allclose(source.poses[:, 0, 3], [20, 21, 23])
     # The full dataset's files have a line for every number instead of one for every scan.
     (folder.parents[1] / "poses" / "07.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {2 * n}\n" for n in range(30)))
     poses = KittiSource(folder).poses
-    assert poses is not None
     np.testing.assert_allclose(poses[:, 0, 3], [40, 42, 46])
 
 
@@ -109,7 +105,6 @@ def test_poses_beside_the_scans_come_first(kitti_folder: MakeFolder) -> None:
     folder = kitti_folder()
     (folder / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {-n}\n" for n in range(3)))
     source = KittiSource(folder)
-    assert source.poses is not None
     np.testing.assert_allclose(source.poses[:3, 0, 3], [0, -1, -2])
     assert np.isnan(source.poses[3:]).all()
     assert "2 of 5 frames have no pose" in source.notes[0]
@@ -311,7 +306,6 @@ def test_poses_that_are_no_transforms_are_none(kitti_folder: MakeFolder) -> None
     folder = kitti_folder()
     (folder / "poses.txt").write_text("".join(f"{1 + (n == 2)} 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(5)))
     source = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
-    assert source.poses is not None
     np.testing.assert_array_equal(np.isnan(source.poses[:, 0, 0]), np.arange(5) == 2)
     assert any("1 poses are no rigid transforms and left out, that of scan 2" in note for note in source.notes)
 
@@ -402,8 +396,6 @@ def test_semantic_kitti_poses_are_a_choice(kitti_folder: Callable[..., Path]) ->
         KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
     (folder / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {2 * n}\n" for n in range(5)))
     suma = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti")).poses
-    assert kitti is not None
-    assert suma is not None
     np.testing.assert_allclose(suma[4, :3, 3] - suma[0, :3, 3], 2 * (kitti[4, :3, 3] - kitti[0, :3, 3]), atol=1e-12)
     np.testing.assert_array_equal(KittiSource(folder).poses, suma)
     again = KittiSource(folder, InputSettings(kitti_poses="kitti")).poses

@@ -75,7 +75,6 @@ def test_poses_are_of_the_lidar_and_unknown_between(root: Path, missing: str | N
         (root / "data_poses" / DRIVE / missing).unlink()
     source = open_source(root)
     assert isinstance(source, Kitti360Source)
-    assert source.poses is not None
     assert np.isfinite(source.poses[:, 0, 0]).tolist() == [False, True, False, True, False]
     for n in (1, 3):
         np.testing.assert_allclose(source.poses[n], truth(n), atol=1e-9)

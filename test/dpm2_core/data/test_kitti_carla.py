@@ -63,7 +63,6 @@ def test_frames_poses_and_times(root: Path) -> None:
         np.testing.assert_allclose(source.poses[n], truth(0.1 * n), atol=1e-9)
         assert frame.index == n
         assert frame.stamp == n * 10**8
-        assert frame.time_offset is not None
         np.testing.assert_allclose(frame.time_offset[[0, -1]], [0, 0.099], atol=1e-6)
         assert (frame.points[:, 3] == 0.5).all()
         assert (frame.images[0].pixels == 10 * n).all()

@@ -135,7 +135,6 @@ def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: 
     assert all_seen(source) == [[0, 100], [1], [101], [102], [2, 103]]
     assert [image.camera.T_lidar_cam[0, 3] for image in frames[0].images] == [0.2, -1]
     assert [image.camera.name for image in frames[0].images] == [IMAGE, REAR]
-    assert source.camera is not None
     assert source.camera.T_lidar_cam[0, 3] == 0.2
     assert f"2 of 5 frames have no image of {IMAGE} (within 0.05 s)" in source.notes
     assert f"1 of 5 frames have no image of {REAR} (within 0.05 s)" in source.notes

@@ -48,7 +48,6 @@ def test_image_and_camera_come_back() -> None:
     """Pixels to what JPEG loses, the camera exactly, for the smaller size."""
     jpeg = thumbnail(picture(), 320)
     back = image_of(jpeg)
-    assert back is not None
     small = cv2.resize(picture().pixels, (320, 120), interpolation=cv2.INTER_AREA)
     assert np.abs(back.pixels.astype(int) - small).mean() < 3
     np.testing.assert_array_equal(back.camera.K, CAMERA.resized(320, 120).K)

@@ -160,7 +160,6 @@ def test_edges_of_real_scans_meet_again(kitti_root: Path) -> None:
     settings = preset("small").points
     frames = list(sequence.frames())
     one, other = (crop(frames[i].points, settings) for i in (10, 13))
-    assert sequence.poses is not None
     T = se3.inverse(sequence.poses[10]) @ sequence.poses[13]
 
     def met(a: Points, b: Points) -> float:

@@ -36,7 +36,6 @@ def test_a_frame_is_timed_from_the_middle_of_its_sweep(stamp_at: float) -> None:
 def test_each_cloud_has_a_middle_of_its_own() -> None:
     """A driver begins in the midst of a sweep, and what it sends first was the measure of all that followed."""
     sweep, whole = Sweep(), a_frame(START)
-    assert whole.time_offset is not None
     late = whole.time_offset > 0.075
     assert sweep.centered(replace(whole, points=whole.points[late], time_offset=whole.time_offset[late])).stamp == (
         pytest.approx(10**9 + 40_000_000, abs=10)  # ns: times are float32
