@@ -75,30 +75,34 @@ def named(path: Path, part: Path) -> Iterator[None]:
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A folder that is named `path` when the block ends well, and is gone when it does not.
 
-    An empty one that is there is filled in the order of the names: it stays, since a shell may be in it.
+    An empty one that is there is filled in the order of the names: it stays, since a shell may be in it. With `replace`
+    another one is there until then.
 
     Raises:
         Dpm2Error: it could not be written.
     """
     path = path.resolve()
     part = part_beside(path)
+    replaced = part.with_name(f"{part.name}-replaced")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
+        part.mkdir(parents=True)
         with named(path, part):
             yield part
         if path.is_dir() and not any(path.iterdir()):
             for entry in sorted(part.iterdir()):
                 entry.rename(path / entry.name)
         else:
+            if replace and path.exists():
+                path.rename(replaced)
             part.rename(path)
     except OSError as error:
         raise not_written(path, error) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:

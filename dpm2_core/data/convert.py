@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from dpm2_core.data.point_times import last_point
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span
 from dpm2_core.errors import UsageError
-from dpm2_core.files import not_written
+from dpm2_core.files import new_folder
 from dpm2_core.frame import Array, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
@@ -69,7 +67,9 @@ def convert(
     positions = range(len(source))[start:end]
     if not positions:
         raise UsageError(f"{source.name}: no frames {start}:{'' if end is None else end}; it has {len(source)}")
-    with _new_folder(out, overwrite) as folder:
+    _check_place(out.resolve(), overwrite)
+    with new_folder(out, replace=True) as part:
+        folder = part / out.resolve().name  # the recording's file carries the folder's name
         writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         if zstd:
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -79,6 +79,11 @@ def convert(
                 bag.write(frame, positions[done])
                 progress(done + 1, len(positions))
             bag.write_path()
+        for path in folder.iterdir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+            path.rename(part / path.name)
+        folder.rmdir()
     return source.notes
 
 
@@ -205,31 +210,13 @@ class _Bag:
         self._writer.write(self._connections[topic], self._recorded[topic], self._typestore.serialize_cdr(msg, kind))
 
 
-@contextmanager
-def _new_folder(out: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder to make and fill that takes the name `out` when the block ends well, and vanishes when it does not."""
-    out = out.resolve()
+def _check_place(out: Path, overwrite: bool) -> None:
+    """Raise UsageError where no recording can be written, or what is there is not to be replaced."""
     if out.suffix in (".mcap", ".db3", ".bag"):
         raise UsageError(f"{out}: a rosbag2 recording is a folder; leave out the {out.suffix}")
     if out.exists() and not (overwrite and (out / "metadata.yaml").is_file()):
         reason = "not a rosbag2 folder, so it is not overwritten" if overwrite else "use --overwrite to replace it"
         raise UsageError(f"{out}: exists already; {reason}")
-    part = out.with_name(f".{out.name}.part")  # one name, so that the next try clears what a killed one left
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-        yield part / out.name  # the recording's file carries the folder's name
-        for path in [*(part / out.name).iterdir(), part / out.name]:
-            descriptor = os.open(path, os.O_RDONLY)
-            os.fsync(descriptor)
-            os.close(descriptor)
-        if out.exists():
-            out.rename(part / "replaced")
-        (part / out.name).rename(out)
-    except OSError as error:
-        raise not_written(out, error) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _qos(latched: bool) -> Qos:

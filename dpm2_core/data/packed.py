@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.errors import UsageError
-from dpm2_core.files import not_written
+from dpm2_core.files import new_folder
 from dpm2_core.frame import Array, Camera, Image
 
 QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times as much
@@ -33,16 +31,11 @@ class Sample(NamedTuple):
 
 
 class PackedWriter:
-    """Writes a drive frame by frame: what is in memory does not grow with it but for poses and calibration.
-
-    A folder appears when the block ends well; a killed run leaves nothing that looks whole.
-
-    Raises:
-        Dpm2Error: of the block, where files could not be written.
-    """
+    """Writes a drive frame by frame: what is in memory does not grow with it but for poses and calibration."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.part = folder, folder.with_name(folder.name + ".part")
+        """`folder`: an empty one, see `packed_writer`."""
+        self.folder = folder
         self.images: int | None = None  # of each frame, once there is one
         self._offsets, self._poses = [0], list[Array]()
         self._K, self._T_lidar_cam = list[list[Array]](), list[list[Array]]()
@@ -50,14 +43,6 @@ class PackedWriter:
 
     def __len__(self) -> int:
         return len(self._poses)
-
-    def __enter__(self) -> PackedWriter:
-        shutil.rmtree(self.part, ignore_errors=True)
-        try:
-            self.part.mkdir(parents=True)
-        except OSError as error:
-            raise not_written(self.folder, error) from error
-        return self
 
     def add(self, sample: Sample) -> None:
         """The next frame.
@@ -68,9 +53,9 @@ class PackedWriter:
         pixels = np.array([image.pixels for image in sample.images], np.uint8)
         if self.images is None:
             self.images = len(pixels)
-            self._files["clouds"] = _GrowingArray(self.part / "clouds.npy", np.int16, (3,))
+            self._files["clouds"] = _GrowingArray(self.folder / "clouds.npy", np.int16, (3,))
             if self.images:
-                self._files["pixels"] = _GrowingArray(self.part / "pixels.npy", np.uint8, pixels.shape)
+                self._files["pixels"] = _GrowingArray(self.folder / "pixels.npy", np.uint8, pixels.shape)
         if len(pixels) != self.images or (self.images and pixels.shape != self._files["pixels"].row):
             raise UsageError(
                 f"{self.folder}: some frames have an image and some have none, or another size; "
@@ -88,22 +73,33 @@ class PackedWriter:
         """The drive is complete; `about` says where it is from."""
         for file in self._files.values():
             file.close()
-        np.save(self.part / "offsets.npy", np.array(self._offsets))
-        np.save(self.part / "poses.npy", np.stack(self._poses))
+        np.save(self.folder / "offsets.npy", np.array(self._offsets))
+        np.save(self.folder / "poses.npy", np.stack(self._poses))
         if self.images:
-            np.save(self.part / "K.npy", np.array(self._K))
-            np.save(self.part / "T_lidar_cam.npy", np.array(self._T_lidar_cam))
-        (self.part / "about.json").write_text(json.dumps({"format": FORMAT, **about}, indent=1))
-        shutil.rmtree(self.folder, ignore_errors=True)
-        os.replace(self.part, self.folder)
+            np.save(self.folder / "K.npy", np.array(self._K))
+            np.save(self.folder / "T_lidar_cam.npy", np.array(self._T_lidar_cam))
+        (self.folder / "about.json").write_text(json.dumps({"format": FORMAT, **about}, indent=1))
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+    def close(self) -> None:
+        """Whether or not the drive is complete."""
         for file in self._files.values():
             with suppress(OSError):  # a full disk: what is left is removed
                 file.close()
-        shutil.rmtree(self.part, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise not_written(self.folder, error) from error
+
+
+@contextmanager
+def packed_writer(folder: Path) -> Iterator[PackedWriter]:
+    """A writer whose folder appears when the block ends well; a killed run leaves nothing that looks whole.
+
+    Raises:
+        Dpm2Error: files could not be written.
+    """
+    with new_folder(folder, replace=True) as part:
+        writer = PackedWriter(part)
+        try:
+            yield writer
+        finally:
+            writer.close()
 
 
 class _GrowingArray:
@@ -133,8 +129,8 @@ class _GrowingArray:
 
 
 def write_packed(folder: Path, samples: Iterable[Sample], about: dict[str, object]) -> None:
-    """Write a drive of at least one frame; see `PackedWriter`."""
-    with PackedWriter(folder) as writer:
+    """Write a drive of at least one frame; see `packed_writer`."""
+    with packed_writer(folder) as writer:
         for sample in samples:
             writer.add(sample)
         writer.finish(about)

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, field_validator
 
 from dpm2_core.config import Settings
-from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, write_packed
+from dpm2_core.data.packed import PackedDrive, Sample, packed_writer, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
@@ -196,7 +196,7 @@ def pack(
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
     chosen = frames or range(len(source))
-    with PackedWriter(folder) as writer:
+    with packed_writer(folder) as writer:
         before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
         twist, scale, first = np.zeros(6), 0.0, None
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):

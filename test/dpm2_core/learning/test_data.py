@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -43,12 +44,13 @@ def test_packing_keeps_clouds_to_a_millimeter(packed: Path, samples: list[Sample
 def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], tmp_path: Path) -> None:
     """What a killed run leaves has another name, and is replaced by the next; the name of the whole does not matter."""
     root = tmp_path / "root.parts"
-    shutil.copytree(packed / "world", root / "new.part")
+    left = root / f".new.{os.getpid()}.part"
+    shutil.copytree(packed / "world", left)
     with pytest.raises(UsageError, match="no packed drive"):
         open_packed(root)
     write_packed(root / "new", samples, {})
     assert [drive.name for drive in open_packed(root)] == ["new"]
-    assert not (root / "new.part").exists()
+    assert not left.exists()
 
 
 def test_without_a_drive_there_is_nothing_to_learn() -> None:

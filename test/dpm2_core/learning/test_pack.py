@@ -315,8 +315,9 @@ def test_frames_that_differ_leave_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_a_world_that_cannot_be_written_ends_the_others(tmp_path: Path) -> None:
-    (tmp_path / "world_001000.part").write_text("a file in the way of the first world")
-    with pytest.raises(Dpm2Error, match="not written: File exists"):
+    (tmp_path / "file").touch()
+    (tmp_path / "world_001000").symlink_to(tmp_path / "file" / "below")  # where the first world cannot be
+    with pytest.raises(Dpm2Error, match="not written: Not a directory"):
         generate(tmp_path, GenerateSettings(worlds=20, frames=2, length=60, beams=16, mixture={"tunnel": 1}), 1)
     assert len(list(tmp_path.glob("world_*"))) < 10  # of 20: those that were begun
 
