@@ -29,60 +29,38 @@ from typing import TYPE_CHECKING
 
 from dpm2_core._version import __version__ as __version__
 
-if TYPE_CHECKING:
-    from dpm2_core.config import dump_settings, load_settings
-    from dpm2_core.data.open import open_source
-    from dpm2_core.data.settings import InputSettings
-    from dpm2_core.data.source import Source
-    from dpm2_core.data.trajectory import write_kitti, write_tum
-    from dpm2_core.descriptors import Descriptors
-    from dpm2_core.errors import Dpm2Error, UsageError
-    from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
-    from dpm2_core.evaluation.figures import trajectory_png
-    from dpm2_core.evaluation.matches import matches_png
-    from dpm2_core.frame import Camera, Frame, Image
-    from dpm2_core.network.pretrained import load_network
-    from dpm2_core.pipeline import OfflineRun
-    from dpm2_core.slam.build import make_odometry, make_slam
-    from dpm2_core.slam.loops.localizer import LocalizationResult
-    from dpm2_core.slam.session import open_for_localization, open_session
-    from dpm2_core.slam.settings import Config, SlamSettings
-    from dpm2_core.slam.system import Slam, SlamResult
-
-__all__ = [
-    "Camera",
-    "Config",
-    "Descriptors",
-    "Dpm2Error",
-    "Edge",
-    "Frame",
-    "Image",
-    "InputSettings",
-    "Keyframe",
-    "LocalizationResult",
-    "OdometryResult",
-    "OfflineRun",
-    "Registration",
-    "Slam",
-    "SlamResult",
-    "SlamSettings",
-    "Source",
-    "State",
-    "UsageError",
-    "__version__",
-    "dump_settings",
-    "load_network",
-    "load_settings",
-    "make_odometry",
-    "make_slam",
-    "matches_png",
-    "open_for_localization",
-    "open_session",
-    "open_source",
-    "trajectory_png",
-    "write_kitti",
-    "write_tum",
-]
+if TYPE_CHECKING:  # `as`: names that are to be exported
+    from dpm2_core.config import dump_settings as dump_settings
+    from dpm2_core.config import load_settings as load_settings
+    from dpm2_core.data.open import open_source as open_source
+    from dpm2_core.data.settings import InputSettings as InputSettings
+    from dpm2_core.data.source import Source as Source
+    from dpm2_core.data.trajectory import write_kitti as write_kitti
+    from dpm2_core.data.trajectory import write_tum as write_tum
+    from dpm2_core.descriptors import Descriptors as Descriptors
+    from dpm2_core.errors import Dpm2Error as Dpm2Error
+    from dpm2_core.errors import UsageError as UsageError
+    from dpm2_core.estimates import Edge as Edge
+    from dpm2_core.estimates import Keyframe as Keyframe
+    from dpm2_core.estimates import OdometryResult as OdometryResult
+    from dpm2_core.estimates import Registration as Registration
+    from dpm2_core.estimates import State as State
+    from dpm2_core.evaluation.figures import trajectory_png as trajectory_png
+    from dpm2_core.evaluation.matches import matches_png as matches_png
+    from dpm2_core.frame import Camera as Camera
+    from dpm2_core.frame import Frame as Frame
+    from dpm2_core.frame import Image as Image
+    from dpm2_core.network.pretrained import load_network as load_network
+    from dpm2_core.pipeline import OfflineRun as OfflineRun
+    from dpm2_core.slam.build import make_odometry as make_odometry
+    from dpm2_core.slam.build import make_slam as make_slam
+    from dpm2_core.slam.loops.localizer import LocalizationResult as LocalizationResult
+    from dpm2_core.slam.session import open_for_localization as open_for_localization
+    from dpm2_core.slam.session import open_session as open_session
+    from dpm2_core.slam.settings import Config as Config
+    from dpm2_core.slam.settings import SlamSettings as SlamSettings
+    from dpm2_core.slam.system import Slam as Slam
+    from dpm2_core.slam.system import SlamResult as SlamResult
 
 _MODULES = {
     "config": "dump_settings load_settings",
@@ -106,6 +84,7 @@ _MODULES = {
 }
 """The public names by the module that has them, as under TYPE_CHECKING above."""
 _PLACES = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = ["__version__", *_PLACES]
 
 
 if not TYPE_CHECKING:  # type checkers would take it for a module that has every name
