@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, Overrides
+from dpm2_core.commands.options import ConfigFile, Overrides, counted, note
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console, progress_bar
 
 
 def convert(
@@ -33,12 +32,7 @@ def convert(
     from dpm2_core.slam.settings import Config
 
     chosen, span = load_settings(Config, config, settings or []).input, parse_range(frames)
-    console = Console(stderr=True)
-    with progress_bar(console) as bar:
-        task = bar.add_task(f"{src} -> {out}", total=None)
-        notes = write_bag(
-            open_source(src, chosen), out, span, zstd, overwrite,
-            lambda done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
-    for note in notes:
-        console.print(f"note: {note}", highlight=False)
+    with counted(f"{src} -> {out}") as progress:
+        notes = write_bag(open_source(src, chosen), out, span, zstd, overwrite, progress)
+    for text in notes:
+        note(f"note: {text}")

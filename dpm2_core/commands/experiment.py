@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Group
 
-from dpm2_core.commands.options import JsonFile, parse_lengths, parse_names, show
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.commands.options import JsonFile, note, parse_lengths, parse_names, show
+from dpm2_core.console import progress_bar
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import UsageError
 from dpm2_core.tables import FigureTable
@@ -91,7 +91,6 @@ def experiment(
         outcome = carry_out(name, request, Progress(frames_done, part_done))
     views = Group(*(table_of.view() for table_of in outcome.tables))
     show(views, {"tables": [table_of.record() for table_of in outcome.tables], "notes": outcome.notes}, json_file)
-    console = Console(stderr=True)
-    for note in outcome.notes:
-        console.print(note, style="yellow", soft_wrap=True)
-    console.print(f"Results in {out / name}.json and .html", soft_wrap=True)
+    for text in outcome.notes:
+        note(text, "yellow")
+    note(f"Results in {out / name}.json and .html")

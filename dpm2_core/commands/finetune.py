@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import JsonFile, show
+from dpm2_core.commands.options import JsonFile, note, show
 from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
@@ -46,8 +46,8 @@ def finetune(
     sources = [open_source(path, chosen.input) for path in src]
     console = Console(stderr=True)
     with console.status("") as status:
-        for note in finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update):
-            console.print(note, soft_wrap=True)
+        for text in finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update):
+            console.print(text, soft_wrap=True)
         status.update("measuring")
         before = work.measure(start, chosen, out)
     written = work.finetune(chosen, out, resume)
@@ -59,4 +59,4 @@ def finetune(
         for figure in (figure for figure in figures if figure in after[name]):
             table.add_row(f"{name}, {figure}", f"{figures[figure]:.3f}", f"{after[name][figure]:.3f}")
     show(table, {"weights": str(written), "before": before, "after": after}, json_file)
-    console.print(f"{written}: written", soft_wrap=True)
+    note(f"{written}: written")

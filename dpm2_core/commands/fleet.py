@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, show
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, show
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
@@ -80,13 +80,10 @@ def merge(
     for row in merged.joins:
         table.add_row(" - ".join(row["drives"]), str(row["accepted"]), str(row["rejected"]))
     show(table, {**asdict(merged), "rejected": merged.rejected}, json_file)
-    console = Console(stderr=True)
     for name, reason in merged.left_out.items():
-        console.print(f"{name}: not in the map: {reason}", style="yellow", soft_wrap=True)
+        note(f"{name}: not in the map: {reason}", "yellow")
     total = len(merged.drives) + len(merged.left_out)
-    console.print(
-        f"{out}: {len(merged.drives)} of {total} drives, {sum(merged.drives.values())} keyframes", soft_wrap=True
-    )
+    note(f"{out}: {len(merged.drives)} of {total} drives, {sum(merged.drives.values())} keyframes")
 
 
 @app.command()

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.commands.options import note
+from dpm2_core.console import progress_bar
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import State
@@ -126,7 +127,7 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
 
         interrupted = drive.run(progress).interrupted
     if interrupted:
-        Console(stderr=True).print("interrupted; writing what there is", style="yellow")
+        note("interrupted; writing what there is", "yellow")
     save_config(config, out)
     write_tum(out / TRAJECTORY, report.stamps, np.array(report.poses).reshape(-1, 4, 4))
     summary = report.summary()

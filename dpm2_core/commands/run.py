@@ -14,7 +14,7 @@ import typer
 
 from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, show
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.console import progress_bar
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import make_folder
 from dpm2_core.interrupt import interrupt_deferred
@@ -162,22 +162,22 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
     """
     from dpm2_core.evaluation.report import metrics_table
 
-    console, source = Console(stderr=True), result.source
+    source = result.source
     if result.interrupted:
-        console.print(f"interrupted after {len(result)} frames; writing what there is", style="yellow")
+        note(f"interrupted after {len(result)} frames; writing what there is", "yellow")
     for text in source.notes:
-        console.print(text, style="yellow", soft_wrap=True)
+        note(text, "yellow")
     of_imu = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
     for problem, count in (of_imu | result.problems).items():
-        console.print(f"{problem} ({count} of {len(result)} frames)", style="yellow", soft_wrap=True)
+        note(f"{problem} ({count} of {len(result)} frames)", "yellow")
     if not result.connected:
-        console.print("no place of this drive was found in the map: it stands in a frame of its own", style="yellow")
+        note("no place of this drive was found in the map: it stands in a frame of its own", "yellow")
     for missing in result.save(out):
-        console.print(missing, soft_wrap=True)
+        note(missing)
     metrics, title = result.metrics, f"{source.name}, {len(result)} frames"
     shown = "" if metrics is None else metrics_table(metrics, title=title, frame=result.sensor)
     figures = {"source": source.name, **result.timing, "metrics": None if metrics is None else metrics.model_dump()}
     show(shown, figures, json_file)
-    console.print(f"Results in {out}", soft_wrap=True)
+    note(f"Results in {out}")
     if problem := result.mapper.store_problem:
         raise Dpm2Error(f"map file incomplete: {problem}")

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, Workers
+from dpm2_core.commands.options import PROCESSORS, Workers, counted, note
 from dpm2_core.config import settings_from
-from dpm2_core.console import Console, progress_bar
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import DriveConfig, PresetName
 
@@ -53,8 +52,6 @@ def sim(
     drive = settings_from(DriveConfig, tree, default="dpm2 sim")
     if sensor == "real":
         drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
-    console = Console(stderr=True)
-    with progress_bar(console) as bar:
-        task = bar.add_task(f"{preset} -> {out}", total=None)
-        made = simulate(out, drive, workers, lambda done, total: bar.update(task, completed=done, total=total))
-    console.print(f"{out}: {'written' if made else 'is there already'}", highlight=False)
+    with counted(f"{preset} -> {out}") as progress:
+        made = simulate(out, drive, workers, progress)
+    note(f"{out}: {'written' if made else 'is there already'}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, note
+from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, counted, note
 from dpm2_core.config import load_settings
 from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.source import parse_range
@@ -39,9 +39,8 @@ def data(
     from dpm2_core.learning.generate import GenerateSettings, generate  # torch and embree are slow to import
 
     chosen = load_settings(GenerateSettings, config, settings or [])
-    with progress_bar() as bar:
-        task = bar.add_task(f"worlds -> {out}", total=chosen.worlds)
-        generate(out, chosen, workers, lambda done, total: bar.update(task, completed=done, total=total))
+    with counted(f"worlds -> {out}") as progress:
+        generate(out, chosen, workers, progress)
 
 
 @train.command()
