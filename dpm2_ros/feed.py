@@ -127,10 +127,7 @@ class Feed:
     def _on_odom(self, message: Odometry) -> None:
         frame = message.header.frame_id
         check_frame(frame)
-        known = self.robots
-        if not known:
-            self._mapper.broadcast(stamp_ns(message.header), self._robot, frame)
-            return
+        known = self.robots  # without a keyframe of a robot in the map it is not known where in it the robot is
         main = [self._robot] if self._robot in known else []
         for robot in (*main, *reversed(known)):  # of two that use the same frame the first
             if known[robot].odom_frame == frame and known[robot].live:

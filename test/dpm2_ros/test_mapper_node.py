@@ -128,9 +128,14 @@ def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
 
 
 def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
+    """Once a keyframe of the robot is in the map: before, its drive may be any, and the mapper one that was started
+    again, which sent the identity until then."""
     odometry = mapper.publisher(Odometry, "/dpm2/odom")
     heard = mapper.hear(TFMessage, "/tf")
     mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 33, "odom", "base"))
+    mapper.send(0, np.eye(4), points(0).astype(np.float32))
+    mapped(mapper, 1)
     odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
     mapper.wait(lambda: heard, "/tf")
     transform = heard[0].transforms[0]
