@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
 from dpm2_core.data.trajectory import FRAME_PERIOD
-from dpm2_core.evaluation.metrics import evaluate
+from dpm2_core.evaluation.metrics import evaluate, path_length
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
@@ -55,7 +55,7 @@ def bench_imu(options: Options) -> Report:
             rates = _rates(robot.poses)
             results[name] = {
                 "frames": FRAMES,
-                "path_length_m": float(np.linalg.norm(np.diff(robot.poses[:, :3, 3], axis=0), axis=1).sum()),
+                "path_length_m": path_length(robot.poses),
                 "fastest_turn_deg_s": float(rates.max()),
                 "frames_above_50_deg_s": int((rates > 50).sum()),
                 **{way: _drive(map(given, frames), robot.poses, settings) for way, given in WAYS.items()},

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.evaluation.pair_set import SUCCESS
 from dpm2_core.experiments.peers import KissIcp, cloud_and_times
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
@@ -16,8 +17,6 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
-SUCCESS_M, SUCCESS_DEG = 0.6, 1.5
-"""Errors below which a registration counts as a success."""
 APART = {f"{low}-{low + 10} m": (low, low + 10) for low in (10, 20, 30, 40)}
 """Distances of the far pairs, m, by their name."""
 MANY = 10
@@ -151,7 +150,7 @@ def summarized(errors: Array) -> dict[str, float | int | None]:
     if not len(errors):
         return {"pairs": 0, "median_m": None, "median_deg": None, "success": None}
     median = np.median(errors, axis=0)
-    good = (errors[:, 0] < SUCCESS_M) & (errors[:, 1] < SUCCESS_DEG)
+    good = (errors < SUCCESS).all(1)
     m, deg = (float(value) if np.isfinite(value) else None for value in median)
     return {"pairs": len(errors), "median_m": m, "median_deg": deg, "success": float(good.mean())}
 

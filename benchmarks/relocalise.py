@@ -15,18 +15,16 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
-from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
+from benchmarks.relocalise_visits import kept, measured, relocalizer_in, row_of, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.simulated_drive import SimulatedDrive
-from dpm2_core.slam.build import make_mapper, make_verifier
+from dpm2_core.slam.build import make_mapper
 from dpm2_core.slam.loops.pictures import KnownMap
-from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
@@ -62,10 +60,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads)
-            verifier = make_verifier(settings)
-            known = KnownMap(data.keyframes, data.clouds, data.poses)
-            verifiers = ByScale(verifier, verifier)
-            relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, known)
+            relocalizer = relocalizer_in(settings, network, KnownMap(data.keyframes, data.clouds, data.poses))
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):

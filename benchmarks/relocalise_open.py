@@ -11,19 +11,16 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.relocalise_visits import kept, measured, row_of, success_rates
+from benchmarks.relocalise_visits import kept, measured, relocalizer_in, row_of, success_rates
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Frame, Image
-from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import CameraConfig, PresetName
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.build import make_verifier
 from dpm2_core.slam.loops.pictures import KnownMap
-from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.settings import SlamSettings
 
 WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
@@ -91,9 +88,7 @@ def _relocalised(
     poses = np.stack([place.T_map_lidar for place in known])
     clouds = [keyframe.cloud for keyframe in keyframes]
     in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
-    verifier = make_verifier(settings)
-    verifiers = ByScale(verifier, verifier)
-    relocalizer = Relocalizer(settings.relocalise, settings.visual, verifiers, network, in_map)
+    relocalizer = relocalizer_in(settings, network, in_map)
     rows = []
     for place in visited:
         visit, started = keyframe(place.frame), perf_counter()

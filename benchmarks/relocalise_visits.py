@@ -10,12 +10,23 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.scale import ByScale
 from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.slam.build import make_verifier
+from dpm2_core.slam.loops.pictures import KnownMap
+from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
 """A result no farther off is right."""
+
+
+def relocalizer_in(settings: SlamSettings, network: DeepPointMap2, known: KnownMap) -> Relocalizer:
+    """What looks for a scan in a map, of streets."""
+    verifier = make_verifier(settings)
+    return Relocalizer(settings.relocalise, settings.visual, ByScale(verifier, verifier), network, known)
 
 
 def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:

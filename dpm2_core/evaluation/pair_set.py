@@ -22,7 +22,8 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import collate_views
 
 NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
-SUCCESS = (0.6, 1.5)  # m, deg
+SUCCESS = (0.6, 1.5)
+"""Errors of a registration, m and deg, below which it counts as a success."""
 
 
 def has_pair(poses: Array, low: float, high: float) -> bool:
