@@ -131,8 +131,8 @@ def write_json(path: Path | str, content: object) -> None:
 
 
 def json_text(content: object, indent: int = 2) -> str:
-    """Content as JSON; a number that is not finite becomes null, since JSON has no NaN."""
-    return json.dumps(_known(content), indent=indent, allow_nan=False) + "\n"
+    """Content as JSON; a number that is not finite becomes null, since JSON has no NaN, and a path text."""
+    return json.dumps(_known(content), indent=indent, allow_nan=False, default=str) + "\n"
 
 
 def _known(content: object) -> object:

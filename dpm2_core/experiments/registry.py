@@ -149,9 +149,8 @@ def _check_names(name: str, parts: Sequence[Part]) -> None:
 
 
 def _record(request: Request, outcome: Outcome, figures: dict[str, Figures]) -> dict[str, Any]:
-    listed = {field.name: getattr(request, field.name) for field in fields(request)}
     return {
-        "request": {key: str(value) if isinstance(value, Path) else value for key, value in listed.items()},
+        "request": {field.name: getattr(request, field.name) for field in fields(request)},
         "tables": [table.record() for table in outcome.tables],
         "notes": outcome.notes,
         **outcome.extra,

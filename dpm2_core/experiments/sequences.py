@@ -88,12 +88,11 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
         for sequence in sequences:
             asked = reading(request, sequence, settings)
             drive, content = _drive(request, asked), drive_content(request.data, asked)
+            folder, path = f"{_folder(name)}/{sequence}", Path(file.replace("{sequence}", sequence))
             if equals:
-                path = Path(file.replace("{sequence}", sequence))
-                work, more, files = GIVEN, {"file": str(path)}, [path]
+                parts.append(Part(folder, GIVEN, {"drive": drive, "file": path}, [path], content=content))
             else:
-                work, more, files = PEER, {"name": name}, []
-            parts.append(Part(f"{_folder(name)}/{sequence}", work, {"drive": drive, **more}, files, content=content))
+                parts.append(Part(folder, PEER, {"drive": drive, "name": name}, content=content))
     return parts
 
 
@@ -129,7 +128,7 @@ def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> li
 
 def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
     return {
-        "data": str(request.data),
+        "data": request.data,
         "settings": list(settings),
         "frames": list(request.frames or (0, None)),
         "lengths": list(request.lengths or OFFICIAL_LENGTHS),

@@ -39,7 +39,7 @@ class Drive(TypedDict):
     """What is driven: root of the data set, settings KEY=VALUE of `Config`, positions of the first frame and of the one
     after the last, and the segment lengths of the KITTI metric, m."""
 
-    data: str
+    data: Path
     settings: Sequence[str]
     frames: Span
     lengths: Sequence[float]
@@ -52,15 +52,15 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
         UsageError: no such sequence, no ground truth, or settings that there are not. Dpm2Error: files not written.
     """
     config = load_settings(Config, None, drive["settings"])
-    source: Source | str = drive["data"]
+    source: Source | Path = drive["data"]
     if corrupt is not None:
         source = CorruptedSource(open_recording(drive["data"], config, True), parse_corruption(corrupt))
-    with OfflineRun(source, config, _span(drive)) as run:
+    with OfflineRun(source, config, drive["frames"]) as run:
         result = run.run(counted(advance, len(run)))
         if result.interrupted:
             raise KeyboardInterrupt
         result.save(folder, cloud=False)
-        truth = _truth(run.source, _span(drive))
+        truth = _truth(run.source, drive["frames"])
         seconds = {stage: float(np.sum(times)) for stage, times in result.seconds.items()}
         accepted = sum(loop.ok for loop in result.mapper.loops)
         figures = _measured(folder, run.source, (result.recorder.stamps, truth, result.poses), drive, result.fps)
@@ -81,7 +81,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     """
     config = load_settings(Config, None, drive["settings"])
     source = open_recording(drive["data"], config, False)
-    start, stop = span_of(source, _span(drive))
+    start, stop = span_of(source, drive["frames"])
     program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
     for frame in prefetch(source.frames(start, stop)):
         if program is None:
@@ -106,7 +106,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     return _measured(folder, source, (stamps, truth, poses), drive, fps)
 
 
-def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
+def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
     """A trajectory from a file: TUM, of the LiDAR by stamp, or KITTI's, of the left camera.
 
     Raises:
@@ -114,12 +114,12 @@ def given(folder: Path, advance: Advance, drive: Drive, file: str) -> Figures:
     """
     config = load_settings(Config, None, drive["settings"])
     source = open_recording(drive["data"], config, False)
-    start, stop = span_of(source, _span(drive))
+    start, stop = span_of(source, drive["frames"])
     truth = _truth(source, (start, stop))
     # Only names and stamps are wanted, but a source gives them with its frames alone.
     keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
     index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
-    poses = _poses_of(Path(file), source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
+    poses = _poses_of(file, source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
     if not known(poses).any():
         raise UsageError(f"{file}: has no pose during the frames of {source.name}")
     there = known(poses)
@@ -159,10 +159,6 @@ def _truth(source: Source, frames: Span) -> Array:
     if truth is None or isinstance(truth, Trajectory):
         raise UsageError(f"{source.name}: no ground truth to compare with")
     return truth
-
-
-def _span(drive: Drive) -> Span:
-    return drive["frames"][0], drive["frames"][1]
 
 
 def _measured(

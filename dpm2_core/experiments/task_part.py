@@ -25,15 +25,17 @@ TRAIN = "dpm2_core.experiments.task_part:train"
 MEASURE = "dpm2_core.experiments.task_part:measure_on"
 SLAM = "dpm2_core.experiments.task_part:slam_on"
 Arm = Literal["without", "with", "placebo"]
+Scans = tuple[Path, Sequence[str]]
+"""Root of a data set, and the sequences in it."""
 
 
 class Training(TypedDict):
     """What an arm is trained by: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, seed."""
 
     task: str
-    data: str
+    data: Path
     learn: Sequence[str]
-    config: str | None
+    config: Path | None
     settings: Sequence[str]
     seed: int
     arm: Arm
@@ -41,8 +43,7 @@ class Training(TypedDict):
 
 def settings_of(training: Training) -> SlamTaskTraining:
     """The settings of an arm: without the SLAM loss, with it, or with that of the window before as a placebo."""
-    config = None if training["config"] is None else Path(training["config"])
-    chosen = load_settings(task_type(training["task"]).training_type, config, training["settings"])
+    chosen = load_settings(task_type(training["task"]).training_type, training["config"], training["settings"])
     assert isinstance(chosen, SlamTaskTraining)
     arm = training["arm"]
     gamma = 0.0 if arm == "without" else chosen.slam.gamma
@@ -61,7 +62,7 @@ def first_slam_epoch(settings: SlamTaskTraining) -> int:
 
 
 def train(
-    folder: Path, advance: Advance, training: Training, until: int | None = None, start: str | None = None
+    folder: Path, advance: Advance, training: Training, until: int | None = None, start: Path | None = None
 ) -> Figures:
     """Train an arm; weights, log and checkpoint stay in the folder, and one that was stopped goes on.
 
@@ -77,7 +78,7 @@ def train(
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     asked = {"training": training, "until": until, "content": scans.digest()}
-    resume = begin_training(folder, settings, data=asked, start=None if start is None else Path(start))
+    resume = begin_training(folder, settings, data=asked, start=start)
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, resume, until=until)
     advance(1, 1)
@@ -85,26 +86,26 @@ def train(
     return {"scans": len(scans), "epochs": epochs, **_logged(folder, epochs, settings.slam.gamma)}
 
 
-def measure_on(folder: Path, advance: Advance, task: str, weights: str, drive: tuple[str, Sequence[str]]) -> Figures:
+def measure_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Scans) -> Figures:
     """Figures of a training on a data set's sequences.
 
     Raises:
         UsageError: no such scans, or they lack what the task needs.
     """
     scans = open_scans(drive[0], task_type(task).needs, drive[1])
-    figures = measure(load_task(task, Path(weights)), scans)
+    figures = measure(load_task(task, weights), scans)
     advance(1, 1)
     return {"scans": len(scans), **figures}
 
 
-def slam_on(folder: Path, advance: Advance, task: str, weights: str, drive: tuple[str, Sequence[str]]) -> Figures:
+def slam_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Scans) -> Figures:
     """Odometry on what a training makes of a data set's sequences; leaves the trajectories.
 
     Raises:
         UsageError: as `slam_runs`.
     """
     rows = {}
-    for run in slam_runs(load_task(task, Path(weights)), Path(drive[0]), drive[1]):
+    for run in slam_runs(load_task(task, weights), *drive):
         rows[run.sequence] = figures_of(run)
         for kind, poses in run.poses.items():
             place = folder / folder_name(run.sequence) / kind

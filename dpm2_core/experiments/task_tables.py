@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import isfinite
-from pathlib import Path
 from statistics import mean
 from typing import Any
 
@@ -81,7 +80,7 @@ class TaskTable:
         shared: list[Part] = []
         arms: list[Part] = []
         measured: list[Part] = []
-        drive = [str(request.data), list(self._sequences(request)[1])]
+        drive = request.data, list(self._sequences(request)[1])
         for seed in range(request.seeds or SEEDS):
             common = first_slam_epoch(settings_of(self._training(request, seed, "with")))
             start = None
@@ -89,15 +88,15 @@ class TaskTable:
                 training = self._training(request, seed, "without")
                 shared.append(Part(self._name(seed, "shared"), TRAIN, {"training": training, "until": common},
                                    request.config_files, content=learned))  # fmt: skip
-                start = str(request.out / self._name(seed, "shared"))
+                start = request.out / self._name(seed, "shared")
             for arm in ARMS:
                 name = self._name(seed, arm)
                 training = self._training(request, seed, arm)
-                checkpoint = [] if start is None else [Path(start) / CHECKPOINT]
+                checkpoint = [] if start is None else [start / CHECKPOINT]
                 inputs = [*request.config_files, *checkpoint]
                 arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs, content=learned))
                 weights = request.out / name / WEIGHTS
-                tested = {"task": self.task, "weights": str(weights), "drive": drive}
+                tested = {"task": self.task, "weights": weights, "drive": drive}
                 part = Part(self._measured(seed, arm), self.measured, tested, [weights], content=tested_on)
                 measured.append(part)
         return [stage for stage in (shared, arms, measured) if stage]
@@ -169,8 +168,7 @@ class TaskTable:
     def _training(self, request: Request, seed: int, arm: Arm) -> Training:
         defaults = () if request.config is not None else self.defaults
         return Training(
-            task=self.task, data=str(request.data), learn=list(self._sequences(request)[0]),
-            config=None if request.config is None else str(request.config),
+            task=self.task, data=request.data, learn=list(self._sequences(request)[0]), config=request.config,
             settings=[*defaults, *request.overrides], seed=seed, arm=arm,
         )  # fmt: skip
 

@@ -25,7 +25,7 @@ DRIVE = "drive"
 """In the folder of a part that packs."""
 
 
-def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], weights: str) -> Figures:
+def pack(folder: Path, advance: Advance, data: Path, settings: Sequence[str], weights: str) -> Figures:
     """The frames of a sequence that have a pose, packed below the folder for the network of these weights.
 
     Raises:
@@ -44,13 +44,13 @@ def pack(folder: Path, advance: Advance, data: str, settings: Sequence[str], wei
 
 
 def training_of(
-    config: str | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Sequence[Path]
+    config: Path | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Sequence[Path]
 ) -> RegistrationTrainingSettings:
     """The training of a variant on packed drives, each as often as it has frames.
 
     `network`: its changes to the network of the weights that it starts from.
     """
-    chosen = load_settings(RegistrationTrainingSettings, None if config is None else Path(config), settings)
+    chosen = load_settings(RegistrationTrainingSettings, config, settings)
     path = weights_path(start)
     own = network_settings(path)
     tree = merged(merged(own.model_dump(mode="json"), chosen.network), network)
@@ -65,15 +65,15 @@ def training_of(
 
 
 def train(
-    folder: Path, advance: Advance, training: dict[str, Any], packed: Sequence[str], network: dict[str, Any]
+    folder: Path, advance: Advance, training: dict[str, Any], packed: Sequence[Path], network: dict[str, Any]
 ) -> Figures:
     """Fine-tune a variant of a network from weights, as far as they fit; one that was stopped goes on.
 
     Raises:
         UsageError: no such weights, or no packed drive.
     """
-    chosen = training_of(training["config"], training["settings"], training["start"], network, [*map(Path, packed)])
-    content = packed_digest(map(PackedDrive, map(Path, packed)))
+    chosen = training_of(**training, network=network, packed=packed)
+    content = packed_digest(map(PackedDrive, packed))
     resume = begin_training(folder, chosen, [Path(chosen.start)], {"content": content})
     weights = train_registration(chosen, folder, resume=resume)
     steps = chosen.optimiser.steps

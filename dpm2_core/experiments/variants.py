@@ -82,15 +82,15 @@ class VariantTable:
         packs = []
         for sequence in _learned(request):
             asked = reading(request, sequence)
-            of = {"data": str(request.data), "weights": start, "settings": asked}
+            of = {"data": request.data, "weights": start, "settings": asked}
             content = drive_content(request.data, asked)
             packs.append(Part(f"packed/{sequence}", PACK, of, [weights_path(start)], content=content))
         training = {
-            "config": None if request.config is None else str(request.config),
+            "config": request.config,
             "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
             "start": start,
         }
-        arguments = {"training": training, "packed": [str(request.out / pack.name / DRIVE) for pack in packs]}
+        arguments = {"training": training, "packed": [request.out / pack.name / DRIVE for pack in packs]}
         content = " ".join(pack.content for pack in packs)
         inputs = [weights_path(start), *request.config_files]
         trained = [

@@ -46,7 +46,7 @@ class Part:
         name: also its folder below that of the whole, such as dpm2/06.
         work: MODULE:FUNCTION, called with the folder, a function to be told of the progress, and the arguments;
             returns figures.
-        arguments: whatever JSON can hold.
+        arguments: whatever JSON can hold, and paths.
         inputs: files that it reads and another part may write, such as weights; a part whose inputs changed is done
             again.
         fresh: it begins with an empty folder, which takes its name when all is in it. Else the work finds what an
@@ -141,14 +141,14 @@ def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) 
             "figures": figures,
         }
         with atomic_write(folder / DONE) as file:
-            file.write(json.dumps(record, indent=1) + "\n")
+            file.write(json.dumps(record, indent=1, default=str) + "\n")
     return _read(record)
 
 
 def figures_of(part: Part, out: Path) -> Figures | None:
     """What a part that ended has found; None where it has not, was asked for something else, or is not whole."""
     try:
-        asked = json.loads(json.dumps(_asked(part)))
+        asked = json.loads(json.dumps(_asked(part), default=str))
         record = {"content": part.content, **json.loads((out / part.name / DONE).read_text(encoding="utf-8"))}
         if any(record[key] != asked[key] for key in asked):
             return None

@@ -173,8 +173,8 @@ def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -
 
     write_kitti(folder / "poses.txt", poses(t))
     write_tum(tmp_path / "peer.tum", np.round((t + 0.008) * 1e9).astype(np.int64), poses(t + 0.008))
-    drive = Drive(data=str(folder), settings=(), frames=(0, None), lengths=(1.0,))
-    found = given(tmp_path, lambda *_: None, drive, str(tmp_path / "peer.tum"))
+    drive = Drive(data=folder, settings=(), frames=(0, None), lengths=(1.0,))
+    found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
     assert (found["frames"], found["failed_frames"]) == (12, 1)  # none at or before the first
     assert found["ape_rmse_m"] < 1e-3  # a line between poses is 7 mm off at this acceleration, at each frame the same
 
@@ -188,8 +188,8 @@ def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path
     (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     for name in (folder / "poses.txt", tmp_path / "peer.txt"):
         write_kitti(name, se3.make(np.eye(3), np.column_stack([at, 0 * at, 0 * at])))
-    drive = Drive(data=str(folder), settings=(), frames=(1, 5), lengths=(1.0,))
-    found = given(tmp_path, lambda *_: None, drive, str(tmp_path / "peer.txt"))
+    drive = Drive(data=folder, settings=(), frames=(1, 5), lengths=(1.0,))
+    found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.txt")
     assert (found["frames"], found["failed_frames"]) == (4, 0)
     assert found["ape_rmse_m"] < 1e-9
 

@@ -195,7 +195,7 @@ def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: 
     labelled_drive(tmp_path / "data/sequences/00", range(4), points=300)
     far = ("epochs=2", "optimiser.kind=sgd", "optimiser.rate=1e30", "optimiser.clip=1e38")
     settings = ["network={cells: 32, cell: 3, channels: 4}", *QUICK, *far]
-    arm = Training(task="gndnet", data=str(tmp_path / "data"), learn=["00"], config=None, settings=settings, seed=0,
+    arm = Training(task="gndnet", data=tmp_path / "data", learn=["00"], config=None, settings=settings, seed=0,
                    arm="without")  # fmt: skip
     found = train(tmp_path / "out", lambda done, total: None, arm)
     assert found["last_task_loss"] is None
@@ -205,7 +205,7 @@ def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: 
 def test_the_last_loss_of_a_part_of_the_epochs_is_of_the_last_that_was_trained(tmp_path: Path) -> None:
     labelled_drive(tmp_path / "data/sequences/00", range(8), points=300)
     settings = ["network={cells: 32, cell: 3, channels: 4}", *QUICK, "epochs=4"]
-    arm = Training(task="gndnet", data=str(tmp_path / "data"), learn=["00"], config=None, settings=settings, seed=0,
+    arm = Training(task="gndnet", data=tmp_path / "data", learn=["00"], config=None, settings=settings, seed=0,
                    arm="without")  # fmt: skip
     found = train(tmp_path / "out", lambda done, total: None, arm, until=1)
     rows = [json.loads(line) for line in (tmp_path / "out/log.jsonl").read_text().splitlines()]

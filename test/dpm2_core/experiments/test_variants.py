@@ -86,7 +86,7 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
         (done := tmp_path / "out" / part.name).mkdir(parents=True)
         record = {"arguments": dict(part.arguments), "files": {}, "figures": {}, "commit": "", "seconds": 0,
                   "peak_memory_mb": 0, "inputs": {str(path): file_digest(path) for path in part.inputs}}  # fmt: skip
-        (done / DONE).write_text(json.dumps(record))
+        (done / DONE).write_text(json.dumps(record, default=str))
     assert all(figures_of(part, tmp_path / "out") is not None for part in one)
     both = trainings(replace(request, learn=("00", "06")))
     assert not any(figures_of(part, tmp_path / "out") for part in both)
