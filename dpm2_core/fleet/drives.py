@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
 from dpm2_core.config import Settings, load_settings, read_yaml, settings_from
-from dpm2_core.data.source import parse_range
+from dpm2_core.data.source import Span, parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.fleet.part import Advance, Figures, Part, counted
 from dpm2_core.network.pretrained import pretrained_names, weights_path
@@ -90,12 +90,11 @@ def parts_of(
 
 def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
     slam, inputs = _from_any_folder(config.slam)
-    config = config.model_copy(update={"slam": slam})
     arguments = {
         "path": drive.path,
         "frames": parse_range(drive.frames),
         "gt": drive.gt,
-        "config": config.model_dump(mode="json"),
+        "config": config.model_copy(update={"slam": slam}),
     }
     if drive.gt:
         inputs.append(Path(drive.gt))
@@ -116,16 +115,13 @@ def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
     return slam.model_copy(update=changes), files
 
 
-def run_drive(
-    folder: Path, advance: Advance, path: str, frames: tuple[int, int | None], gt: str, config: Mapping[str, Any]
-) -> Figures:
+def run_drive(folder: Path, advance: Advance, path: str, frames: Span, gt: str, config: Config) -> Figures:
     """Run a drive; leaves the files of `dpm2 run` and its map in the folder.
 
     Raises:
         UsageError: a recording that cannot be opened. Dpm2Error: results that cannot be written.
     """
-    chosen, truth = settings_from(Config, dict(config)), Path(gt) if gt else None
-    with OfflineRun(path, chosen, (frames[0], frames[1]), truth, folder / MAP) as run:
+    with OfflineRun(path, config, frames, gt or None, folder / MAP) as run:
         result = run.run(counted(advance, len(run)))
         if result.interrupted:
             raise KeyboardInterrupt

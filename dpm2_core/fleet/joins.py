@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.config import settings_from
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.part import Advance, Figures, Part
 from dpm2_core.frame import Array, Points
@@ -56,7 +55,7 @@ def stretches(one: str, other: str, pairs: NDArray[np.int64]) -> Iterator[Stretc
             yield Stretch(one, other, tuple(sorted(near)), tuple(range(int(group[0, 1]), last + 1)))
 
 
-def join_part(number: int, stretch: Stretch, maps: Mapping[str, Mapping[str, Any]], slam: Mapping[str, Any]) -> Part:
+def join_part(number: int, stretch: Stretch, maps: Mapping[str, Mapping[str, Any]], slam: SlamSettings) -> Part:
     """The part that looks for the loops of a stretch; `maps` has path and version of each drive's map."""
     arguments = {
         "one": maps[stretch.one],
@@ -73,7 +72,7 @@ def verify(
     one: Mapping[str, Any],
     other: Mapping[str, Any],
     nodes: Sequence[Sequence[int]],
-    slam: Mapping[str, Any],
+    slam: SlamSettings,
 ) -> Figures:
     """Every loop that was tried from a node of the first drive to one of the other, as `edge_figures`.
 
@@ -81,8 +80,8 @@ def verify(
         Dpm2Error: a map cannot be read.
     """
     del folder
-    closer = make_loops(settings_from(SlamSettings, dict(slam)))
-    with MapStore.open(Path(one["path"])) as a, MapStore.open(Path(other["path"])) as b:
+    closer = make_loops(slam)
+    with MapStore.open(one["path"]) as a, MapStore.open(other["path"]) as b:
         first, second = _excerpt(a, nodes[0], "one"), _excerpt(b, nodes[1], "other")
         clouds = _Clouds([first, second])
         keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])

@@ -20,6 +20,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write, file_digest, make_folder, not_written
@@ -46,7 +47,7 @@ class Part:
         name: also its folder below that of the whole, such as dpm2/06.
         work: MODULE:FUNCTION, called with the folder, a function to be told of the progress, and the arguments;
             returns figures.
-        arguments: whatever JSON can hold, and paths.
+        arguments: whatever JSON can hold, paths and settings.
         inputs: files that it reads and another part may write, such as weights; a part whose inputs changed is done
             again.
         fresh: it begins with an empty folder, which takes its name when all is in it. Else the work finds what an
@@ -141,14 +142,14 @@ def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) 
             "figures": figures,
         }
         with atomic_write(folder / DONE) as file:
-            file.write(json.dumps(record, indent=1, default=str) + "\n")
+            file.write(json.dumps(record, indent=1, default=_plain) + "\n")
     return _read(record)
 
 
 def figures_of(part: Part, out: Path) -> Figures | None:
     """What a part that ended has found; None where it has not, was asked for something else, or is not whole."""
     try:
-        asked = json.loads(json.dumps(_asked(part), default=str))
+        asked = json.loads(json.dumps(_asked(part), default=_plain))
         record = {"content": part.content, **json.loads((out / part.name / DONE).read_text(encoding="utf-8"))}
         if any(record[key] != asked[key] for key in asked):
             return None
@@ -217,6 +218,11 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 def _read(record: Mapping[str, Any]) -> Figures:
     return {**record["figures"], "part": {key: record[key] for key in ("commit", "seconds", "peak_memory_mb")}}
+
+
+def _plain(argument: object) -> object:
+    """What JSON has no word for."""
+    return argument.model_dump(mode="json") if isinstance(argument, Settings) else str(argument)
 
 
 def _asked(part: Part) -> dict[str, Any]:

@@ -38,19 +38,19 @@ _LINKS, _BUILD, _SEARCH = 32, 80, 64
 def places_part(name: str, path: Path) -> Part:
     """The part that reads the places of a drive's map."""
     stat = path.stat()
-    return Part(f"places/{name}", _WORK, {"path": str(path), "version": [stat.st_size, stat.st_mtime_ns]}, fresh=True)
+    return Part(f"places/{name}", _WORK, {"path": path, "version": [stat.st_size, stat.st_mtime_ns]}, fresh=True)
 
 
-def describe(folder: Path, advance: Advance, path: str, version: Sequence[int]) -> Figures:
+def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int]) -> Figures:
     """Check a map, all of it, and write the vectors of its places.
 
     Raises:
         Dpm2Error: it is damaged, or has no descriptors; nothing of it should be used.
     """
     del advance, version  # quick; and only to know another map of that name by
-    if problems := check_map(Path(path)).problems:
+    if problems := check_map(path).problems:
         raise Dpm2Error(f"{path}: {problems[0]}; see dpm2 map check")
-    with MapStore.open(Path(path)) as store:
+    with MapStore.open(path) as store:
         data = load_map(store)
     vectors = np.zeros((len(data), WIDTH), np.float32)
     for node, keyframe in enumerate(data.keyframes):

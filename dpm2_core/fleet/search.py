@@ -106,8 +106,7 @@ class Search:
         Raises:
             Dpm2Error: a search failed, or what is kept is damaged. KeyboardInterrupt: it was stopped.
         """
-        slam = self.settings.model_dump(mode="json")
-        maps = {name: dict(part.arguments) for name, part in parts.items()}
+        maps = {name: part.arguments for name, part in parts.items()}
         work: dict[str, tuple[Part, str, str]] = {}
         outside = False
         for name, *_ in index.drives:
@@ -115,7 +114,7 @@ class Search:
             for one, rows in (self._pairs(name) if outside else {}).items():
                 if one not in inside or name not in inside:
                     for number, stretch in enumerate(stretches(one, name, np.array(rows))):
-                        part = join_part(number, stretch, maps, slam)
+                        part = join_part(number, stretch, maps, self.settings)
                         work[part.name] = part, one, name
         outcomes = self._done([part for part, *_ in work.values()])
         if failed := [outcome for outcome in outcomes if outcome.figures is None]:

@@ -236,7 +236,7 @@ def test_drives_of_a_manifest_have_names_and_settings_of_their_own(tmp_path: Pat
     assert parts[1].arguments["gt"] == str(tmp_path / "true.txt")
     assert parts[1].arguments["frames"] == (5, 9)
     assert [part.cores for part in parts] == [1, 3]
-    assert parts[0].arguments["config"]["slam"]["registration"] == "geometric"
+    assert parts[0].arguments["config"].slam.registration == "geometric"
 
 
 @pytest.mark.parametrize(("text", "words"), [
@@ -260,7 +260,7 @@ def test_weights_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.M
     shutil.copy(Path(__file__), "own.safetensors")
     (part,) = parts_of(read_drives([Path("00")]), None, ["slam.neural.weights=own.safetensors"])
     config: Any = part.arguments["config"]
-    assert config["slam"]["neural"]["weights"] == str(tmp_path / "own.safetensors")
+    assert config.slam.neural.weights == str(tmp_path / "own.safetensors")
     assert part.inputs == [tmp_path / "own.safetensors"]
 
 
@@ -273,7 +273,7 @@ def test_a_drive_is_done_again_when_the_weights_of_its_filter_or_its_truth_chang
     of_filter = ["slam.filter.kind=movers", "slam.filter.weights=own.safetensors"]
     (part,) = parts_of(read_drives([Path("fleet.yaml")]), None, [*FAST, *of_filter])
     config: Any = part.arguments["config"]
-    assert config["slam"]["filter"]["weights"] == str(tmp_path / "own.safetensors")
+    assert config.slam.filter.weights == tmp_path / "own.safetensors"
     assert part.inputs == [tmp_path / "own.safetensors", tmp_path / "poses.txt"]
 
 
