@@ -53,14 +53,10 @@ def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], 
     assert not left.exists()
 
 
-def test_without_a_drive_there_is_nothing_to_learn() -> None:
+@pytest.mark.parametrize("weight", [0, None])
+def test_without_a_drive_of_some_weight_there_is_nothing_to_learn(packed: Path, weight: float | None) -> None:
     with pytest.raises(UsageError, match=r"data\.packed: want packed drives"):
-        Mixture(DataSettings())
-
-
-def test_drives_of_no_weight_are_none(packed: Path) -> None:
-    with pytest.raises(UsageError, match=r"data\.packed: want packed drives"):
-        Mixture(DataSettings(packed={str(packed): 0}))
+        Mixture(DataSettings(packed={} if weight is None else {str(packed): weight}))
 
 
 def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tmp_path: Path) -> None:

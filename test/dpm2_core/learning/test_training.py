@@ -345,15 +345,21 @@ def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
 
 
 @pytest.mark.slow
-def test_overlap_keeps_the_network_of_registration(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Also settings that change no shape and differ from the preset: the weights that it writes have them again."""
+def test_overlap_keeps_the_network_of_registration_and_what_is_said_of_it(
+    settings: RegistrationTrainingSettings, tmp_path: Path
+) -> None:
+    """Also settings that change no shape and differ from the preset: the weights that it writes have them again; and
+    steps and images, by which the SLAM knows whether to use the camera. The phase is two."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
     start = train_registration(
         settings.model_copy(update={"network": merged(settings.network, changed)}), tmp_path / "one"
     )
-    after = network_settings(train_overlap(_overlap(settings, start, steps=1), tmp_path / "two"))
+    weights = train_overlap(_overlap(settings, start, steps=1), tmp_path / "two")
+    after, before, said = network_settings(weights), read_metadata(start), read_metadata(weights)
     assert after == network_settings(start)
     assert (after.decoder.temperature, after.fusion.image_mask) == (0.5, "front")
+    assert (before["images"], before["phase"]) == ("true", "1")
+    assert said == {**before, "phase": "2"}
 
 
 @pytest.mark.parametrize(("kind", "key"), [
@@ -473,19 +479,6 @@ def test_a_log_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
     log.close()
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(line["step"], line["loss"]) for line in lines] == [(0, 0.5), (1, 0.5), (2, 0.25)]
-
-
-def test_overlap_keeps_what_the_weights_say_of_registration(
-    settings: RegistrationTrainingSettings, tmp_path: Path
-) -> None:
-    """Steps and images of the registration training, by which the SLAM knows whether to use the camera, stay; the phase
-    is two."""
-    start = train_registration(settings, tmp_path / "one")
-    second = _overlap(settings, start, steps=1)
-    before, after = read_metadata(start), read_metadata(train_overlap(second, tmp_path / "two"))
-    assert before["images"] == "true"
-    assert before["phase"] == "1"
-    assert {**before, "phase": "2"} == after
 
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3]), "OMP_NUM_THREADS": "1"}

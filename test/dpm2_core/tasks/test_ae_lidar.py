@@ -108,10 +108,3 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
     loaded = load_task("ae_lidar", tmp_path / WEIGHTS)
     image = torch.rand(1, 2, 16, 64)
     torch.testing.assert_close(loaded.network(image)[0], task.network(image)[0])
-
-
-def test_weights_of_another_task_are_rejected(tmp_path: Path) -> None:
-    """The task's name is in the file."""
-    shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
-    with pytest.raises(UsageError, match="not of ae_lidar"):
-        load_task("ae_lidar", shipped)

@@ -197,24 +197,6 @@ def test_a_scan_without_points_in_the_image_is_none_and_spoils_nothing() -> None
     assert found["chamfer_m"] == pytest.approx(sum(row["chamfer_m"] for row in rows if row is not rows[1]) / 3)
 
 
-def test_what_is_no_dslr_is_rejected(pairs: Path, tmp_path: Path) -> None:
-    """A pickle, another task's weights, a missing file, scans without twins."""
-    torch.save({"weights": torch.ones(1)}, tmp_path / "pickle.pt")
-    with pytest.raises(UsageError, match="pickled weights are never loaded"):
-        load(tmp_path / "pickle.pt")
-    with pytest.raises(UsageError, match="no such weights"):
-        load(tmp_path / "nothing.safetensors")
-    shipped = Path(__file__).parents[3] / "dpm2_core" / "weights" / "small.safetensors"
-    with pytest.raises(UsageError, match="weights of no task, not of dslr"):
-        load(shipped)
-    drive = tmp_path / "drive" / "velodyne"
-    drive.mkdir(parents=True)
-    for i in range(2):
-        torch.rand(100, 4).numpy().tofile(drive / f"{i:06d}.bin")
-    with pytest.raises(UsageError, match="no static/"):
-        open_scans(tmp_path / "drive", DslrTask.needs)
-
-
 def test_the_authors_weights(pairs: Path) -> None:
     """Stage 1 on both kinds of scans; in stage 3 the cross entropy counts for 10 over the scans of a step."""
     scans = open_scans(pairs)

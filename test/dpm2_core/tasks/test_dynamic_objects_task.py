@@ -13,8 +13,6 @@ import torch
 
 from dpm2_core.errors import UsageError
 from dpm2_core.network.perception.dynamic_objects import DynamicObjectNetSettings, load
-from dpm2_core.network.perception.gndnet import GroundSettings
-from dpm2_core.network.perception.task_weights import write_weights
 from dpm2_core.tasks.dynamic_objects_task import (
     MOVABLE,
     DynamicObjectTask,
@@ -98,22 +96,10 @@ def test_figures_are_counts_of_points() -> None:
         assert all(np.isnan(value) for value in task.evaluate(TaskScans([_One(still)])).values())
 
 
-@pytest.mark.slow
-def test_scans_without_classes_and_weights_of_others_are_errors_of_use(tmp_path: Path) -> None:
+def test_scans_without_classes_are_an_error_of_use() -> None:
     scan = TaskScan(torch.zeros(10, 4), None, None, "drive", 3)
     with pytest.raises(UsageError, match="drive, scan 3: no labels"):
         DynamicObjectTask(SMALL).losses([scan])
-    task = DynamicObjectTask(SMALL)
-    write_weights(tmp_path / "g.safetensors", "gndnet", GroundSettings(), task.state_dict(), {})
-    with pytest.raises(UsageError, match="weights of gndnet, not of movers"):
-        load(tmp_path / "g.safetensors")
-    with torch.no_grad():
-        next(task.parameters()).fill_(torch.nan)
-    save_task(task, tmp_path / "n.safetensors", {})
-    with pytest.raises(UsageError, match="not finite"):
-        load(tmp_path / "n.safetensors")
-    with pytest.raises(UsageError, match="not a safetensors file"):
-        load(Path(__file__))
 
 
 def test_dynamic_objects_of_one_scan_are_put_into_another() -> None:

@@ -6,21 +6,23 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from dpm2_core.diffslam import SlamLoss
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.checkpoint import WEIGHTS
-from dpm2_core.network.perception import gndnet
+from dpm2_core.network.perception import dslr, dynamic_objects, gndnet
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.scan import TaskScan, TaskScans
+from dpm2_core.tasks.task import task_type
 from dpm2_core.tasks.training import (
     draw,
     load_task,
@@ -190,32 +192,42 @@ def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
         draw(task, scans, 6, tmp_path / "none.png")
 
 
-def test_wrong_weights_are_rejected(scans: TaskScans, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "load", "tensor"),
+    [
+        ("gndnet", gndnet.load, "net.head.bias"),
+        ("movers", dynamic_objects.load, "net.head.bias"),
+        ("dslr", dslr.load, "network.decoder.layers.0.weight"),
+        ("ae_lidar", partial(load_task, "ae_lidar"), "network.decoder.0.weight"),
+    ],
+)
+def test_wrong_weights_are_rejected(tmp_path: Path, name: str, load: Callable[[Path], nn.Module], tensor: str) -> None:
     """No file, a pickle, another task's, no settings, wrong ones, other shapes, NaN: each says so."""
     path = tmp_path / "w.safetensors"
-    task = GroundTask(settings())
-    with pytest.raises(UsageError, match="no such weights"):
-        load_task("gndnet", path)
-    torch.save(task.state_dict(), path)
-    with pytest.raises(UsageError, match="pickled weights are never loaded"):
-        gndnet.load(path)
-    state = {name: value.contiguous() for name, value in task.state_dict().items()}
-    about = {"task": "gndnet", "network": task.settings.network.model_dump_json()}
+    kind = task_type(name)
+    task = kind(kind.training_type(network={"channels": 8}))  # type: ignore[arg-type]
+    state = {key: value.contiguous() for key, value in task.state_dict().items()}
+    about = {"task": name, "network": task.settings.network.model_dump_json()}
 
-    def rejected(tensors: dict[str, Tensor], metadata: dict[str, str], message: str) -> None:
-        save_file(tensors, path, metadata)
-        for load in (lambda: load_task("gndnet", path), lambda: gndnet.load(path)):
+    def rejected(message: str) -> None:
+        for either in (partial(load_task, name), load):
             with pytest.raises(UsageError, match=message):
-                load()
+                either(path)
 
-    rejected(state, {**about, "task": "dslr"}, "weights of dslr, not of gndnet")
-    rejected(state, {"preset": "small"}, "weights of no task, not of gndnet")
-    rejected(state, {"task": "gndnet"}, "without a network description")
-    rejected(state, {**about, "network": '{"cell": 0}'}, "cell: input should be greater than 0")
-    rejected(state, {**about, "network": '{"channels": 8, "cells": 32}'}, "tensors differ, such as net.down")
-    rejected({name: v for name, v in state.items() if name != "net.pillar.bias"}, about, "such as net.pillar.bias")
-    broken = {**state, "net.head.bias": torch.tensor([math.nan])}
-    rejected(broken, about, "net.head.bias holds values that are not finite")
+    rejected("no such weights")
+    torch.save(state, path)
+    rejected("pickled weights are never loaded")
+    for tensors, metadata, message in (
+        (state, {**about, "task": "others"}, f"weights of others, not of {name}"),
+        (state, {"preset": "small"}, f"weights of no task, not of {name}"),
+        (state, {"task": name}, "without a network description"),
+        (state, {**about, "network": '{"channels": 0}'}, "channels: input should be greater than"),
+        (state, {**about, "network": '{"channels": 16}'}, "tensors differ, such as net"),
+        ({key: v for key, v in state.items() if key != tensor}, about, f"such as {tensor}"),
+        ({**state, tensor: torch.full_like(state[tensor], math.nan)}, about, "holds values that are not finite"),
+    ):
+        save_file(tensors, path, metadata)
+        rejected(message)
 
 
 def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:
