@@ -8,10 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from dpm2_core.data.ply import write_ply
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write, write_json
+
+from ..helpers.full_disk import largest_file
 
 
 def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
@@ -53,20 +57,8 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> Non
     """A file size limit makes the kernel reject the write half-way, as a full disk does, without root or a mount."""
     path = tmp_path / "map.ply"
     path.write_text("old")
-    program = f"""
-import resource, signal, numpy as np
-from dpm2_core.data.ply import write_ply
-from dpm2_core.errors import Dpm2Error
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-try:
-    write_ply({str(path)!r}, np.ones((100_000, 4), np.float32))
-except Dpm2Error as error:
-    print(error)
-"""
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert str(path) in result.stdout
-    assert "File too large" in result.stdout
+    with largest_file(100_000), pytest.raises(Dpm2Error, match=f"{path}: .*File too large"):
+        write_ply(path, np.ones((100_000, 4), np.float32))
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

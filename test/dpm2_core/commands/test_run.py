@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 import signal
 import subprocess
@@ -28,6 +27,7 @@ from dpm2_core.slam.store.map_store import MapStore
 
 from ...helpers.command import dpm2, dpm2_process
 from ...helpers.drives import first_scans
+from ...helpers.full_disk import largest_file
 
 pytestmark = pytest.mark.slow
 
@@ -221,12 +221,8 @@ def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert dpm2("run", recording, "--out", out, "--frames", ":4", *QUICK).returncode == 0
     before = (out / "map.ply").read_bytes()
-
-    def limit() -> None:  # no file may grow beyond 50 kB: writing the map fails as on a full disk
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
-
-    done = dpm2_process("run", recording, "--out", out, *QUICK, preexec_fn=limit)
+    with largest_file(50_000):
+        done = dpm2("run", recording, "--out", out, *QUICK)
     assert done.returncode == 1
     assert "map.ply" in done.stderr
     assert (out / "map.ply").read_bytes() == before

@@ -11,6 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from dpm2_core.data import bag_messages
+from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.geometry import se3
+
 CALIB = """P0: 50 0 20 0 0 50 15 0 0 0 1 0
 P2: 50 0 20 3 0 50 15 0.1 0 0 1 0.002
 Tr: 0 -1 0 0.01 0 0 -1 -0.05 1 0 0 -0.3
@@ -56,17 +60,10 @@ class BagMaker:
         return self.store.types[f"{package}/msg/{kind}"](*args, **kwargs)
 
     def header(self, stamp: float, frame: str = "velo_link") -> Any:
-        ns = round(stamp * 1e9)
-        return self.new(
-            "std_msgs/Header",
-            stamp=self.new("builtin_interfaces/Time", sec=ns // 10**9, nanosec=ns % 10**9),
-            frame_id=frame,
-        )
+        return bag_messages.header(round(stamp * 1e9), frame)
 
     def cloud(self, stamp: float, x: float = 1.0, count: int = 60, frame: str = "velo_link") -> Any:
         """`count` points whose x says which cloud it is."""
-        from dpm2_core.data.messages import cloud_fields, point_columns
-
         points = np.full((count, 4), [x, 2, 3, 0.5], np.float32)
         fields = cloud_fields(point_columns(points), self.store.types["sensor_msgs/msg/PointField"])
         return self.new("sensor_msgs/PointCloud2", header=self.header(stamp, frame), **fields)
@@ -85,20 +82,10 @@ class BagMaker:
                         binning_x=0, binning_y=0, roi=roi)  # fmt: skip
 
     def transform(self, parent: str, child: str, xyz: tuple[float, float, float]) -> Any:
-        pose = self.new("geometry_msgs/Transform", translation=self.new("geometry_msgs/Vector3", *xyz),
-                        rotation=self.new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0))  # fmt: skip
-        stamped = self.new("geometry_msgs/TransformStamped", header=self.header(0, parent), child_frame_id=child,
-                           transform=pose)  # fmt: skip
-        return self.new("tf2_msgs/TFMessage", transforms=[stamped])
+        return bag_messages.transforms(0, {child: (parent, se3.make(np.eye(3), xyz))})
 
     def odometry(self, stamp: float, x: float, child: str = "velo_link") -> Any:
-        zero = self.new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        pose = self.new("geometry_msgs/Pose", position=self.new("geometry_msgs/Point", x, 0.0, 0.0),
-                        orientation=self.new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0))  # fmt: skip
-        twist = self.new("geometry_msgs/Twist", zero, zero)
-        return self.new("nav_msgs/Odometry", header=self.header(stamp, "map"), child_frame_id=child,
-                        pose=self.new("geometry_msgs/PoseWithCovariance", pose, np.zeros(36)),
-                        twist=self.new("geometry_msgs/TwistWithCovariance", twist, np.zeros(36)))  # fmt: skip
+        return bag_messages.odometry(round(stamp * 1e9), child, se3.make(np.eye(3), [x, 0, 0]))
 
     def write(
         self,

@@ -189,18 +189,3 @@ def test_a_folder_becomes_a_bag_with_the_same_fixes(kitti_folder: Any, tmp_path:
             np.testing.assert_array_equal(ours.fix.antenna, [0.3, 0.2, 1.0])
             np.testing.assert_allclose(ours.fix.covariance, np.diag([1.0, 4, 9]), atol=1e-3)
     assert taken == {1: 49.05, 2: 49.18, 4: 49.33}
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("0 49 8\n", "gnss.txt:1: 3 numbers, want 7"),
-        ("0 49 8 0 1 1 1\n1 99 8 0 1 1 1\n", "gnss.txt:2: fix: .* no place on Earth"),
-        ("0 49 8 0 1 1 0\n", "gnss.txt:1: fix: .* no covariance"),
-    ],
-)
-def test_a_damaged_file_is_named(kitti_folder: Any, text: str, problem: str) -> None:
-    folder = kitti_folder()
-    (folder / "gnss.txt").write_text(text)
-    with pytest.raises(UsageError, match=problem):
-        KittiSource(folder)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dpm2_core.data import bag_messages
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.imu import ImuBuffer, decode_imu
@@ -24,18 +25,11 @@ NAN, INF = float("nan"), float("inf")
 
 def imu(bags: Any, stamp: float, rates: tuple = (0.1, 0.2, 0.3), forces: tuple = (0.0, 0.0, 9.8), **other: Any) -> Any:
     """A message; `other`: frame, rates_known, forces_known."""
-    vector, known = lambda v: bags.new("geometry_msgs/Vector3", *map(float, v)), {True: 0.0, False: -1.0}
-    covariance = lambda name: np.array([known[other.get(name, True)], *np.zeros(8)])  # noqa: E731
-    return bags.new(
-        "sensor_msgs/Imu",
-        header=bags.header(stamp, other.get("frame", "imu_link")),
-        orientation=bags.new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
-        orientation_covariance=covariance("none"),
-        angular_velocity=vector(rates),
-        angular_velocity_covariance=covariance("rates_known"),
-        linear_acceleration=vector(forces),
-        linear_acceleration_covariance=covariance("forces_known"),
-    )
+    message = bag_messages.imu(round(stamp * 1e9), np.array(rates, float), np.array(forces, float))
+    message.header.frame_id = other.get("frame", "imu_link")
+    message.angular_velocity_covariance = np.full(9, 0.0 if other.get("rates_known", True) else -1.0)
+    message.linear_acceleration_covariance = np.full(9, 0.0 if other.get("forces_known", True) else -1.0)
+    return message
 
 
 def drive(bags: Any, until: float = 2.0, **other: Any) -> list[tuple[float, str, Any]]:
@@ -239,16 +233,3 @@ def test_a_folder_becomes_a_bag_with_the_same_samples(kitti_folder: Any, tmp_pat
         np.testing.assert_allclose(ours.imu.rates, theirs.imu.rates, atol=1e-9)
         np.testing.assert_allclose(ours.imu.forces, theirs.imu.forces, atol=1e-9)
     assert KittiSource(folder, InputSettings(imu=False)).imu is None
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [("0 1 2 3\n", "imu.txt:1: 4 numbers, want 7"), ("0 0 0 0 0 0 9\n0 0 0 0 0 0 9\n", "imu.txt:2: times do not")],
-)
-def test_a_damaged_file_is_named(kitti_folder: Any, text: str, problem: str) -> None:
-    folder = kitti_folder()
-    (folder / "imu.txt").write_text(text)
-    with (folder / "calib.txt").open("a") as file:
-        file.write("Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0\n")
-    with pytest.raises(UsageError, match=problem):
-        KittiSource(folder)

@@ -328,13 +328,20 @@ def test_without_times_frames_are_a_tenth_apart(kitti_folder: MakeFolder, text: 
         ("times.txt", "0\n\n1 2\n", r"times.txt:3: 2 numbers, want 1"),
         ("times.txt", "0\n1e300\n", r"times.txt:2: 1e\+300 is no time"),
         ("imu.txt", "0 0 0 0 0 0 1e300\n", r"imu.txt:1: 1e\+300 is no"),
+        ("imu.txt", "0 1 2 3\n", "imu.txt:1: 4 numbers, want 7"),
+        ("imu.txt", "0 0 0 0 0 0 9\n0 0 0 0 0 0 9\n", "imu.txt:2: times do not"),
         ("gnss.txt", "1e20 49 8 100 1 1 1\n", r"gnss.txt:1: 1e\+20 is no time"),
+        ("gnss.txt", "0 49 8\n", "gnss.txt:1: 3 numbers, want 7"),
+        ("gnss.txt", "0 49 8 0 1 1 1\n1 99 8 0 1 1 1\n", "gnss.txt:2: fix: .* no place on Earth"),
+        ("gnss.txt", "0 49 8 0 1 1 0\n", "gnss.txt:1: fix: .* no covariance"),
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n", r"poses.txt:1: 11 numbers, want 12"),
     ],
 )
 def test_a_damaged_text_file_is_named(kitti_folder: MakeFolder, name: str, text: str, message: str) -> None:
     folder = kitti_folder()
     (folder / name).write_text(text)
+    with (folder / "calib.txt").open("a") as file:
+        file.write("Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(UsageError, match=message):
         KittiSource(folder)
 
