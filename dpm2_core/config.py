@@ -6,7 +6,6 @@ Each part of the package keeps its own `Settings` type beside the code it config
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -115,8 +114,10 @@ def dump_settings(settings: Settings) -> str:
 
 def merged(tree: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
     """A nested dictionary with the keys of another one put in."""
-    out = copy.deepcopy(dict(tree))
-    _merge(out, dict(more))
+    out = dict(tree)
+    for key, value in more.items():
+        inner = out.get(key)
+        out[key] = merged(inner if isinstance(inner, dict) else {}, value) if isinstance(value, dict) else value
     return out
 
 
@@ -185,16 +186,6 @@ def value_of(text: str) -> Any:
         return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
     except _NOT_YAML:
         return text
-
-
-def _merge(tree: dict[str, Any], more: dict[str, Any]) -> None:
-    for key, value in more.items():
-        if isinstance(value, dict):
-            # A copy: two keys may share one mapping through a YAML anchor, and each is its own.
-            tree[key] = dict(tree[key]) if isinstance(tree.get(key), dict) else {}
-            _merge(tree[key], value)
-        else:
-            tree[key] = value
 
 
 def put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], value: Any) -> None:

@@ -15,7 +15,7 @@ from dpm2_core.data.ply import read_ply
 from dpm2_core.data.scan_file import chosen, image_size, images_of
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource
-from dpm2_core.data.text import read_lines, read_numbers
+from dpm2_core.data.text import read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Frame
@@ -67,7 +67,7 @@ class KittiCarlaSource(IndexedSource):
     def _trajectory(self) -> tuple[NDArray[np.int64], Array | None]:
         """Stamps (len,) ns and poses (len, 4, 4) T_world_lidar at them, of the file with one pose a millisecond."""
         path, seconds = self.folder / "full_poses_lidar.txt", self.numbers * _PERIOD
-        rows = _rows(path, 13)
+        rows = read_numbers(path, 13)
         if not len(rows):
             self.notes.append(f"{path}: missing: no ground truth, and frames are taken to be {_PERIOD} s apart")
             return np.round(seconds * 1e9).astype(np.int64), None
@@ -83,7 +83,7 @@ class KittiCarlaSource(IndexedSource):
 
     def _extrinsic(self) -> Array | None:
         """LiDAR to the optical frame of camera 0; None where lidar_to_cam0.txt is missing."""
-        rows = _rows(self.folder / "lidar_to_cam0.txt", 12)
+        rows = read_numbers(self.folder / "lidar_to_cam0.txt", 12)
         return se3.inverse(_T_BODY_OPTICAL) @ se3.from_rows(rows[0]) if len(rows) else None
 
     def _camera(self) -> Camera | None:
@@ -103,12 +103,6 @@ class KittiCarlaSource(IndexedSource):
 
     def _image_path(self, number: int) -> Path:
         return self.folder / "images_rgb" / f"{number:04d}_0.png"
-
-
-def _rows(path: Path, columns: int) -> Array:
-    """Lines of numbers below a header that starts with #; no rows if there is no such file."""
-    skip = sum(1 for line in read_lines(path)[:1] if line.startswith("#"))
-    return read_numbers(path, columns, skip)
 
 
 def _find(path: Path, sequence: str) -> Path:

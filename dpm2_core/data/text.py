@@ -16,16 +16,16 @@ _LARGEST = 9e9  # s, of a stamp in ns as an integer: the year 2255; no place or 
 _DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
 
 
-def read_numbers(path: Path, columns: int, skip: int = 0) -> Array:
-    """(lines, columns) float64 of a text file below a header of `skip` lines; no rows if there is no such file.
+def read_numbers(path: Path, columns: int) -> Array:
+    """(lines, columns) float64 of a text file, without lines that begin with #; no rows if there is no such file.
 
     Raises:
         UsageError: a line has another number of numbers, or something else; the message names it.
     """
     rows = [
         parse_row(line, columns, f"{path}:{i}")
-        for i, line in enumerate(read_lines(path)[skip:], 1 + skip)
-        if line.strip()
+        for i, line in enumerate(read_lines(path), 1)
+        if line.strip() and not line.startswith("#")
     ]
     return np.array(rows).reshape(-1, columns)
 

@@ -13,7 +13,6 @@ import numpy as np
 from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.data.image_messages import DISTORTIONS
 from dpm2_core.frame import Array, Camera, Image
-from dpm2_core.geometry import se3
 
 PLACE_WIDTH = 320
 """Of a picture by which a place is found, pixels: 6 kB."""
@@ -76,21 +75,9 @@ def usable_image(jpeg: bytes | None) -> Image | None:
 
 
 def _camera(fields: dict[str, object]) -> Camera:
-    K, T, size = _numbers(fields, "K", (3, 3)), _numbers(fields, "T_lidar_cam", (4, 4)), _numbers(fields, "size", (2,))
-    if min(K[0, 0], K[1, 1]) <= 0 or (K[2] != (0, 0, 1)).any():
-        raise ValueError("K is not one of a pinhole")
-    if not se3.is_rigid(T):
-        raise ValueError("T_lidar_cam is not a rigid transform")
-    if not ((size >= 1) & (size <= _LARGEST)).all():
+    K, T, size, distortion = (np.asarray(fields[key], np.float64) for key in ("K", "T_lidar_cam", "size", "distortion"))
+    if size.shape != (2,) or not ((size >= 1) & (size <= _LARGEST)).all():
         raise ValueError(f"size of {size.tolist()} pixels")
-    distortion = np.asarray(fields["distortion"], np.float64)
     if distortion.ndim != 1 or len(distortion) not in DISTORTIONS or not np.isfinite(distortion).all():
         raise ValueError("distortion is not 4, 5, 8, 12 or 14 finite numbers")
     return Camera(K, T, (int(size[0]), int(size[1])), tuple(distortion.tolist()), str(fields["name"]))
-
-
-def _numbers(fields: dict[str, object], key: str, shape: tuple[int, ...]) -> Array:
-    found = np.asarray(fields[key], np.float64)
-    if found.shape != shape or not np.isfinite(found).all():
-        raise ValueError(f"{key} is not {shape} finite numbers")
-    return found

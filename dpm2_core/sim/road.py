@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from dpm2_core.data.text import read_numbers
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -225,20 +226,11 @@ def read_drive(path: FilePath) -> Array:
     """(N, 4) positions of a file of KITTI poses, x ahead at the start, y left, z up, m, and headings, rad.
 
     Raises:
-        UsageError: no such file, or not 12 finite numbers on each line.
+        UsageError: no such file, or not 12 finite numbers on each line, which is named.
     """
     if not path.is_file():
         raise UsageError(f"--road {path}: want one of {', '.join(ROAD_KINDS)}, or a file of KITTI poses")
-    try:
-        rows = np.array(
-            [[float(word) for word in line.split()] for line in path.read_text().splitlines() if line.strip()]
-        )
-    except OSError as error:
-        raise UsageError(f"--road {path}: {error.strerror or error}") from None
-    except ValueError:  # words, lines of different lengths, or no text at all
-        raise UsageError(f"--road {path}: not a file of KITTI poses (12 numbers a line)") from None
-    if rows.ndim != 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
-        raise UsageError(f"--road {path}: not a file of KITTI poses (12 finite numbers a line)")
+    rows = read_numbers(path, 12)
     heading = np.arctan2(-rows[:, 2], rows[:, 10])  # of the camera's z axis, which looks ahead
     return np.concatenate([rows[:, [11, 3, 7]] * (1, -1, -1), np.unwrap(heading)[:, None]], 1)
 

@@ -89,9 +89,9 @@ def test_the_car_heads_where_the_file_says(poses_file: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 0 0 0\n0 1 0 0\n", "12 "),
-        ("a b c\n", "12 numbers"),
-        ("", "12"),
+        ("1 0 0 0\n0 1 0 0\n", "poses.txt:1: 4 numbers, want 12"),
+        ("a b c\n", "poses.txt:1: .*'a'"),
+        ("", "a drive of 0 m"),
         ("1 0 0 nan 0 1 0 0 0 0 1 0\n" * 3, "finite"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 30, "at least 20 m"),
     ],
