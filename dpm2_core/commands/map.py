@@ -12,13 +12,22 @@ from typing import Annotated
 import typer
 
 from dpm2_core.commands.map_graph import optimize
-from dpm2_core.commands.map_info import MapFile, info
-from dpm2_core.commands.options import ConfigFile, Overrides, note
+from dpm2_core.commands.options import ConfigFile, JsonFile, Overrides, note, show
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 
 app = typer.Typer(help="Map files: info, export, merge, prune, check; pose graphs: optimize.", no_args_is_help=True)
-app.command()(info)
+MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2 run --map` writes it.")]
+
+
+@app.command()
+def info(path: MapFile, json_file: JsonFile = None) -> None:
+    """What is in a map."""
+    from dpm2_core.commands.map_figures import info_table
+
+    show(*info_table(path), json_file)
+
+
 app.command()(optimize)
 
 

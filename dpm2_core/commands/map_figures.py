@@ -13,9 +13,10 @@ from dpm2_core.commands.options import note
 from dpm2_core.database import size_with_log
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.mapping.restore import restore_solved
-from dpm2_core.slam.store.map_data import MapData, Way, ways
+from dpm2_core.slam.store.map_data import MapData, Way, load_map, ways
 from dpm2_core.slam.store.map_file import missing_log
 from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.tables import FigureTable
 
 if TYPE_CHECKING:
     from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -25,6 +26,37 @@ def say_what_is_missing(store: MapStore) -> None:
     """Say that the last keyframes of a map may be in a file that is no longer beside it."""
     if missing := missing_log(store.path):
         note(f"{store.path}: {missing}")
+
+
+def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
+    """What is in a map, for people and as figures."""
+    with MapStore.open(path) as store:
+        say_what_is_missing(store)
+        data = load_map(store, descriptors=False)
+        figures = figures_of(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
+    f = figures
+    table = FigureTable(str(path), names=["what"], text=["value"], header=False)
+    own = f"{f['own_clouds']} of them with their own cloud, {f['with_descriptors']} with descriptors"
+    extent = " x ".join(f"{size:.1f}" for size in f["extent_m"])
+    rows = (
+        ("keyframes", f"{f['keyframes']}, {own}"),
+        ("pruned", str(f["pruned"])),
+        ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
+        ("length", f"{f['length_m']:.1f} m"),
+        ("extent", f"{extent} m, of the keyframes that are tied to the first" if extent else "-"),
+        ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
+        ("georeference", georeference_text(f["georeference"], unplaced(data))),
+        ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
+    )
+    for row in rows:
+        table.add_row(*row)
+    for s in figures["sessions"]:
+        tied = f", {s['untied']} of them not tied to the first keyframe: elsewhere" if s["untied"] else ""
+        info = (
+            f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+        )
+        table.add_row(f"session {s['session']}", info)
+    return table, figures
 
 
 def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:

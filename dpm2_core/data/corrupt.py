@@ -54,8 +54,8 @@ class CorruptionSettings(Settings):
 
 
 _BAND = np.radians(0.4)  # the spacing of an HDL-64
-# Streams of random numbers, so that no corruption changes another.
-_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION, _BEAMS, _EXTRINSIC, _BOX, _DUST = range(9)
+_OF_FRAMES = ("camera", "no_image", "overexposed", "underexposed", "obstruction")
+_STREAMS = (*_OF_FRAMES, "beams", "extrinsic", "box", "dust")  # of random numbers, so that none changes another
 _DUSTY = (0.4, 6.0)  # m, evenly along a pulse
 
 
@@ -118,13 +118,13 @@ class CorruptedSource:
         self._settings = settings
         self.name, self.notes, self.truth = source.name, source.notes, source.truth
         self.numbers, self.in_order = getattr(source, "numbers", None), getattr(source, "in_order", False)
-        turn, shift = self._rng(_EXTRINSIC).normal(size=(2, 3))
+        turn, shift = self._rng("extrinsic").normal(size=(2, 3))
         turn *= np.radians(settings.extrinsic_deg) / np.linalg.norm(turn)
         shift *= settings.extrinsic_m / np.linalg.norm(shift)
         self._T_true_wrong = se3.make(Rotation.from_rotvec(turn).as_matrix(), shift)
         bands = int(np.pi / _BAND) + 1
-        self._dead = self._rng(_BEAMS).permutation(bands) < round(settings.beams * bands)
-        self._hit = {kind: self._chosen(kind, ratio) for kind, ratio in self._ratios().items()}
+        self._dead = self._rng("beams").permutation(bands) < round(settings.beams * bands)
+        self._hit = {name: self._chosen(name, getattr(settings, name)) for name in _OF_FRAMES}
 
     @property
     def poses(self) -> Array | None:
@@ -156,28 +156,23 @@ class CorruptedSource:
         """With late images the frames before are read too, at 5 Hz or more as many as the delay is long."""
         return max(0, start - int(np.ceil(self._settings.time_offset * 20))) if self._settings.time_offset else start
 
-    def _ratios(self) -> dict[int, float]:
-        s = self._settings
-        kinds = (_CAMERA, _NO_IMAGE, _OVER, _UNDER, _OBSTRUCTION)
-        return dict(zip(kinds, (s.camera, s.no_image, s.overexposed, s.underexposed, s.obstruction), strict=True))
-
-    def _chosen(self, kind: int, share: float) -> NDArray[np.bool_]:
+    def _chosen(self, name: str, share: float) -> NDArray[np.bool_]:
         """(len,) True for exactly that fraction of the frames."""
-        rank = self._rng(kind).permutation(len(self._source))
+        rank = self._rng(name).permutation(len(self._source))
         return rank < round(share * len(rank))
 
-    def _rng(self, kind: int, position: int = 0) -> np.random.Generator:
-        return np.random.default_rng([self._settings.seed, kind, position])
+    def _rng(self, stream: str, position: int = 0) -> np.random.Generator:
+        return np.random.default_rng([self._settings.seed, _STREAMS.index(stream), position])
 
     def _corrupted(self, frame: Frame, position: int) -> Frame:
         kept = ~self._dead[self._bands(frame.points)]
-        if self._hit[_OBSTRUCTION][position]:
-            kept &= ~hidden_by(random_box(self._rng(_BOX, position)), frame.points)
+        if self._hit["obstruction"][position]:
+            kept &= ~hidden_by(random_box(self._rng("box", position)), frame.points)
         s = self._settings
-        points, seen = in_fog(frame.points, s.dust, s.sight or np.inf, self._rng(_DUST, position))
+        points, seen = in_fog(frame.points, s.dust, s.sight or np.inf, self._rng("dust", position))
         kept &= seen
         offset = None if frame.time_offset is None else frame.time_offset[kept]
-        images = () if self._hit[_NO_IMAGE][position] else tuple(self._image(i, position) for i in frame.images)
+        images = () if self._hit["no_image"][position] else tuple(self._image(i, position) for i in frame.images)
         return replace(frame, points=points[kept], time_offset=offset, images=images)
 
     @staticmethod
@@ -190,11 +185,11 @@ class CorruptedSource:
 
     def _image(self, image: Image, position: int) -> Image:
         pixels, stops = image.pixels, self._settings.stops
-        if self._hit[_OVER][position]:
+        if self._hit["overexposed"][position]:
             pixels = exposed(pixels, stops)
-        if self._hit[_UNDER][position]:
+        if self._hit["underexposed"][position]:
             pixels = exposed(pixels, -stops)
-        if self._hit[_CAMERA][position]:
+        if self._hit["camera"][position]:
             pixels = np.zeros_like(pixels)
         camera = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ self._T_true_wrong)
         return replace(image, pixels=pixels, camera=camera)

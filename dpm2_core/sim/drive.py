@@ -23,7 +23,7 @@ from dpm2_core.sim.gnss import Receiver
 from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.road import ROAD_KINDS, make_road, read_drive
-from dpm2_core.sim.settings import DriveConfig, LidarConfig
+from dpm2_core.sim.settings import DriveConfig
 from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 NOTE = "dpm2_sim.json"
@@ -31,6 +31,7 @@ OVERLAP = 16.0
 """How far a closed drive goes on beyond its start, m."""
 LONGEST_LAP = 800.0
 """A longer drive goes round again, m."""
+_UNSAID = {"pattern", "roll", "pitch", "real", "wet", "lens", "traffic", "imu", "gnss"}
 _LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM, _GNSS_STREAM = 10, 11, 14, 15
 
 
@@ -95,22 +96,17 @@ def fitting_length(drive: DriveConfig) -> float:
 
 
 def _recipe(drive: DriveConfig) -> dict[str, Any]:
-    """What the drive is made from, of a file its name and checksum; usual traffic goes without saying."""
+    """What the drive is made from, of a file its name and checksum; usual traffic, a level and clean LiDAR that turns
+    and a dry lens go without saying."""
     recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump(mode="json")}
-    for name in ("pattern", "roll", "pitch", "real"):  # and so does a level, clean sensor that turns
-        if recipe["lidar"][name] == LidarConfig().model_dump(mode="json")[name]:
-            del recipe["lidar"][name]
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
         recipe["road"] = f"{path.name} sha256:{file_digest(path)}"
-    for name in ("wet", "lens"):  # and a dry one
-        if recipe["camera"][name] == 0:
-            del recipe["camera"][name]
-    if drive.traffic == 1:
-        del recipe["traffic"]
-    for name in ("imu", "gnss"):
-        if recipe[name] is None:
-            del recipe[name]
+    usual = DriveConfig().model_dump(mode="json")
+    for part, default in ((recipe, usual), (recipe["lidar"], usual["lidar"]), (recipe["camera"], usual["camera"])):
+        for name in _UNSAID & part.keys():
+            if part[name] == default[name]:
+                del part[name]
     return recipe
 
 
