@@ -12,7 +12,7 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.relocalise_visits import kept, measured, relocalizer_in, row_of, success_rates
-from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
+from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.network.model import DeepPointMap2
@@ -92,7 +92,6 @@ def _relocalised(
     rows = []
     for place in visited:
         visit, started = keyframe(place.frame), perf_counter()
-        picture = usable_image(visit.thumbnail)
-        found = relocalizer.find(visit.cloud, descriptors=visit.descriptors, picture=picture)
+        found = relocalizer.find(visit)
         rows.append(row_of(found, place.T_map_lidar, perf_counter() - started))
     return success_rates(rows)

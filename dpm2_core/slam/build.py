@@ -148,7 +148,7 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
         known = KnownMap(data.keyframes, data.clouds, data.poses, data.thumbnail)
         return Relocalizer(s.relocalise, s.visual, verifiers, network, known)
 
-    relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).describe)
+    relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).descriptors)
     return Localizer(relocalizer, s.relocalise.max_failures)
 
 

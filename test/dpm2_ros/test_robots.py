@@ -23,7 +23,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe
-from dpm2_core.frame import Array
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
@@ -231,12 +231,10 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
     """Descriptors come out as they went in; a cloud too large is downsampled until it fits, a small one is not
     touched."""
     from dpm2_core.network.pretrained import load_network
-    from dpm2_core.slam.loops.place_recognition import PlaceRecognition
     from dpm2_core.slam.store.cloud_codec import unpack_cloud
 
     points = next(iter(open_source(recording, InputSettings(images=False)).frames(0, 1))).points
-    descriptors = PlaceRecognition(load_network("small", 1)).describe(points)
-    assert descriptors is not None
+    descriptors = load_network("small", 1).describe(Frame(0, points))
     tilted = replace(descriptors, up=np.array([0.6, 0, 0.8], np.float32))  # no base says what level is: not sent
     assert descriptors_from_msg(descriptors_to_msg(tilted, 5, "red/kf_1.00000000")) == (None, "")
     room = replace(descriptors, scale=5.0)

@@ -89,7 +89,7 @@ class LoopCloser:
         if keyframe.descriptors is not None or self._places is None:
             return keyframe
         try:
-            return replace(keyframe, descriptors=self._places.describe(keyframe.cloud, keyframe.up))
+            return replace(keyframe, descriptors=self._places.descriptors(keyframe))
         except Dpm2Error:  # too few points: no loop begins there, and none ends there
             return keyframe
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe, Registration, State
-from dpm2_core.frame import Array, Image
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
@@ -101,29 +100,28 @@ class Localizer:
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
         self._T_last = keyframe.T_odom_kf
-        picture = usable_image(keyframe.thumbnail)
         try:
             if self._state.located:
-                return self._track(keyframe, picture)
-            return self._find(keyframe, picture, nowhere("lost"))
+                return self._track(keyframe)
+            return self._find(keyframe, nowhere("lost"))
         except Dpm2Error as error:
             self._failures += 1
             self._doubt()
             T_predicted, why = self.T_map_odom @ keyframe.T_odom_kf, nowhere(str(error))
             return LocalizationResult(T_predicted, LOST, self.state, why, unreadable=True)
 
-    def _track(self, keyframe: Keyframe, picture: Image | None) -> LocalizationResult:
+    def _track(self, keyframe: Keyframe) -> LocalizationResult:
         """Where the odometry says, if the points agree; else look everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
-        result = self._relocalizer.verify(keyframe.cloud, T_predicted, picture)
+        result = self._relocalizer.verify(keyframe, T_predicted)
         if result.ok:
             return self._located(keyframe, result, State.TRACKING)
         self._failures += 1
-        return self._find(keyframe, picture, result)
+        return self._find(keyframe, result)
 
-    def _find(self, keyframe: Keyframe, picture: Image | None, rejected: Registration) -> LocalizationResult:
+    def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
         """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
-        result = self._relocalizer.find(keyframe.cloud, self._hint, keyframe.descriptors, picture, keyframe.up)
+        result = self._relocalizer.find(keyframe, self._hint)
         self._hint = None
         tracking = self._state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf

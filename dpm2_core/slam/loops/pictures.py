@@ -14,7 +14,7 @@ import numpy as np
 
 from dpm2_core.data.thumbnail import usable_image
 from dpm2_core.estimates import Keyframe, Registration
-from dpm2_core.frame import Array, Image, Points
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.verification import Along, Verifier, second_best
 from dpm2_core.slam.registration.texture import (
@@ -77,9 +77,10 @@ class PicturedPlaces:
         self._known, self._poses = known, known.poses
         self._references: dict[int, Reference | None] = {}
 
-    def texture(self, picture: Image | None) -> Texture | None:
-        """Of a picture that is looked for; None without one, and if none are to be used."""
-        return textured(picture) if picture is not None and self._settings.enabled else None
+    def texture(self, keyframe: Keyframe) -> Texture | None:
+        """Of the picture of a keyframe that is looked for; None without one, and if none are to be used."""
+        picture = usable_image(keyframe.thumbnail) if self._settings.enabled else None
+        return None if picture is None else textured(picture)
 
     def along(self, picture: Texture, reach: float, nodes: Sequence[int]) -> Along:
         """How far along a place is, at most `reach` m from where it is thought to be, by the nearest of `nodes`.

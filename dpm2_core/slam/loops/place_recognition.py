@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors, merge
 from dpm2_core.estimates import Keyframe, Registration
-from dpm2_core.frame import Array, Frame, Points, Up
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.retrieval import PlaceIndex, pooled
 
@@ -39,15 +39,15 @@ class PlaceRecognition:
         """Width of the features that it makes."""
         return self._network.settings.channels
 
-    def describe(self, points: Points, up: Up | None = None) -> Descriptors:
-        """Descriptors of a cloud (M, 4), `up` in it as in `Frame`.
+    def descriptors(self, keyframe: Keyframe) -> Descriptors:
+        """Those of a keyframe; of its cloud, if its registration made none.
 
-        A keyframe's cloud, downsampled as it is, gives descriptors that serve as well as those of the whole scan.
+        The cloud, downsampled as it is, gives descriptors that serve as well as those of the whole scan.
 
         Raises:
             Dpm2Error: it has none.
         """
-        return self._network.describe(Frame(0, points, up=up))
+        return keyframe.descriptors or self._network.describe(Frame(0, keyframe.cloud, up=keyframe.up))
 
     def update(self, keyframes: Sequence[Keyframe]) -> None:
         """Take in those that are new."""

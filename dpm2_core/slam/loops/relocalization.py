@@ -20,8 +20,8 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Image, Points, Up
+from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
@@ -60,17 +60,10 @@ class RelocalizationSettings(Settings):
 class FindsPlaces(Protocol):
     """What a `Localizer` asks: see `Relocalizer`."""
 
-    def find(
-        self,
-        cloud: Points,
-        hint: Array | None = None,
-        descriptors: Descriptors | None = None,
-        picture: Image | None = None,
-        up: Up | None = None,
-    ) -> Registration:
-        """T_map_lidar of a cloud (M, 4), or why it is not known."""
+    def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
+        """T_map_lidar of a keyframe, which has its cloud, or why it is not known."""
 
-    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+    def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """Verifies a pose in the map by the points."""
 
 
@@ -95,24 +88,17 @@ class Relocalizer:
     def __len__(self) -> int:
         return len(self._keyframes)
 
-    def find(
-        self,
-        cloud: Points,
-        hint: Array | None = None,
-        descriptors: Descriptors | None = None,
-        picture: Image | None = None,
-        up: Up | None = None,
-    ) -> Registration:
-        """T_map_lidar of a cloud (M, 4), or why it is not known.
+    def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
+        """T_map_lidar of a keyframe, which has its cloud, or why it is not known.
+
+        Its thumbnail is asked where the points do not say how far along a road it was.
 
         Args:
             hint: T_map_lidar (4, 4) to look around; its heading does not matter.
-            descriptors: of the cloud, if they are known already.
-            picture: taken with the cloud, for where the points do not say how far along a road it was.
-            up: in the cloud, see `Frame`.
         """
+        cloud = keyframe.cloud
         try:
-            descriptors = descriptors or self._places.describe(cloud, up)
+            descriptors = self._places.descriptors(keyframe)
         except Dpm2Error as error:
             return nowhere(str(error))
         allowed = np.ones(len(self), bool)
@@ -120,7 +106,7 @@ class Relocalizer:
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= self._settings.hint_radius
         places = self._by_points(cloud, descriptors, allowed)
         found = _unique(places) if places else nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
-        texture = self._pictures.texture(picture)
+        texture = self._pictures.texture(keyframe)
         if found.ok or texture is None:
             return found
         nodes = self._places.similar(descriptors, allowed, self._settings.pictured)
@@ -132,15 +118,12 @@ class Relocalizer:
             return nowhere(f"{found.reason}; {place.reason}")
         return self._verified(cloud, place.T_target_source, partial(self._pictures.along, texture, _REACH))
 
-    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
-        """Verifies a pose in the map by the points: T_map_lidar, `ok` or not.
-
-        Args:
-            picture: taken with the cloud, for where the points leave a direction open.
-        """
-        texture = self._pictures.texture(picture)
+    def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
+        """Verifies a pose in the map by the points, and the thumbnail where they leave a direction open: T_map_lidar,
+        `ok` or not."""
+        texture = self._pictures.texture(keyframe)
         along = None if texture is None else partial(self._pictures.along, texture, BETWEEN)
-        return self._verified(cloud, T_map_lidar, along)
+        return self._verified(keyframe.cloud, T_map_lidar, along)
 
     def _verified(
         self, cloud: Points, T_map_lidar: Array, along: Callable[[Sequence[int]], Along] | None = None

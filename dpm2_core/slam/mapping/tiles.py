@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
@@ -17,9 +18,9 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.files import new_folder, write_json
-from dpm2_core.frame import Array, Image, Points, Up
+from dpm2_core.frame import Array
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps
@@ -194,28 +195,21 @@ class TiledRelocalizer:
         settings: RelocalizationSettings,
         tiles: TiledMap,
         make: Callable[[MapData], Relocalizer],
-        describe: Callable[[Points, Up | None], Descriptors],
+        describe: Callable[[Keyframe], Descriptors],
     ) -> None:
-        """`make`: for a map that is in memory. `describe`: see `PlaceRecognition`."""
+        """`make`: for a map that is in memory. `describe`: see `PlaceRecognition.descriptors`."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
         self._problem = ""  # why a square is not in it
 
-    def find(
-        self,
-        cloud: Points,
-        hint: Array | None = None,
-        descriptors: Descriptors | None = None,
-        picture: Image | None = None,
-        up: Up | None = None,
-    ) -> Registration:
+    def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
         """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
 
         Raises:
             Dpm2Error: it is found nowhere, and a square is missing or damaged.
         """
         try:
-            descriptors = descriptors or self._describe(cloud, up)
+            keyframe = replace(keyframe, descriptors=(descriptors := self._describe(keyframe)))
         except Dpm2Error as error:
             return nowhere(str(error))
         if hint is None:
@@ -223,9 +217,9 @@ class TiledRelocalizer:
         else:
             tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
         self._go_to(tiles)
-        return self._known(lambda here: here.find(cloud, hint, descriptors, picture))
+        return self._known(lambda here: here.find(keyframe, hint))
 
-    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+    def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """As `Relocalizer.verify`.
 
         Raises:
@@ -234,7 +228,7 @@ class TiledRelocalizer:
         xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
             self._go_to(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
-        return self._known(lambda here: here.verify(cloud, T_map_lidar, picture))
+        return self._known(lambda here: here.verify(keyframe, T_map_lidar))
 
     def _go_to(self, tiles: Collection[Tile]) -> None:
         self._here, self._problem = None, ""

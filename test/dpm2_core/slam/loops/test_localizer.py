@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe, Registration, State
-from dpm2_core.frame import Array, Frame, Image, Points, Up
+from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.loops.localizer import Localizer
@@ -28,18 +27,11 @@ class Places:
         """`found`: meters along x, NaN where nothing is found."""
         self._found, self._confirms = list(found), confirms
 
-    def find(
-        self,
-        cloud: Points,
-        hint: Array | None = None,
-        descriptors: Descriptors | None = None,
-        picture: Image | None = None,
-        up: Up | None = None,
-    ) -> Registration:
+    def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
         x = self._found.pop(0)
         return nowhere("nothing fits") if np.isnan(x) else Registration(at(x), FIRM, 0.95, 0.05, "relocalisation")
 
-    def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+    def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         return (
             Registration(T_map_lidar, FIRM, 0.95, 0.05, "relocalisation") if self._confirms else nowhere("nothing fits")
         )
@@ -57,10 +49,10 @@ def test_where_the_map_cannot_be_read_nothing_is_found_and_the_drive_goes_on() -
     """As with a tile that is missing: the run ended there, without what it had found until then."""
 
     class Torn(Places):
-        def verify(self, cloud: Points, T_map_lidar: Array, picture: Image | None = None) -> Registration:
+        def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
             if self._found:
                 raise Dpm2Error("tile 1_0: no such map file")
-            return super().verify(cloud, T_map_lidar, picture)
+            return super().verify(keyframe, T_map_lidar)
 
     places = Torn(0.0, 0.0, confirms=True)
     localizer = Localizer(places)
@@ -68,7 +60,7 @@ def test_where_the_map_cannot_be_read_nothing_is_found_and_the_drive_goes_on() -
     result = localizer.add(halt(1))
     assert (result.unreadable, result.registration.ok, result.state) == (True, False, State.DEGRADED)
     assert result.registration.reason == "tile 1_0: no such map file"
-    places.find(halt(1).cloud)  # from here on it can be read
+    places.find(halt(1))  # from here on it can be read
     result = localizer.add(halt(2))
     assert (result.unreadable, result.state) == (False, State.TRACKING)
 

@@ -10,9 +10,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail, usable_image
+from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.estimates import Keyframe
-from dpm2_core.frame import Array, Image
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
@@ -42,11 +42,9 @@ def keyframe(x: float, paint: Paint, index: int, pictured: bool = True) -> Keyfr
 def with_picture(x: float, paint: Paint, index: int) -> Keyframe:
     """Not to be written to: the tests have maps of the same keyframes."""
     seen = frame(x, paint, index, gain=0.8)
-    describe = PlaceRecognition(load_network("small", 1)).describe
-    return Keyframe(
-        index, index * 10**9, index, place(x), seen.points, None, "", describe(seen.points),
-        thumbnail(seen.images[0], PLACE_WIDTH),
-    )  # fmt: skip
+    picture = thumbnail(seen.images[0], PLACE_WIDTH)
+    whole = Keyframe(index, index * 10**9, index, place(x), seen.points, thumbnail=picture)
+    return replace(whole, descriptors=PlaceRecognition(load_network("small", 1)).descriptors(whole))
 
 
 def place(x: float) -> Array:
@@ -71,23 +69,19 @@ def relocalizer(paint: Paint, pictured: bool = True, visual: VisualSettings | No
     return searching(known, visual or VisualSettings())
 
 
-def picture_of(keyframe: Keyframe) -> Image | None:
-    return usable_image(keyframe.thumbnail)
-
-
 @pytest.mark.slow
 def test_a_place_in_a_corridor_is_found_by_its_picture_alone() -> None:
     """To 5 cm, two steps of the fine search at half the resolution; without the picture or the map's, not at all."""
     visit = keyframe(18.3, PAINT, 77)
-    found = relocalizer(PAINT).find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    found = relocalizer(PAINT).find(visit)
     assert found.ok, found.reason
     assert found.T_target_source[0, 3] == pytest.approx(18.3, abs=0.05)
     np.testing.assert_allclose(found.T_target_source[1:3, 3], 0, atol=0.03)
     assert found.worst_sigma < 0.1
-    blind = relocalizer(PAINT).find(visit.cloud, None, visit.descriptors)
+    blind = relocalizer(PAINT).find(replace(visit, thumbnail=None))
     assert not blind.ok
     for without in (relocalizer(PAINT, pictured=False), relocalizer(PAINT, visual=VisualSettings(enabled=False))):
-        assert not without.find(visit.cloud, None, visit.descriptors, picture_of(visit)).ok
+        assert not without.find(visit).ok
 
 
 @pytest.mark.slow
@@ -101,7 +95,7 @@ def test_a_place_in_a_corridor_is_found_by_its_picture_alone() -> None:
 )
 def test_a_picture_that_fits_nowhere_or_everywhere_is_no_place(paint: Paint, seen: Paint, why: str) -> None:
     visit = keyframe(18.3, seen, 77)
-    found = relocalizer(paint).find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    found = relocalizer(paint).find(visit)
     assert not found.ok
     assert re.search(why, found.reason), found.reason
 
@@ -130,6 +124,6 @@ def test_a_damaged_picture_in_a_map_is_no_picture() -> None:
     assert jpeg is not None
     keyframes[4] = replace(keyframes[4], thumbnail=jpeg[:1000])
     known = in_map(keyframes)
-    found = searching(known, VisualSettings()).find(visit.cloud, None, visit.descriptors, picture_of(visit))
+    found = searching(known, VisualSettings()).find(visit)
     assert found.ok, found.reason
     assert found.T_target_source[0, 3] == pytest.approx(18.3, abs=0.1)

@@ -58,7 +58,7 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
     network, described = load_network("small", 1), dict[int, Descriptors | None]()
     for cloud in looks or clouds:  # some look alike
         if id(cloud) not in described:
-            described[id(cloud)] = PlaceRecognition(network).describe(cloud)
+            described[id(cloud)] = PlaceRecognition(network).descriptors(lone(cloud))
     keyframes = [
         Keyframe(i, i, i, poses[i], cloud[:0], None, "", described[id(cloud)])
         for i, cloud in enumerate(looks or clouds)
@@ -66,6 +66,11 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
     s = SlamSettings()
     verifiers = ByScale(*(make_verifier(one) for one in (s, s.indoors())))
     return Relocalizer(s.relocalise, s.visual, verifiers, network, KnownMap(keyframes, clouds, poses))
+
+
+def lone(cloud: Points) -> Keyframe:
+    """One that has nothing but its cloud."""
+    return Keyframe(0, 0, 0, np.eye(4), cloud)
 
 
 def off(found: Registration, truth: Array) -> tuple[float, float]:
@@ -84,7 +89,7 @@ def test_found_from_one_cloud_with_other_traffic(
 ) -> None:
     cloud, truth = seen(s, lateral, heading, time=7.0), world().pose_at(s, lateral, heading)
     T_level_lidar = se3.make(np.diag([1.0, up, up]), np.zeros(3))
-    result = relocalizer.find(se3.transform(T_level_lidar, cloud).astype(np.float32), up=(0.0, 0.0, up))
+    result = relocalizer.find(replace(lone(se3.transform(T_level_lidar, cloud).astype(np.float32)), up=(0.0, 0.0, up)))
     assert result.ok, result.reason
     meters, degrees = off(result, truth @ T_level_lidar)
     assert meters < 0.1
@@ -95,10 +100,10 @@ def test_found_from_one_cloud_with_other_traffic(
 def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer: Relocalizer) -> None:
     elsewhere = world("city", 5)
     for s in (60.0, 80.0):
-        assert not relocalizer.find(seen(s, of=elsewhere)).ok
-    cloud = seen(63.0)
-    assert relocalizer.find(cloud, hint=world().pose_at(70.0)).ok
-    assert not relocalizer.find(cloud, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
+        assert not relocalizer.find(lone(seen(s, of=elsewhere))).ok
+    visit = lone(seen(63.0))
+    assert relocalizer.find(visit, hint=world().pose_at(70.0)).ok
+    assert not relocalizer.find(visit, hint=world().pose_at(70.0) @ se3.make(np.eye(3), np.array([500.0, 0, 0]))).ok
 
 
 @pytest.mark.slow
@@ -111,7 +116,7 @@ def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(
     at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array(away))
     poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
     partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 2 * kept - 1] for cloud in clouds]
-    result = made(clouds + partly, np.concatenate([poses, far @ poses])).find(seen(63.0, 0.5, time=7.0))
+    result = made(clouds + partly, np.concatenate([poses, far @ poses])).find(lone(seen(63.0, 0.5, time=7.0)))
     assert result.ok == found, result.reason
     if found:
         assert off(result, world().pose_at(63.0, 0.5))[0] < 0.1
@@ -125,7 +130,7 @@ def test_no_place_is_found_where_another_storey_would_be_believed_alone() -> Non
     at, up = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 0, 3.0]))
     poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
     partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 0.6] for cloud in clouds]
-    result = made(clouds + partly, np.concatenate([poses, up @ poses])).find(clouds[2])
+    result = made(clouds + partly, np.concatenate([poses, up @ poses])).find(lone(clouds[2]))
     assert not result.ok
     assert re.match(r"9\d% of the points fit on another storey, too", result.reason)
 
@@ -149,7 +154,7 @@ def test_a_place_that_looks_less_alike_is_compared_too() -> None:
     relocalizer = made(
         [c for cloud in clouds for c in (cloud, nothing)], between, [c for cloud in looks for c in (cloud, nothing)]
     )
-    found = relocalizer.find(seen(63.0, 0.5, time=7.0))
+    found = relocalizer.find(lone(seen(63.0, 0.5, time=7.0)))
     assert re.match(r"two places of the map fit alike: \d+% and \d+%", found.reason)
 
 
@@ -160,7 +165,7 @@ def test_in_a_room_that_looks_the_same_from_its_other_end_both_ways_are_compared
     at = np.array([standing(*place) for place in ROUND])
     relocalizer = made([scan(T, HALL, things, i) for i, T in enumerate(at)], at)
     for seed, place in enumerate([(0.4, 0.5, 330.0), (-1.2, 0.7, 160.0), (1.7, 0.4, 20.0)]):
-        found = relocalizer.find(scan(standing(*place), HALL, things, 100 + seed))
+        found = relocalizer.find(lone(scan(standing(*place), HALL, things, 100 + seed)))
         if len(things) == len(BOTH_ENDS):
             assert re.match(r"two places of the map fit alike: \d+% and \d+%", found.reason)
         else:
@@ -170,7 +175,7 @@ def test_in_a_room_that_looks_the_same_from_its_other_end_both_ways_are_compared
 
 @pytest.mark.slow
 def test_an_empty_cloud_is_no_place(relocalizer: Relocalizer) -> None:
-    result = relocalizer.find(np.zeros((0, 4), np.float32))
+    result = relocalizer.find(lone(np.zeros((0, 4), np.float32)))
     assert not result.ok
     assert re.search(r"has \d+ points within", result.reason)
 

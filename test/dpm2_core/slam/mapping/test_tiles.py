@@ -135,18 +135,18 @@ def test_what_can_be_read_is_searched_without_what_cannot(folder: Path, data: Ma
 
         verify = find
 
-    cloud, counts, like = np.zeros((0, 4), np.float32), list[int](), data.keyframes[0].descriptors
+    keyframe, counts = data.keyframes[0], list[int]()
     (folder / "0_0.dpm2map").unlink()
     with TiledMap(folder) as tiles:
         settings = RelocalizationSettings(candidates=60)
-        places = TiledRelocalizer(settings, tiles, Here, lambda *_: like)  # type: ignore[arg-type,return-value]
+        places = TiledRelocalizer(settings, tiles, Here, lambda _: keyframe.descriptors)  # type: ignore[arg-type,return-value]
         for found in (True, False):
-            for ask in (places.find, lambda cloud: places.verify(cloud, np.eye(4))):
+            for ask in (places.find, lambda keyframe: places.verify(keyframe, np.eye(4))):
                 if found:
-                    assert ask(cloud).ok
+                    assert ask(keyframe).ok
                 else:
                     with pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such map file"):
-                        ask(cloud)
+                        ask(keyframe)
     assert counts == [44] * 4  # of 59, 15 of them in the tile that is missing
 
 
