@@ -45,8 +45,8 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
     problems = []
     if mapper.waiting > BEHIND:
         problems.append(f"{mapper.waiting} keyframes wait: the map, its loops and map -> odom are behind")
-    if mapper.file_problem:
-        problems.append(f"no map file, the map is only in memory: {mapper.file_problem}")
+    if problem := mapper.active.file_problem:
+        problems.append(f"no map file, the map is only in memory: {problem}")
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
     if graph_problem := mapper.slam.mapper.graph_problem:

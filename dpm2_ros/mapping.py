@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -20,7 +20,6 @@ from visualization_msgs.msg import MarkerArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Array
-from dpm2_core.slam.loops.localizer import LocalizationResult
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.mapping.occupancy import why_of_no_use
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
@@ -46,17 +45,23 @@ class MapperThread:
     """Works on the map so that a loop search or an optimization never delays the odometry.
 
     Every method may be called from any thread, and returns at once.
+
+    Attributes:
+        active: what it works on; other threads may read there.
+        written: so many keyframes, of all that were ever added, are in the map file (without one: in the map) or
+            rejected, but for those that are missing.
+        missing: keyframes that were not unsound, but could not be taken in, by number: why, in words.
     """
 
     def __init__(self, node: GuardedNode, config: NodeConfig, robot: str) -> None:
         self._node, self._config, self._robot = node, config, robot
-        self._active = ActiveMap(config, robot, node.get_logger())
+        self.active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)
         self._stamp = 0  # of the last keyframe, ns
         self._restarted: dict[str, Future[None]] = {}  # by robot: since when its odometry's start is known here
         self._lock = threading.Lock()
-        self._added = self._taken = self._written = 0  # keyframes
-        self._missing: dict[int, str] = {}
+        self._added = self._taken = self.written = 0  # keyframes
+        self.missing: dict[int, str] = {}
         self._changes = self.keyframes
         ros = config.ros
         self._tf = TransformBroadcaster(
@@ -81,17 +86,17 @@ class MapperThread:
     @property
     def slam(self) -> Slam:
         """What works on the map; its odometry is for another thread."""
-        return self._active.slam
+        return self.active.slam
 
     @property
     def keyframes(self) -> int:
         """How many there are."""
-        return len(self._active.mapper.keyframes)
+        return len(self.active.mapper.keyframes)
 
     @property
     def loops(self) -> tuple[int, int]:
         """Loops accepted, and loops tried."""
-        loops = list(self._active.mapper.loops)
+        loops = list(self.active.mapper.loops)
         return sum(loop.ok for loop in loops), len(loops)
 
     @property
@@ -100,35 +105,9 @@ class MapperThread:
         return self._added - self._taken
 
     @property
-    def written(self) -> int:
-        """So many keyframes, of all that were ever added, are in the map file (without one: in the map) or rejected,
-        but for those that are missing."""
-        return self._written
-
-    @property
-    def missing(self) -> Mapping[int, str]:
-        """Keyframes that were not unsound, but could not be taken in, by number: why, in words."""
-        return self._missing
-
-    @property
     def store_problem(self) -> str:
         """Why the map file is behind, in words; empty when it is not, or when there is none."""
-        return self._active.mapper.store_problem
-
-    @property
-    def file_problem(self) -> str:
-        """Why there is no map file although there is to be one, in words; else empty."""
-        return self._active.file_problem
-
-    @property
-    def localizing(self) -> bool:
-        """Whether the map stays as it is."""
-        return self._active.localizer is not None
-
-    @property
-    def located(self) -> LocalizationResult | None:
-        """What became of the last keyframe in a map that stays as it is."""
-        return self._active.located
+        return self.active.mapper.store_problem
 
     def broadcast(self, stamp: int, robot: str, odom_frame: str, T_own_odom: Array | None = None) -> None:
         """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known.
@@ -137,7 +116,7 @@ class MapperThread:
             T_own_odom: (4, 4) frame `odom_frame` in that of the robot's keyframes; None: it is the same.
         """
         restarted = self._restarted.get(robot)
-        T_map_odom = self._active.T_map_odom(robot) if restarted is None or restarted.done() else None
+        T_map_odom = self.active.T_map_odom(robot) if restarted is None or restarted.done() else None
         if T_map_odom is not None:
             T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
             self._tf.send(T, stamp + self._config.ros.ahead, odom_frame)
@@ -151,7 +130,7 @@ class MapperThread:
 
     def hint(self, T_map_base: Array) -> str:
         """Prior for the robot's pose (4, 4), for example from RViz; returns why it cannot be used, or an empty text."""
-        localizer = self._active.localizer
+        localizer = self.active.localizer
         if localizer is None:
             return "a map is being made: a pose is of use only with localization_mode"
         self._submit(lambda: localizer.hint(T_map_base))
@@ -159,17 +138,17 @@ class MapperThread:
 
     def localise(self) -> Future[str]:
         """End the map that is being made, if one is, and look for the robot in the map file; returns a message."""
-        return self._thread.submit(self._change, self._active.localise)
+        return self._thread.submit(self._change, self.active.localise)
 
     def load(self) -> Future[str]:
         """Look for the robot in the map that `ros.map_name` names, or in the same one again; returns a message."""
-        if not (name := self._config.ros.map_name) and not self.localizing:
+        if not (name := self._config.ros.map_name) and self.active.localizer is None:
             raise UsageError("no map is loaded: ros.map_name is empty, and localization_mode is off")
-        return self._thread.submit(self._change, lambda: self._active.localise(name))
+        return self._thread.submit(self._change, lambda: self.active.localise(name))
 
     def extend(self) -> Future[str]:
         """Let the map grow from now on: that in which the robot was looked for, by a new session."""
-        return self._thread.submit(self._change, self._active.extend)
+        return self._thread.submit(self._change, self.active.extend)
 
     def apply(self, config: NodeConfig) -> None:
         """What is shown, and the map's name, by settings that have changed while the node runs."""
@@ -178,11 +157,11 @@ class MapperThread:
 
     def restart(self, robot: str) -> None:
         """A robot's odometry has started again: the map stays, the robot's place in it is no longer known."""
-        self._restarted[robot] = self._submit(lambda: self._active.restart(robot))
+        self._restarted[robot] = self._submit(lambda: self.active.restart(robot))
 
     async def before_reset(self, response: Trigger.Response, begins: str) -> None:
         """Save the map, and answer the service that asks for a reset: with what begins, or why there is no reset."""
-        await respond(self._node, self._thread.submit(self._active.keep), response)
+        await respond(self._node, self._thread.submit(self.active.keep), response)
         if response.success:
             response.message = "; ".join(filter(None, (response.message, begins)))
         else:
@@ -190,7 +169,7 @@ class MapperThread:
 
     def reset(self) -> None:
         """The odometry starts again, and with it an empty map."""
-        self._restarted[self._robot] = self._submit(lambda: self._change(self._active.reset))
+        self._restarted[self._robot] = self._submit(lambda: self._change(self.active.reset))
 
     def close(self) -> None:
         """Finish what is waiting, save the map, end the thread.
@@ -202,9 +181,9 @@ class MapperThread:
             self._node.get_logger().warning(
                 f"{self.waiting} keyframes are still to be taken into the map: this takes a while"
             )
-        self._submit(self._active.finish)
-        saved = self._thread.submit(self._active.save) if self._active.saves else None
-        self._submit(self._active.close)
+        self._submit(self.active.finish)
+        saved = self._thread.submit(self.active.save) if self.active.saves else None
+        self._submit(self.active.close)
         self._thread.shutdown(wait=True)
         if saved is not None:
             try:
@@ -245,19 +224,19 @@ class MapperThread:
         except RejectedError:
             raise
         except Exception as error:
-            if self.keyframes == before and not self.localizing:
-                self._missing[number] = str(error) or type(error).__name__
+            if self.keyframes == before and self.active.localizer is None:
+                self.missing[number] = str(error) or type(error).__name__
             raise
         finally:
             self._taken += 1
             if not self.store_problem:
-                self._written = self._taken
+                self.written = self._taken
             elif not behind:
                 self._node.get_logger().error(f"map file incomplete: {self.store_problem}")
 
     def _add(self, keyframe: Keyframe) -> None:
-        loops = self._active.add(keyframe)
-        if self.localizing:
+        loops = self.active.add(keyframe)
+        if self.active.localizer is not None:
             return
         self._stamp = keyframe.stamp
         for loop in loops:
@@ -265,14 +244,14 @@ class MapperThread:
         self._changes += 1
 
     def _publish_loop(self, loop: Edge, stamp: int) -> None:
-        ends = [self._active.mapper.keyframes[node] for node in (loop.from_node, loop.to_node)]
+        ends = [self.active.mapper.keyframes[node] for node in (loop.from_node, loop.to_node)]
         names = [keyframe_name(keyframe.robot, keyframe.id) for keyframe in ends]
         self._loop_candidates.publish(loop_to_msg(loop, stamp, *names))
         if loop.ok:
             self._loop_closures.publish(edge_to_msg(loop.T_from_to, loop.covariance, stamp, *names))
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self._node, self._thread.submit(self._active.save, self._config.ros.map_name), response)
+        await respond(self._node, self._thread.submit(self.active.save, self._config.ros.map_name), response)
         return response
 
     def _show(self) -> None:
@@ -281,16 +260,16 @@ class MapperThread:
                 self._submit(display.publish)
 
     def _path(self) -> Any:
-        mapper = self._active.mapper
+        mapper = self.active.mapper
         placed = mapper.placed
         stamps = [keyframe.stamp for keyframe, known in zip(mapper.keyframes, placed, strict=True) if known]
         return path_to_msg(mapper.poses[placed], stamps, self._config.ros.map_frame)
 
     def _pose_graph(self) -> Any:
-        return pose_graph_to_msg(self._active.mapper, self._stamp, self._config.ros.map_frame)
+        return pose_graph_to_msg(self.active.mapper, self._stamp, self._config.ros.map_frame)
 
     def _grid(self) -> Any:
-        mapper, ros = self._active.mapper, self._config.ros
+        mapper, ros = self.active.mapper, self._config.ros
         of = (mapper, ros.grid, ros.grid_max_cells)
         if self._drawn is None or self._drawn[0] != of:
             self._drawn = of, OccupancyMap(ros.grid, ros.grid_max_cells)
@@ -304,7 +283,7 @@ class MapperThread:
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
     def _map(self) -> Any:
-        points = self._active.mapper.cloud()
+        points = self.active.mapper.cloud()
         most = self._config.ros.map_max_points
         if len(points) > most:
             points = points[np.linspace(0, len(points) - 1, most).astype(np.intp)]

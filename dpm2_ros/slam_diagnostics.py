@@ -80,7 +80,7 @@ class Diagnostics:
             if problem := self._sender.problem:
                 level, text = ERROR, f"{text}; {problem}"
             out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": arrived}))
-        elif self._mapper.localizing:
+        elif self._mapper.active.localizer is not None:
             out.append(self._localization(self._mapper))
         else:
             out.append(mapper_status(self._node, self._mapper))
@@ -186,7 +186,7 @@ class Diagnostics:
         return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
     def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
-        located, figures = mapper.located, {"keyframes of the map": str(mapper.keyframes)}
+        located, figures = mapper.active.located, {"keyframes of the map": str(mapper.keyframes)}
         if located is None:
             return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
         result, last, state = located.registration, self._health.last, located.state

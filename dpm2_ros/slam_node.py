@@ -275,7 +275,7 @@ class SlamNode(ManagedNode):
         self._odom.publish(odometry_to_msg(motion, covariance, seconds, ros.own_frame, self._base.name))
         if ros.invert_odom_tf or (self._other is None and not self._base.child_problem):
             self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
-        if not (tracked.state is State.LOST and self._mapper is not None and self._mapper.localizing):
+        if not (tracked.state is State.LOST and self._mapper is not None and self._mapper.active.localizer is not None):
             self._send_map(motion)  # where the map does not grow nobody is in it by an odometry that is lost
 
     def _send_map(self, motion: BodyMotion) -> None:
