@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -23,11 +22,9 @@ from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_file import remove_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import Session
 
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
-_NO_DESCRIPTORS = "no keyframe has descriptors (made with slam.loops.descriptors off?)"
 _COMPARED = 500  # points of a cloud
 _APART = 0.75
 """m, of three in four of them: its own frame is at 0.01, or as far as it was de-skewed; another one from 1.1 on."""
@@ -75,13 +72,7 @@ def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore 
         UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
     """
     path = Path(path)
-    if path.is_dir():
-        tiles = TiledMap(path)
-        if not tiles.described:
-            raise UsageError(f"{path}: {_NO_DESCRIPTORS}")
-        _check_same(path, tiles.weights, weights_id(settings.neural.weights))
-        return tiles
-    store = MapStore.open(path)
+    store = TiledMap(path) if path.is_dir() else MapStore.open(path)
     try:
         check_for_localization(store, settings)
     except BaseException:
@@ -90,27 +81,22 @@ def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore 
     return store
 
 
-def check_for_localization(store: MapStore, settings: SlamSettings) -> None:
-    """Whether one could find oneself in a map file, which may be one that still grows.
+def check_for_localization(store: MapStore | TiledMap, settings: SlamSettings) -> None:
+    """Whether one could find oneself in a map, which may be one that still grows.
 
     Raises:
         UsageError: it has no descriptors, or those of other weights. Dpm2Error: it cannot be read.
     """
     _check_weights(store, weights_id(settings.neural.weights))
-    if not any(store.payload(node, "descriptors") for node, *_ in store.rows("keyframes", "node")):
-        raise UsageError(f"{store.path}: {_NO_DESCRIPTORS}")
+    if not store.described:
+        raise UsageError(f"{store.path}: no keyframe has descriptors (made with slam.loops.descriptors off?)")
 
 
-def _check_weights(store: MapStore, weights: str) -> None:
+def _check_weights(store: MapStore | TiledMap, weights: str) -> None:
     """Descriptors of different weights have nothing in common; `weights` "": none are made."""
-    if weights:
-        _check_same(store.path, [Session(*row).weights for row in store.rows("sessions")], weights)
-
-
-def _check_same(path: Path, found: Iterable[str], weights: str) -> None:
-    for before in found:
+    for before in store.weights if weights else ():
         if before and before != weights:
-            raise UsageError(f"{path}: made with weights {before}, not with {weights}")
+            raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
 
 
 def resume_at(mapper: Mapper, source: Source, start: int) -> int:

@@ -119,7 +119,9 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         edges,
         trail,
         [made for _, made in _made(store, "sessions", session_of)],
-        CloudStore(store.cloud, [moving.get(node) for node in nodes], loans, str(store.path)),
+        CloudStore(
+            lambda node: store.payload(node, "cloud"), [moving.get(node) for node in nodes], loans, str(store.path)
+        ),
         lambda node: store.payload(node, "thumbnail"),
         lambda node: None if (packed := store.payload(node, "descriptors")) is None else unpack_descriptors(packed),
         next((made for _, made in _made(store, "georeference", georeference_of)), None),

@@ -194,9 +194,15 @@ class MapStore:
         at = schema.CONTENT["payloads"].index(what)
         return next((row[at] for row in self.rows("payloads", where=f"node = {node:d}")), None)
 
-    def cloud(self, node: int) -> bytes | None:
-        """The packed cloud of a node."""
-        return self.payload(node, "cloud")
+    @property
+    def weights(self) -> list[str]:
+        """With which its descriptors were made, session by session; empty where none were."""
+        return [weights for (weights,) in self.rows("sessions", "weights")]
+
+    @property
+    def described(self) -> bool:
+        """Whether any keyframe has descriptors."""
+        return any(self.payload(node, "descriptors") for (node,) in self.rows("keyframes", "node"))
 
     def close(self) -> None:
         """End it. The last one to write leaves a single file behind, without FILE-wal."""
