@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +24,7 @@ from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, ch
 from dpm2_core.slam.store.cloud_codec import CodecError, origin_of, unpack_cloud
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframe_messages import BUDGET, WIRE, descriptors_from_msg, payload_from_msg, received_to_msg
+from dpm2_ros.keyframe_messages import BUDGET, WIRE, Payload, descriptors_from_msg, payload_from_msg, received_to_msg
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.streams import Parts, Stream
 
@@ -140,37 +139,35 @@ class Feed:
         return any(s.robot is None and s.live and drive.heard < s.since <= s.heard for s in self._streams.values())
 
     def _on_pose(self, message: Odometry) -> None:
-        stream, id = self._hear(message.child_frame_id)
-        if stream.wants(id, "pose"):
-            with _noted(stream, id):
-                check_frame(message.header.frame_id)
-                keyframe_from(message, "", id, None)
-            self._put(stream, id, "pose", message)
+        self._take_part("pose", message.child_frame_id, lambda id: _checked_pose(message, id))
 
     def _on_cloud(self, message: UInt8MultiArray) -> None:
         if not message.layout.dim:
             raise RejectedError("name", "a cloud without the name of its keyframe")
-        stream, id = self._hear(message.layout.dim[0].label)
-        if stream.wants(id, "cloud"):
-            with _noted(stream, id):
-                _check_budget(message, id)
-                payload = payload_from_msg(message)
-                try:
-                    unpack_cloud(payload.cloud)
-                except CodecError as error:
-                    raise RejectedError("cloud", f"keyframe {id}: {error}") from None
-            self._put(stream, id, "cloud", payload)
+        self._take_part("cloud", message.layout.dim[0].label, lambda id: _checked_payload(message, id))
 
     def _on_seen(self, message: PointCloud2) -> None:
-        stream, id = self._hear(message.header.frame_id)
-        if stream.wants(id, "seen"):
-            with _noted(stream, id):
-                _check_budget(message, id)
-                descriptors, weights = descriptors_from_msg(message)
-            self._put(stream, id, "seen", True, self._usable(id, descriptors, weights))
+        self._take_part("seen", message.header.frame_id, lambda id: (self._usable(message, id),))
 
-    def _usable(self, id: int, descriptors: Descriptors | None, weights: str) -> Descriptors | None:
+    def _take_part(self, part: str, name: str, checked: Callable[[int], Any]) -> None:
+        """One of the messages of a keyframe, by its name; the stream takes note of one that is rejected."""
+        stream, id = self._hear(name)
+        if not stream.wants(id, part):
+            return
+        try:
+            value = checked(id)
+        except Exception:
+            stream.reject(id, time.monotonic())
+            raise
+        if stream.put(id, part, value):
+            self._hand_on(stream, time.monotonic())
+        if stream is not self._main and stream.holds:
+            self._bound()
+
+    def _usable(self, message: PointCloud2, id: int) -> Descriptors | None:
         """Descriptors that the mapper's network can compare; without, it makes its own of the keyframe's cloud."""
+        _check_budget(message, id)
+        descriptors, weights = descriptors_from_msg(message)
         channels = self._mapper.slam.mapper.channels
         if descriptors is None or channels is None:
             return None
@@ -200,12 +197,6 @@ class Feed:
             self._acks += 1
             self._acknowledge(stream, now)
         return stream, id
-
-    def _put(self, stream: Stream, id: int, part: str, value: Any, descriptors: Descriptors | None = None) -> None:
-        if stream.put(id, part, value, descriptors):
-            self._hand_on(stream, time.monotonic())
-        if stream is not self._main and stream.holds:
-            self._bound()
 
     def _bound(self) -> None:
         """Unknown drives may not fill the memory: those whose last message is oldest are dropped."""
@@ -247,10 +238,11 @@ class Feed:
 
     def _add(self, stream: Stream, id: int, parts: Parts) -> None:
         assert stream.robot is not None
-        keyframe = keyframe_from(parts.pose, stream.robot, id, stream.last, parts.descriptors)
+        assert parts.cloud is not None
+        assert parts.seen is not None
+        keyframe = keyframe_from(parts.pose, stream.robot, id, stream.last, *parts.seen)
         stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
         stream.taken += 1
-        assert parts.cloud is not None
         packed, fix, thumbnail = parts.cloud
         keyframe = replace(keyframe, origin=origin_of(packed), fix=fix, thumbnail=thumbnail)
         stream.given(id, self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed))))
@@ -262,14 +254,20 @@ class Feed:
             self._received.publish(received_to_msg(stream.session, *stream.arrived(written, missing)))
 
 
-@contextmanager
-def _noted(stream: Stream, id: int) -> Iterator[None]:
-    """The stream takes note of a part that is rejected within."""
+def _checked_pose(message: Odometry, id: int) -> Odometry:
+    check_frame(message.header.frame_id)
+    keyframe_from(message, "", id, None)
+    return message
+
+
+def _checked_payload(message: UInt8MultiArray, id: int) -> Payload:
+    _check_budget(message, id)
+    payload = payload_from_msg(message)
     try:
-        yield
-    except Exception:
-        stream.reject(id, time.monotonic())
-        raise
+        unpack_cloud(payload.cloud)
+    except CodecError as error:
+        raise RejectedError("cloud", f"keyframe {id}: {error}") from None
+    return payload
 
 
 def _check_budget(message: Any, id: int) -> None:

@@ -22,26 +22,23 @@ _TIMES = 3
 
 @dataclass(eq=False)
 class Parts:
-    """What has come of a keyframe, each part checked: its pose, its payload, its descriptors."""
+    """What has come of a keyframe, each part checked: its pose, its payload, and its descriptors, if it has some."""
 
     pose: Any = None
     cloud: Payload | None = None
-    seen: bool = False
-    descriptors: Descriptors | None = None
+    seen: tuple[Descriptors | None] | None = None
 
     @property
     def complete(self) -> bool:
         """Whether nothing is missing."""
-        return self.pose is not None and self.cloud is not None and self.seen
+        return self.pose is not None and self.cloud is not None and self.seen is not None
 
     @property
     def nbytes(self) -> int:
         """Roughly."""
-        return (
-            2000
-            + (0 if self.cloud is None else len(self.cloud.cloud) + len(self.cloud.thumbnail or b""))
-            + (0 if self.descriptors is None else self.descriptors.nbytes)
-        )
+        payload, (descriptors,) = self.cloud, self.seen or (None,)
+        size = 2000 if payload is None else 2000 + len(payload.cloud) + len(payload.thumbnail or b"")
+        return size if descriptors is None else size + descriptors.nbytes
 
 
 class Stream:
@@ -97,15 +94,12 @@ class Stream:
         """Whether a message would add anything: pose, cloud, or seen."""
         if self.session and (not self.next <= id < self.next + AHEAD or id in self._above):
             return False
-        parts = self._parts.get(id)
-        return parts is None or not getattr(parts, part)
+        return getattr(self._parts.get(id, Parts()), part) is None
 
-    def put(self, id: int, part: str, value: Any, descriptors: Descriptors | None = None) -> bool:
+    def put(self, id: int, part: str, value: Any) -> bool:
         """A part that is sound; whether its keyframe is complete now."""
         parts = self._parts.setdefault(id, Parts())
         setattr(parts, part, value)
-        if descriptors is not None:
-            parts.descriptors = descriptors
         if not parts.complete:
             while len(self._parts) > _HALVES:
                 self._parts.popitem(last=False)
