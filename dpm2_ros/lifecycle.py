@@ -115,16 +115,10 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         return self._return(1)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Inactive to unconfigured: the map is saved."""
+        """To unconfigured, also after a bug in a step, or to the end: the map is saved."""
         return self._return(0)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """From anywhere to the end."""
-        return self._return(0)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After a bug in a step: to unconfigured."""
-        return self._return(0)
+    on_shutdown = on_error = on_cleanup
 
     def _open_map(self, back: ExitStack) -> MapperThread:
         """The map of this node, until the cleanup."""

@@ -241,11 +241,8 @@ class Inputs:
     def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
         info = info_of(camera.topic, message)
-        try:
-            decode_camera(info, np.eye(4), "camera")
-        except UsageError:
-            if _usable(camera.info):
-                raise  # what is known stays
+        if _usable(camera.info):
+            decode_camera(info, np.eye(4), "camera")  # raises where what is known is to stay
         camera.info = info
 
     def _on_static(self, message: Any) -> None:
