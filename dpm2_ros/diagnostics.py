@@ -49,7 +49,7 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
         problems.append(f"no map file, the map is only in memory: {problem}")
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
-    if graph_problem := mapper.slam.mapper.graph_problem:
+    if graph_problem := mapper.slam.mapper.graph.problem:
         problems.append(f"poses not optimized: {graph_problem}")
     if missing := list(mapper.missing.values()):
         problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")

@@ -200,7 +200,7 @@ class Result:
             remove_results(out, CLOUD)
         else:
             write_ply(out / CLOUD, points)
-        self.mapper.write_g2o(out / GRAPH)
+        self.mapper.graph.write_g2o(out / GRAPH)
         keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)

@@ -125,4 +125,4 @@ def save_map(mapper: Mapper, directory: Path) -> None:
         ways.setdefault(mapper.keyframes[node].robot, []).append(node)
     nodes = [node for way in ways.values() for node in way]
     write_tum(directory / "trajectory.tum", [mapper.keyframes[node].stamp for node in nodes], mapper.poses[nodes])
-    mapper.write_g2o(directory / "pose_graph.g2o")
+    mapper.graph.write_g2o(directory / "pose_graph.g2o")

@@ -63,7 +63,7 @@ def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monke
         lidar.publish(drive.cloud(n))
         harness.wait(lambda before=before: len(odom) > before, f"the odometry of cloud {n}")
     mapper = node.slam.mapper
-    harness.wait(lambda: mapper.georeference is not None, "the map's place on Earth")
+    harness.wait(lambda: mapper.graph.georeference is not None, "the map's place on Earth")
     harness.status(": gnss", lambda s: s.message == "in use")
     receiver.publish(nav(drive.stamp(n) + 18 * 10**9, place))  # GPS has no leap seconds
     status = harness.status(": gnss", lambda s: s.message == "stamps of another clock, +18 s from the clouds'")
@@ -71,7 +71,7 @@ def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monke
     harness.status(": mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m a scan: every second one
     harness.wait(lambda: sum(node.rejections.values()) >= 3 * (drive.frames - 1), "the rejections")
     # map is the frame of the base's first pose, `base` over the ground
-    known, T_start_map = mapper.georeference, se3.inverse(T_BASE_LIDAR)
+    known, T_start_map = mapper.graph.georeference, se3.inverse(T_BASE_LIDAR)
     found = geodesy.enu_frame(known.origin) @ known.T_enu_map
     way = se3.inverse(found) @ T_ECEF_START @ T_start_map
     assert np.linalg.norm(way[:3, 3]) < 0.2

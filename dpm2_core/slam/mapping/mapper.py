@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
+from dpm2_core.frame import NO_POINTS, Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -23,7 +23,6 @@ from dpm2_core.slam.mapping.moving import MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
 from dpm2_core.slam.mapping.restore import restore_solved
-from dpm2_core.slam.mapping.session_start import SessionStart
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map, map_cloud
@@ -62,6 +61,14 @@ class _Robot:
     offset: int = 0
 
 
+class _Start(NamedTuple):
+    """Where a session in a loaded map begins, as `Mapper.start_session` is told it, which says what is what."""
+
+    T_map_odom: Array | None
+    covariance: Array
+    node: int | None
+
+
 class Mapper:
     """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
 
@@ -70,6 +77,8 @@ class Mapper:
 
     Attributes:
         keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
+        clouds: (M, 4) of each in its own frame, read from disk; without what moves.
+        graph: their poses, and what ties them.
         session_start: node of the first keyframe of this session: those before are of a map that was loaded.
         loops: tried in this session, accepted or rejected.
         thumbnail: JPEG of a node of a map that was loaded, or None.
@@ -80,15 +89,15 @@ class Mapper:
     ) -> None:
         """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
         self._settings = settings
-        self._graph = graph
+        self.graph = graph
         self._closer = loops
         self.keyframes: list[Keyframe] = []
         self.loops: list[Edge] = []
         self.thumbnail: Thumbnail = lambda node: None
-        self._clouds = CloudStore()
+        self.clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
-        self._start: SessionStart | None = None
+        self._start: _Start | None = None
         if store is not None:
             self._load(store)
         self.session_start = len(self.keyframes)
@@ -96,12 +105,12 @@ class Mapper:
     @property
     def poses(self) -> Array:
         """(N, 4, 4) optimized T_map_kf of all keyframes."""
-        return self._graph.poses
+        return self.graph.poses
 
     @property
     def edges(self) -> list[Edge]:
         """Odometry edges and accepted loops."""
-        return self._graph.edges
+        return self.graph.edges
 
     @property
     def T_map_odom(self) -> Array | None:
@@ -118,23 +127,18 @@ class Mapper:
         last = self._robots[robot].last if robot in self._robots else None
         if last is None or not self._is_placed(last):
             return None
-        return se3.orthonormalized(self._graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
+        return se3.orthonormalized(self.graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
 
     @property
     def placed(self) -> NDArray[np.bool_]:
         """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
-        parts = self._graph.parts
+        parts = self.graph.parts
         return np.asarray(parts == parts[:1])
 
     @property
     def robots(self) -> list[str]:
         """Names of those that have sent keyframes in this session."""
         return [name for name, robot in self._robots.items() if robot.last is not None]
-
-    @property
-    def clouds(self) -> CloudStore:
-        """(M, 4) of each keyframe in its own frame, read from disk; without what moves."""
-        return self._clouds
 
     @property
     def store_problem(self) -> str:
@@ -146,16 +150,6 @@ class Mapper:
         """Width of the features that its network makes; None without a network."""
         return self._closer.channels
 
-    @property
-    def graph_problem(self) -> str:
-        """Why the poses are not optimized, in words; empty since they were."""
-        return self._graph.problem
-
-    @property
-    def georeference(self) -> Georeference | None:
-        """Where on Earth the map is, by the fixes of its keyframes; None while that is not known."""
-        return self._graph.georeference
-
     def start_session(self, T_map_odom: Array | None, covariance: Array, node: int | None = None) -> None:
         """Before the first keyframe of a session in a loaded map: where its odometry begins. Else only a loop tells.
 
@@ -164,7 +158,7 @@ class Mapper:
             covariance: (6, 6) of the first keyframe's pose relative to that of `node`, to which an edge will tie it.
             node: of the map, from which the odometry goes on; None: the nearest whose place is known.
         """
-        self._start = SessionStart(T_map_odom, covariance, node)
+        self._start = _Start(T_map_odom, covariance, node)
 
     def forget_start(self) -> None:
         """The odometry that `start_session` has placed begins anew before its first keyframe: only a loop tells."""
@@ -191,12 +185,12 @@ class Mapper:
         keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None, origin=np.zeros(3))
         packed = pack_cloud(cloud, origin)
         to_before = self._add_node(keyframe, way, robot.last if follows else None)
-        self._clouds.append(packed)
+        self.clouds.append(packed)
         self.keyframes.append(keyframe)
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
         before = len(self.loops)
         try:
-            self._close_loops(keyframe.fix is not None and self._graph.add_fix(node, keyframe.fix))
+            self._close_loops(keyframe.fix is not None and self.graph.add_fix(node, keyframe.fix))
             self._lend(node, to_before, self.loops[before:])
             if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
                 self._mark_moving(robot.window.finish(self.poses))
@@ -210,45 +204,41 @@ class Mapper:
         """Give up the cloud of a keyframe that came back to an older one for that one's."""
         odometry = [edge for edge in to_before if edge.kind == "odometry"]
         again = odometry if node == self.session_start else []  # the frame with which the session before ended
-        loan = lender(node, [*again, *self._kept(loops)], self._clouds.loan, self._settings.redundancy)
+        loan = lender(node, [*again, *self._kept(loops)], self.clouds.loan, self._settings.redundancy)
         if loan is not None:
-            self._clouds.borrow(node, loan)
+            self.clouds.borrow(node, loan)
             self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
 
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
         """Bring the map file, if there is one, up to date with a new keyframe."""
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail, edges)
-            self._writer.sync(self.poses, self.georeference)
+            self._writer.sync(self.poses, self.graph.georeference)
 
     def finish(self) -> None:
         """At the end of a drive: wait for the solver, find moving points in the last clouds, write the map file."""
-        self._optimize(changed=self._graph.unsolved)
+        self._optimize(changed=self.graph.unsolved)
         self._optimize(changed=False, wait=True)
-        self._graph.close()
+        self.graph.close()
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
         if self._writer is not None:
-            self._writer.judge(self._graph.loops)
-            self._writer.sync(self.poses, self.georeference)
+            self._writer.judge(self.graph.loops)
+            self._writer.sync(self.poses, self.graph.georeference)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
         placed = np.flatnonzero(self.placed).tolist()
-        return map_cloud(self._clouds, self.poses, voxel_size or self._settings.voxel, placed)
+        return map_cloud(self.clouds, self.poses, voxel_size or self._settings.voxel, placed)
 
     def update_grid(self, grid: OccupancyMap, seconds: float) -> bool:
         """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
         if not self.keyframes:
             return True
-        return grid.update(self._clouds, self.poses, self._clouds.version, seconds, self.placed, self._clouds.origin)
-
-    def write_g2o(self, path: Path) -> None:
-        """The pose graph as a g2o file."""
-        self._graph.write_g2o(path)
+        return grid.update(self.clouds, self.poses, self.clouds.version, seconds, self.placed, self.clouds.origin)
 
     def _is_placed(self, node: int) -> bool:
-        return self._graph.part(node) == self._graph.part(0)
+        return self.graph.part(node) == self.graph.part(0)
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels
@@ -256,16 +246,16 @@ class Mapper:
             if d is not None and channels is not None and d.features.shape[1] != channels:
                 width = d.features.shape[1]
                 raise UsageError(f"{store.path}: descriptors of {width} channels, the network makes {channels}")
-        self.keyframes, self._clouds, self.thumbnail = data.keyframes, data.clouds, data.thumbnail
+        self.keyframes, self.clouds, self.thumbnail = data.keyframes, data.clouds, data.thumbnail
         try:
-            restore_solved(self._graph, data)
+            restore_solved(self.graph, data)
         except (ValueError, Dpm2Error) as error:
             raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
         for keyframe in data.keyframes:
             robot = self._robot(keyframe.robot)
             robot.ids = max(robot.ids, keyframe.id + 1)
         if not store.read_only:
-            self._writer = MapWriter(store, self._clouds, data.poses)
+            self._writer = MapWriter(store, self.clouds, data.poses)
 
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving_window)))
@@ -280,30 +270,39 @@ class Mapper:
             covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
             result = replace(result, T_target_source=T_before_this, covariance=covariance)
         elif node == self.session_start and self._start is not None:
-            return [self._begin_session(self._start.after(way), node, keyframe)]
+            return [self._begin_session(self._start, keyframe, way)]
         else:
-            self._graph.add_node(keyframe.T_odom_kf)
+            self.graph.add_node(keyframe.T_odom_kf)
             return []
         edge = Edge("odometry", last, node, result)
-        self._graph.add_node(self._graph.pose(last) @ edge.T_from_to, edge)
+        self.graph.add_node(self.graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
 
-    def _begin_session(self, start: SessionStart, node: int, keyframe: Keyframe) -> Edge:
-        """The first node of a session, and the edge that ties it to the map."""
-        T = start.T_map_kf(keyframe.T_odom_kf, self.poses)
-        edge = start.edge(node, T, self.poses, self.placed)
-        if edge.kind == "odometry":
-            self._graph.add_node(T, edge)
+    def _begin_session(self, start: _Start, keyframe: Keyframe, way: Registration | None) -> Edge:
+        """The first node of a session, and what ties it to the map: odometry from a node, or a loop to the nearest one.
+
+        `way`: to it from a keyframe before the session, if there is one: a break of the odometry may be in it.
+        """
+        poses, other = self.poses, start.node
+        T = poses[other] if start.T_map_odom is None else start.T_map_odom @ keyframe.T_odom_kf
+        if other is None:
+            known = np.flatnonzero(self.placed)
+            other = int(known[np.linalg.norm(poses[known, :3, 3] - T[:3, 3], axis=1).argmin()])
+        covariance = start.covariance if way is None else start.covariance + way.covariance
+        tie = Registration(se3.inverse(poses[other]) @ T, covariance)
+        if start.node is not None:
+            edge = Edge("odometry", other, len(self.keyframes), tie)
+            self.graph.add_node(T, edge)
             return edge
-        self._graph.add_node(T)
-        return self._tied(edge)
+        self.graph.add_node(T)
+        return self._tied(Edge("loop", other, len(self.keyframes), tie))
 
     def _close_loops(self, due: bool) -> None:
         """Loops of the last keyframe: into the graph, unless they were rejected there or before.
 
         `due`: solve it in any case.
         """
-        found = self._closer.close(self.keyframes, self._clouds, self.poses, self._graph.parts)
+        found = self._closer.close(self.keyframes, self.clouds, self.poses, self.graph.parts)
         tried = [self._tied(loop) for loop in found]
         self.loops += tried
         self._optimize(due or any(loop.ok for loop in tried))
@@ -312,28 +311,28 @@ class Mapper:
         """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
         if loop.ok:
             try:
-                self._graph.add_loop(loop)
+                self.graph.add_loop(loop)
             except Dpm2Error as error:
                 return loop.rejected(str(error))
         return loop
 
     def _optimize(self, changed: bool, wait: bool = False) -> None:
         """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
-        self._graph.collect(wait)
+        self.graph.collect(wait)
         if changed:
             try:
-                self._graph.optimize()
+                self.graph.optimize()
             except Dpm2Error as error:  # the drive goes on, with the poses as they were
-                self._graph.problem = str(error)
+                self.graph.problem = str(error)
 
     def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
         """Those that the optimization has not rejected either: for no other is a cloud given up."""
-        rejected = {(loop.from_node, loop.to_node) for loop in self._graph.loops if not loop.ok}
+        rejected = {(loop.from_node, loop.to_node) for loop in self.graph.loops if not loop.ok}
         return [loop for loop in loops if (loop.from_node, loop.to_node) not in rejected]
 
     def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in checked:
-            if self._clouds.loan(node) is None and moving.any():
-                self._clouds.set_moving(node, moving)
+            if self.clouds.loan(node) is None and moving.any():
+                self.clouds.set_moving(node, moving)
                 if self._writer is not None:
                     self._writer.set_moving(node)

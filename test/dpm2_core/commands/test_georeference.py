@@ -120,7 +120,7 @@ def test_a_lidar_that_hangs_has_a_level_map_with_its_place_on_earth(drive: Path)
         slam.process(replace(frame, points=points, fix=fix, images=(), up=(0.0, 0.0, -1.0)))
     slam.finish()
     assert ground_tilt(slam.mapper.clouds, slam.mapper.poses) < 5
-    assert slam.mapper.georeference.T_enu_map[2, 2] > 0.99
+    assert slam.mapper.graph.georeference.T_enu_map[2, 2] > 0.99
 
 
 @pytest.mark.slow
