@@ -44,6 +44,10 @@ class Registration:
         """The same, with one more reason in words."""
         return replace(self, reason="; ".join(part for part in (self.reason, why) if part))
 
+    def rejected(self, reason: str) -> Registration:
+        """The same, not to be used for that reason."""
+        return replace(self, ok=False, reason=reason)
+
     def doubted(self, way: Array) -> Registration:
         """As uncertain as another pose is away, to which `way` (6,) leads: which of the two is right nothing shows."""
         return replace(self, covariance=self.covariance + np.outer(way, way))
@@ -159,7 +163,7 @@ class Edge:
 
     def rejected(self, reason: str) -> Edge:
         """The same edge, which does not constrain the poses."""
-        return replace(self, registration=replace(self.registration, ok=False, reason=reason))
+        return replace(self, registration=self.registration.rejected(reason))
 
 
 @dataclass(frozen=True, eq=False)

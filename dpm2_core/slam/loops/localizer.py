@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -132,8 +132,7 @@ class Localizer:
                 return self._located(keyframe, result, State.TRACKING if tracking and near else State.RELOCALIZED)
             self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf)
             meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
-            reason = f"found {meters:.1f} m, {degrees:.0f} deg away, not confirmed yet"
-            result = replace(result, ok=False, reason=reason)
+            result = result.rejected(f"found {meters:.1f} m, {degrees:.0f} deg away, not confirmed yet")
         elif tracking:
             result = rejected
         self._doubt()

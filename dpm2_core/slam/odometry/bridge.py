@@ -126,7 +126,7 @@ class Bridge:
         if not problem and not fits:  # else it stands where it stood, whatever the clock says
             problem = self._impossible(result.T_target_source @ T_this_begin)
         if problem:
-            return replace(result, ok=False, reason=problem), False
+            return result.rejected(problem), False
         self._ties.append(_Tie(result, T_stretch))
         agreeing = self._agreeing()
         certain = bool(agreeing) and (fits or _apart(agreeing) >= _TIES)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from dpm2_core.estimates import Registration
@@ -138,9 +136,9 @@ class MotionState:
         meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
         unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
         if result.ok and meters > 0.5 + unknown + self.settings.max_acceleration * time * time:
-            return replace(result, ok=False, reason=f"{meters:.1f} m from the prediction")
+            return result.rejected(f"{meters:.1f} m from the prediction")
         if result.ok and degrees > 3 + self.settings.max_turn * time:
-            return replace(result, ok=False, reason=f"{degrees:.0f} deg from the prediction")
+            return result.rejected(f"{degrees:.0f} deg from the prediction")
         return result
 
     def advance(

@@ -80,7 +80,7 @@ class FusedScanRegistration:
         """What the network says as well, of points that were registered or, where it is always asked, are not yet."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
-            neural = replace(neural, ok=False, reason="found where no vehicle can have come")
+            neural = neural.rejected("found where no vehicle can have come")
         if neural is not None and neural.ok and not prediction.known:
             points, prediction = None, _also_from(neural, prediction)
         points = points or self._geometric.located(scan, prediction)

@@ -292,7 +292,7 @@ class GeometricScanRegistration:
             meters, _ = se3.magnitude(se3.inverse(result.T_target_source) @ other.T_target_source)
             one = near(other.T_target_source, result.T_target_source, _NEAR)
             if its_likelihood > likelihood - DISTINCT and not one:
-                return replace(result, ok=False, reason=f"a place {meters:.1f} m away fits as well")
+                return result.rejected(f"a place {meters:.1f} m away fits as well")
         return replace(result, ok=True, reason="")
 
     def _fitted(self, source: Array, T: Array) -> tuple[Registration, float]:

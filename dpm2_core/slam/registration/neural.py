@@ -110,13 +110,13 @@ class NeuralScanRegistration:
                 result = second
         least = self._settings.min_confidence
         if result.confidence < (max(least, _PLACE) if prediction.unique else least):
-            return replace(result, ok=False, reason=f"right with a probability of only {result.confidence:.0%}")
+            return result.rejected(f"right with a probability of only {result.confidence:.0%}")
         if (sigma := result.worst_sigma) > self._settings.max_sigma:
-            return replace(result, ok=False, reason=f"position uncertain by {sigma:.2f} m")
+            return result.rejected(f"position uncertain by {sigma:.2f} m")
         if prediction.information is not None:
             covariance = np.linalg.inv(prediction.information).astype(np.float64)
             if not agree(result, Registration(T_predicted, covariance, 0.0, np.inf, "predicted")):
-                return replace(result, ok=False, reason="contradicts the motion so far")
+                return result.rejected("contradicts the motion so far")
         return result
 
     def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
