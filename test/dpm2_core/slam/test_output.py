@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a map: what is tied to it, and each way by itself."""
+"""The folder of a map: what is tied to it, and each way by itself; corrections reach every frame."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dpm2_core.data.trajectory import read_trajectory
-from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import NO_POINTS
+from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
+from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_loops
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.output import save_map
+from dpm2_core.slam.output import TrajectoryRecorder, save_map
 from dpm2_core.slam.settings import SlamSettings
 
 
@@ -38,3 +39,45 @@ def test_a_trajectory_has_what_is_tied_to_the_map_robot_by_robot(tmp_path: Path)
     assert written.keys.tolist() == [0, 10**8, 2 * 10**8] * 2
     np.testing.assert_allclose(written.poses, mapper.poses[[0, 2, 4, 1, 3, 5]], atol=1e-9)
     np.testing.assert_allclose(written.poses[3, :3, 3], [0.0, 5.0, 0.0], atol=1e-6)
+
+
+def found(T: Array, ok: bool = True) -> Registration:
+    return Registration(T, np.eye(6) * 1e-4, method="test", ok=ok)
+
+
+def tracked(index: int, T: Array, keyframe: Keyframe | None) -> OdometryResult:
+    return OdometryResult(index * 10**8, index, T, np.zeros((6, 6)), np.zeros(6), State.TRACKING, found(T), keyframe)
+
+
+def test_corrections_reach_the_frames_between_keyframes() -> None:
+    recorder = TrajectoryRecorder()
+    poses = se3.exp(np.arange(11)[:, None] * np.array([0, 0, 0.01, 1.0, 0, 0]))
+    for i, T in enumerate(poses):
+        recorder.add(tracked(i, T, Keyframe(i // 5, i, i, T, NO_POINTS) if i % 5 == 0 else None))
+    shift = se3.exp([0, 0, 0, 0, 1.0, 0])
+    corrected = np.array([poses[0], shift @ poses[5], shift @ poses[10]])
+    out = recorder.poses(corrected)
+    np.testing.assert_allclose(out[[0, 5, 10]], corrected, atol=1e-12)
+    np.testing.assert_allclose(out[:6, 1, 3] - poses[:6, 1, 3], np.linspace(0, 1, 6), atol=1e-9)  # evenly, no step
+    np.testing.assert_allclose(out[6:, 1, 3] - poses[6:, 1, 3], 1.0, atol=1e-9)
+
+
+def test_a_loop_after_a_break_moves_what_comes_after_it_alone() -> None:
+    """Frames 6 and 7 come after a pause that frame 8 gives up to bridge, and frame 10 is the next keyframe. Frames to
+    both sides were put on a line between the two keyframes: registered ones, that the loop has told the place of, were
+    off by as much as the guess across the pause was. What no scan tells, 4 and 5, is between the two still."""
+    recorder = TrajectoryRecorder()
+    poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0, 0.4, 0, 0]))
+    for i, T in enumerate(poses):
+        keyframe = Keyframe(i // 10, i, i, T, NO_POINTS) if i in (0, 10) else None
+        how = replace(found(T, ok=i not in (4, 5, 6, 7)), method="none" if i in (4, 5) else "test")
+        recorder.add(replace(tracked(i, T, keyframe), registration=how, breaks=int(i >= 8)))
+    shift = se3.exp([0, 0, 0, 0, 30.0, 0])
+    out = recorder.poses(np.array([poses[0], shift @ poses[10]]))
+    np.testing.assert_allclose(out[:, 1, 3], [0, 0, 0, 0, 10, 20, *[30] * 6], atol=1e-9)
+
+
+def test_no_keyframe_no_correction() -> None:
+    recorder = TrajectoryRecorder()
+    recorder.add(tracked(0, np.eye(4), None))
+    np.testing.assert_array_equal(recorder.poses(np.zeros((0, 4, 4))), np.eye(4)[None])

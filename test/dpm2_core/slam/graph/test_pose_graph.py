@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -60,6 +61,41 @@ def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[PoseGraph]:
     graph.add_loop(loop(0, 50))
     yield graph
     graph.close()
+
+
+def test_a_loop_spreads_the_drift() -> None:
+    graph = PoseGraph(RobustSettings())
+    drive(graph, 51)
+    before = np.linalg.norm((graph.poses - truth(51))[:, :3, 3], axis=1)
+    graph.add_loop(loop(0, 50, LOOP / 100))
+    graph.optimize()
+    after = np.linalg.norm((graph.poses - truth(51))[:, :3, 3], axis=1)
+    assert after[-1] < 0.1 * before[-1]
+    assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
+    np.testing.assert_allclose(graph.poses[0], np.eye(4), atol=1e-6)  # the first stays
+
+
+def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
+    graph = PoseGraph(RobustSettings())
+    graph.add_node(np.eye(4))
+    for _ in range(4):
+        T = T_STEP @ se3.exp([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3])
+        graph.add_node(graph.poses[-1] @ T, step(graph, T))
+    graph.write_g2o(tmp_path / "graph.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    for node in range(5):
+        np.testing.assert_allclose(values.atPose3(node).matrix(), graph.poses[node], atol=1e-12)
+    # The error that gtsam finds in the file is the one that the graph has: information and its order are right.
+    moved = gtsam.Values()
+    for node in range(5):
+        off = se3.exp(np.array([1e-3, -2e-3, 1e-3, 0.01, 0.02, -0.01]) * node)
+        moved.insert(node, gtsam.Pose3(graph.poses[node] @ off))
+    expected = 0.0
+    for edge in graph.edges:
+        a, b = (moved.atPose3(node).matrix() for node in (edge.from_node, edge.to_node))
+        off = se3.log(se3.inverse(edge.T_from_to) @ se3.inverse(a) @ b)
+        expected += 0.5 * off @ np.linalg.solve(edge.covariance, off)
+    assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion against tangent, to second order
 
 
 def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:

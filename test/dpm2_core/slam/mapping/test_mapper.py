@@ -6,11 +6,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
+from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.regions import side_by_side
 from dpm2_core.frame import Array
@@ -19,13 +18,11 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_mapper
-from dpm2_core.slam.graph.pose_graph import PoseGraph
-from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.occupancy import occupancy_grid
 from dpm2_core.slam.mapping.occupancy_map import OCCUPIED, OccupancyMap, OccupancySettings
-from dpm2_core.slam.output import TrajectoryRecorder, save_map
+from dpm2_core.slam.output import save_map
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map, save_as, subset
@@ -57,56 +54,6 @@ def circle(count: int, radius: float = 20.0) -> Array:
     """A lap of `count` poses that ends where it began."""
     turn = np.linspace(0, 2 * np.pi, count)
     return se3.exp(np.array([0, 0, 1.0, radius, 0, 0]) * turn[:, None])
-
-
-def test_a_loop_edge_spreads_the_drift() -> None:
-    poses = circle(40)
-    graph = PoseGraph(RobustSettings())
-    for keyframe in drifting(poses, np.array([0, 0, 5e-4, 0.01, 0, 0.005]), np.zeros((0, 4), np.float32)):
-        n = len(graph)
-        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
-    before = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
-    graph.add_loop(Edge("loop", 0, 39, Registration(se3.inverse(poses[0]) @ poses[39], SIGMA)))
-    graph.optimize()
-    after = np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
-    assert after[-1] < 0.1 * before[-1]
-    assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
-    np.testing.assert_allclose(graph.poses[0], np.eye(4), atol=1e-6)  # the first stays
-
-
-def test_one_wrong_loop_among_right_ones_bends_little() -> None:
-    poses = circle(40)
-    graph = PoseGraph(RobustSettings())
-    for keyframe in drifting(poses, np.zeros(6), np.zeros((0, 4), np.float32)):
-        n = len(graph)
-        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
-    graph.add_loop(Edge("loop", 0, 39, Registration(se3.inverse(poses[0]) @ poses[39], SIGMA)))
-    graph.add_loop(Edge("loop", 3, 20, Registration(np.eye(4), SIGMA)))  # 40 m wrong
-    graph.optimize()
-    assert np.linalg.norm(graph.poses[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.5
-
-
-def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
-    graph = PoseGraph(RobustSettings())
-    poses = circle(5)
-    for keyframe in drifting(poses, np.array([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3]), np.zeros((0, 4), np.float32)):
-        n = len(graph)
-        graph.add_node(keyframe.T_odom_kf, keyframe.edge and Edge("odometry", n - 1, n, keyframe.edge))
-    graph.write_g2o(tmp_path / "graph.g2o")
-    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
-    for node in range(5):
-        np.testing.assert_allclose(values.atPose3(node).matrix(), graph.poses[node], atol=1e-12)
-    # The error that gtsam finds in the file is the one that the graph has: information and its order are right.
-    moved = gtsam.Values()
-    for node in range(5):
-        off = se3.exp(np.array([1e-3, -2e-3, 1e-3, 0.01, 0.02, -0.01]) * node)
-        moved.insert(node, gtsam.Pose3(graph.poses[node] @ off))
-    expected = 0.0
-    for edge in graph.edges:
-        a, b = (moved.atPose3(node).matrix() for node in (edge.from_node, edge.to_node))
-        off = se3.log(se3.inverse(edge.T_from_to) @ se3.inverse(a) @ b)
-        expected += 0.5 * off @ np.linalg.solve(edge.covariance, off)
-    assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion against tangent, to second order
 
 
 @pytest.fixture(scope="module")
@@ -189,46 +136,6 @@ def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Ar
     assert len(np.unique(np.floor(cloud[:, :3]).astype(int), axis=0)) == len(cloud)
     assert len(mapper.cloud(2.0)) < len(cloud)
     assert cloud[:, 0].max() > lap[0][0].cloud[:, 0].max() + 4  # the later keyframes reach farther
-
-
-def tracked(index: int, T: Array, keyframe: Keyframe | None) -> OdometryResult:
-    return OdometryResult(index * 10**8, index, T, np.zeros((6, 6)), np.zeros(6), State.TRACKING, found(T), keyframe)
-
-
-def test_corrections_reach_the_frames_between_keyframes() -> None:
-    recorder = TrajectoryRecorder()
-    poses = se3.exp(np.arange(11)[:, None] * np.array([0, 0, 0.01, 1.0, 0, 0]))
-    cloud = np.zeros((0, 4), np.float32)
-    for i, T in enumerate(poses):
-        recorder.add(tracked(i, T, Keyframe(i // 5, i, i, T, cloud) if i % 5 == 0 else None))
-    shift = se3.exp([0, 0, 0, 0, 1.0, 0])
-    corrected = np.array([poses[0], shift @ poses[5], shift @ poses[10]])
-    out = recorder.poses(corrected)
-    np.testing.assert_allclose(out[[0, 5, 10]], corrected, atol=1e-12)
-    np.testing.assert_allclose(out[:6, 1, 3] - poses[:6, 1, 3], np.linspace(0, 1, 6), atol=1e-9)  # evenly, no step
-    np.testing.assert_allclose(out[6:, 1, 3] - poses[6:, 1, 3], 1.0, atol=1e-9)
-
-
-def test_a_loop_after_a_break_moves_what_comes_after_it_alone() -> None:
-    """Frames 6 and 7 come after a pause that frame 8 gives up to bridge, and frame 10 is the next keyframe. Frames to
-    both sides were put on a line between the two keyframes: registered ones, that the loop has told the place of, were
-    off by as much as the guess across the pause was. What no scan tells, 4 and 5, is between the two still."""
-    recorder = TrajectoryRecorder()
-    poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0, 0.4, 0, 0]))
-    cloud = np.zeros((0, 4), np.float32)
-    for i, T in enumerate(poses):
-        keyframe = Keyframe(i // 10, i, i, T, cloud) if i in (0, 10) else None
-        how = replace(found(T, ok=i not in (4, 5, 6, 7)), method="none" if i in (4, 5) else "test")
-        recorder.add(replace(tracked(i, T, keyframe), registration=how, breaks=int(i >= 8)))
-    shift = se3.exp([0, 0, 0, 0, 30.0, 0])
-    out = recorder.poses(np.array([poses[0], shift @ poses[10]]))
-    np.testing.assert_allclose(out[:, 1, 3], [0, 0, 0, 0, 10, 20, *[30] * 6], atol=1e-9)
-
-
-def test_no_keyframe_no_correction() -> None:
-    recorder = TrajectoryRecorder()
-    recorder.add(tracked(0, np.eye(4), None))
-    np.testing.assert_array_equal(recorder.poses(np.zeros((0, 4, 4))), np.eye(4)[None])
 
 
 @pytest.mark.slow
