@@ -223,8 +223,7 @@ class Mapper:
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
         if self._writer is not None:
-            self._writer.judge(self.graph.loops)
-            self._writer.sync(self.poses, self.graph.georeference)
+            self._writer.sync(self.poses, self.graph.georeference, self.graph.loops)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
         """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""

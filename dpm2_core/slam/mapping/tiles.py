@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -59,7 +59,7 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
         mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)
         np.save(part / VECTORS, centered(vectors, mean))
         for tile, nodes in squares.items():
-            save_as(_of(data, nodes), part / _name(tile))
+            save_as(subset(data, nodes, data.constraints, []), part / _name(tile))
         counts = [[*tile, len(nodes)] for tile, nodes in sorted(squares.items())]
         weights = sorted({session.weights for session in data.sessions if session.weights})
         write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
@@ -69,11 +69,6 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
 def _vector(data: MapData, node: int) -> Vector:
     descriptors = data.keyframes[node].descriptors or data.describe(node)
     return np.zeros(WIDTH, np.float32) if descriptors is None else pooled(descriptors)
-
-
-def _of(data: MapData, nodes: Sequence[int]) -> MapData:
-    """The map of some nodes, and the edges between them."""
-    return subset(data, nodes, data.constraints, [])
 
 
 def _name(tile: Tile) -> str:

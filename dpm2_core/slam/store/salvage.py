@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Container, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -58,12 +58,10 @@ class Salvage:
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
         for node, mask in self._rows("moving"):
-            try:
+            with self._noted(f"keyframe {node}: which points move is lost"):
                 if node in keyframes and (cloud := self._payload(node)[0]) is not None:
                     unpack_mask(mask, len(unpack_cloud(cloud)))
                     moving[node] = mask
-            except (ValueError, TypeError) as error:
-                self._problem(f"keyframe {node}: which points move is lost: {error}")
         self._fixes(keyframes)
         edges = self._edges(keyframes, session)
         trail = self._trail(keyframes)
@@ -88,13 +86,10 @@ class Salvage:
         session: dict[int, int] = {}
         loans: dict[int, Loan] = {}
         for row in self._rows("keyframes"):
-            try:
+            with self._noted(f"keyframe {row[0]}"):
                 node, keyframes[row[0]], session[row[0]], loan = rows.keyframe_of(row)
-            except ValueError as error:
-                self._problem(f"keyframe {row[0]}: {error}")
-                continue
-            if loan is not None:
-                loans[node] = loan
+                if loan is not None:
+                    loans[node] = loan
         end = max(self._last[table] for table in ("keyframes", "payloads", "poses")) + 1
         if missing := sorted(set(range(end)) - keyframes.keys()):
             self._problem(f"keyframes lost: {_listed(missing)}")
@@ -156,31 +151,25 @@ class Salvage:
     def _fixes(self, keyframes: dict[int, Keyframe]) -> None:
         """Give those that are good to their keyframes."""
         for row in self._rows("fixes"):
-            try:
+            with self._noted(f"keyframe {row[0]}: its fix is lost"):
                 node, fix = rows.fix_of(row)
                 keyframes[node] = replace(keyframes[node], fix=fix)
-            except (ValueError, KeyError) as error:
-                self._problem(f"keyframe {row[0]}: its fix is lost: {error}")
 
     def _georeference(self) -> Georeference | None:
         for row in self._rows("georeference"):
-            try:
+            with self._noted("georeference"):
                 return rows.georeference_of(row)
-            except ValueError as error:
-                self._problem(f"georeference: {error}")
         return None
 
     def _edges(self, keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
         """Those between keyframes that are there, and what bridges the others."""
         edges, known = [], []
         for row in self._rows("edges"):
-            try:
+            with self._noted(f"edge {row[0]}"):
                 edge = rows.edge_of(row)
                 known.append(edge)
                 rows.check_ends(edge, keyframes)
                 edges.append(edge)
-            except ValueError as error:
-                self._problem(f"edge {row[0]}: {error}")
         return [*edges, *self._bridges(known, keyframes, session)]
 
     def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> Iterator[Edge]:
@@ -223,11 +212,9 @@ class Salvage:
     def _rows(self, table: str) -> Iterator[tuple[Any, ...]]:
         """The good rows of a table, each fetched by its number so that a damaged page costs only what is on it."""
         for number in range(self._last[table] + 1):
-            try:
+            row = None
+            with self._noted(f"{table} {number}"):
                 row = self._row(table, number)
-            except ValueError as error:
-                self._problem(f"{table} {number}: {error}")
-                continue
             if row is not None:
                 yield row
 
@@ -272,6 +259,14 @@ class Salvage:
                     last = number
             number += 1
         return last
+
+    @contextmanager
+    def _noted(self, what: str) -> Iterator[None]:
+        """What is found wrong within is a problem, and the check goes on after it."""
+        try:
+            yield
+        except (ValueError, TypeError, KeyError) as error:
+            self._problem(f"{what}: {error}")
 
     def _problem(self, text: str) -> None:
         self._findings.problems.append(text)

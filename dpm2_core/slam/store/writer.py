@@ -35,28 +35,26 @@ class MapWriter:
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
-        self._judged: list[Edge] = []
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
         """A keyframe, whose cloud is in the cloud store, and the edges that came with it."""
         self._keyframes.append((node, keyframe, thumbnail))
         self._edges += edges
 
-    def judge(self, loops: Sequence[Edge]) -> None:
-        """Loops as they are now: with the next `sync` those of the file whose verdict is another one are rewritten."""
-        self._judged = list(loops)
-
     def set_moving(self, node: int) -> None:
         """The cloud store has a mask for that node."""
         self._moving.add(node)
 
-    def sync(self, poses: Array, georeference: Georeference | None) -> None:
-        """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`."""
+    def sync(self, poses: Array, georeference: Georeference | None, judged: Sequence[Edge] = ()) -> None:
+        """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`.
+
+        `judged`: loops as they are now: those of the file whose verdict is another one are rewritten.
+        """
         try:
             while len(self._keyframes) > _BATCH:
                 self._write(self._keyframes[:_BATCH], poses, georeference)
             self._write(self._keyframes, poses, georeference)
-            self._rewrite()
+            self._rewrite(judged)
             self.problem = "" if self._store.in_place else f"{self._store.path}: removed or moved since it was opened"
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
@@ -85,16 +83,15 @@ class MapWriter:
         written[still] = self._written[still]  # small moves add up until they are worth writing
         self._written = written
 
-    def _rewrite(self) -> None:
+    def _rewrite(self, judged: Sequence[Edge]) -> None:
         """Bring the verdicts in the file up to date."""
         # By the measurement, too: the search may have rejected another loop between the same two keyframes.
-        now = {_key(loop): loop for loop in self._judged if loop.kind == "loop"}
+        now = {_key(loop): loop for loop in judged if loop.kind == "loop"}
         rows = self._store.rows("edges", where="kind = 'loop'") if now else ()
         file = [(int(row[0]), edge_of(row)) for row in rows]
         known = [(number, loop, now[_key(loop)]) for number, loop in file if _key(loop) in now]
-        if changed := {number: judged for number, loop, judged in known if judged.ok != loop.ok}:
+        if changed := {number: new for number, loop, new in known if new.ok != loop.ok}:
             self._store.write(Change(judged=changed))
-        self._judged = []
 
     def _moved(self, poses: Array) -> dict[int, Array]:
         """Poses that the file does not have, by node."""
