@@ -40,8 +40,9 @@ def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str,
 
 def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
     """A map that grows: how large it is, and what is wrong with its file or its poses."""
-    accepted, tried = mapper.loops
-    figures = {"keyframes": mapper.keyframes, "loops accepted": accepted, "loops tried": tried}
+    core = mapper.active.mapper
+    loops = [loop.ok for loop in core.loops]
+    figures = {"keyframes": mapper.keyframes, "loops accepted": sum(loops), "loops tried": len(loops)}
     problems = []
     if mapper.waiting > BEHIND:
         problems.append(f"{mapper.waiting} keyframes wait: the map, its loops and map -> odom are behind")
@@ -49,11 +50,11 @@ def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
         problems.append(f"no map file, the map is only in memory: {problem}")
     if mapper.store_problem:
         problems.append(f"map file incomplete: {mapper.store_problem}")
-    if graph_problem := mapper.slam.mapper.graph.problem:
-        problems.append(f"poses not optimized: {graph_problem}")
+    if problem := core.graph.problem:
+        problems.append(f"poses not optimized: {problem}")
     if missing := list(mapper.missing.values()):
         problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")
-    text = "; ".join([f"{mapper.keyframes} keyframes, {accepted} loops", *problems])
+    text = "; ".join([f"{mapper.keyframes} keyframes, {sum(loops)} loops", *problems])
     return status(node, "mapper", WARN if problems else OK, text, figures | {"waiting": mapper.waiting})
 
 

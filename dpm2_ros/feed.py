@@ -168,7 +168,7 @@ class Feed:
         """Descriptors that the mapper's network can compare; without, it makes its own of the keyframe's cloud."""
         _check_budget(message, id)
         descriptors, weights = descriptors_from_msg(message)
-        channels = self._mapper.slam.mapper.channels
+        channels = self._mapper.active.mapper.channels
         if descriptors is None or channels is None:
             return None
         try:

@@ -58,7 +58,7 @@ class MapperNode(ManagedNode):
     @property
     def slam(self) -> Slam:
         """What works on the map."""
-        return self._map.slam
+        return self._map.active.slam
 
     @property
     def _map(self) -> MapperThread:

@@ -23,7 +23,6 @@ from dpm2_core.frame import Array
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.mapping.occupancy import why_of_no_use
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
-from dpm2_core.slam.system import Slam
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
 from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pose_graph_to_msg
@@ -84,20 +83,9 @@ class MapperThread:
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
     @property
-    def slam(self) -> Slam:
-        """What works on the map; its odometry is for another thread."""
-        return self.active.slam
-
-    @property
     def keyframes(self) -> int:
         """How many there are."""
         return len(self.active.mapper.keyframes)
-
-    @property
-    def loops(self) -> tuple[int, int]:
-        """Loops accepted, and loops tried."""
-        loops = list(self.active.mapper.loops)
-        return sum(loop.ok for loop in loops), len(loops)
 
     @property
     def waiting(self) -> int:

@@ -229,7 +229,7 @@ class Diagnostics:
         inputs, located = self._inputs, None
         problem = self._fix_problem() or self._frames.problems.get(inputs.calibration.gnss_topic)
         if self._mapper is not None:
-            located = self._mapper.slam.mapper.graph.georeference
+            located = self._mapper.active.mapper.graph.georeference
         text = "in use" if located is not None else "the map's place on Earth is not known yet"
         return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
 

@@ -66,7 +66,7 @@ class SlamNode(ManagedNode):
     def configure(self, back: ExitStack) -> None:
         """As of `ManagedNode`."""
         ros, weights = self._config.ros, weights_identity(self._config.slam)
-        self._slam = self._open_map(back).slam if ros.embed_mapper else make_slam(self._config.slam, self._robot)
+        self._slam = self._open_map(back).active.slam if ros.embed_mapper else make_slam(self._config.slam, self._robot)
         self._health = Health()
         self._sender = KeyframeSender(self, self._robot, ros, weights)
         back.callback(self._sender.close)

@@ -133,7 +133,7 @@ def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     """It was acknowledged as one in the map file, so that its robot deleted it; /diagnostics said OK."""
-    mapper = robot.node.mapper.slam.mapper
+    mapper = robot.node.mapper.active.mapper
     add, errors = mapper.add, [error]
 
     def failing(keyframe: Keyframe) -> Any:
