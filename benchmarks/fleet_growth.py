@@ -148,9 +148,9 @@ def _drive(poses: Array, rng: np.random.Generator) -> MapData:
             T = se3.inverse(poses[number - 1]) @ poses[number] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(_NOISE)))
             own.append(own[-1] @ T)
             edges.append(Edge("odometry", number - 1, number, Registration(T, _NOISE)))
-    keyframes = [Keyframe(i, i * 10**9, i, T, NO_POINTS) for i, T in enumerate(own)]
+    keyframes = [Keyframe(i, i * 10**9, i, T, NO_POINTS, session=1) for i, T in enumerate(own)]
     sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
-    return MapData(keyframes, [1] * len(own), np.array(own), edges, [], sessions, clouds)
+    return MapData(keyframes, np.array(own), edges, [], sessions, clouds)
 
 
 def _joins(one: str, other: str, way: Array, at: Any) -> list[Join]:

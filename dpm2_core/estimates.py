@@ -107,6 +107,7 @@ class Keyframe:
         origin: (3,) m, where in its own frame the LiDAR was, of several the first: from there `cloud` was seen. It goes
             with the cloud, also into the map file.
         up: see `Frame`, in its own frame.
+        session: of its map, from 1; 0: the one that is being written.
     """
 
     id: int
@@ -121,6 +122,7 @@ class Keyframe:
     fix: Fix | None = None
     origin: Array = field(default_factory=lambda: np.zeros(3))
     up: Up | None = None
+    session: int = 0
 
 
 @dataclass(frozen=True, eq=False)

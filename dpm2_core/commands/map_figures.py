@@ -62,7 +62,7 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
 def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
     loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
     parts = parts_of(data)
-    placed, session = parts == parts[:1], np.array(data.session, np.int64)
+    placed, session = parts == parts[:1], np.array([k.session for k in data.keyframes], np.int64)
     return {
         "map": str(path),
         "keyframes": len(data),

@@ -91,10 +91,10 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
             "stamp": str(keyframe.stamp),  # ns are more than a number of JavaScript holds
             "frame": keyframe.index,
             "robot": keyframe.robot,
-            "session": session,
+            "session": keyframe.session,
             "image": None if (small := _within(jpeg, room)) is None else data_url(small, "image/jpeg"),
         }
-        for keyframe, session, T, jpeg in zip(data.keyframes, data.session, data.poses, jpegs, strict=True)
+        for keyframe, T, jpeg in zip(data.keyframes, data.poses, jpegs, strict=True)
     ]
 
 

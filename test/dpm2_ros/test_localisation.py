@@ -231,7 +231,7 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
 
     with MapStore.open(path) as store:
         data = load_map(store)
-    assert set(data.session) == {1, 2}
+    assert {k.session for k in data.keyframes} == {1, 2}
     assert len({(k.robot, k.id) for k in data.keyframes}) == len(data)
 
 

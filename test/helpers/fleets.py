@@ -23,7 +23,7 @@ NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 def drive_map(poses: Array, seed: int) -> MapData:
     """The map of a drive whose odometry has drifted; it stands in a frame of its own."""
     rng = np.random.default_rng(seed)
-    keyframes = [Keyframe(i, i, i, np.eye(4), NO_POINTS) for i in range(len(poses))]
+    keyframes = [Keyframe(i, i, i, np.eye(4), NO_POINTS, session=1) for i in range(len(poses))]
     edges, own = [], [se3.exp(rng.normal(size=6) * [0, 0, 1, 50, 50, 0])]
     for i in range(1, len(poses)):
         T = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(NOISE)))
@@ -33,7 +33,7 @@ def drive_map(poses: Array, seed: int) -> MapData:
     for _ in poses:
         clouds.append(point)
     sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
-    return MapData(keyframes, [1] * len(poses), np.array(own), edges, [], sessions, clouds)
+    return MapData(keyframes, np.array(own), edges, [], sessions, clouds)
 
 
 def fleet_maps(count: int, turn: float = 0.01) -> tuple[dict[str, Array], dict[str, MapData], list[Join]]:

@@ -33,14 +33,12 @@ def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -
     clouds = CloudStore()
     for T in poses:
         clouds.append(pack_cloud(_walls(rng, T, radius, points)))
-    keyframes = [Keyframe(i, 10**9 * i, 10 * i, T, NO_POINTS) for i, T in enumerate(poses)]
+    keyframes = [Keyframe(i, 10**9 * i, 10 * i, T, NO_POINTS, session=1) for i, T in enumerate(poses)]
     steps = [_edge("odometry", i, i + 1, poses) for i in range(count - 1)]
     loops = [_edge("loop", 0, count - 1, poses), _edge("loop", 0, count // 2, poses).rejected("<b>points</b> disagree")]
     session = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
     pictures = [None if image is None else _noise(rng, image) for _ in range(3)]
-    return MapData(
-        keyframes, [1] * count, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3]
-    )
+    return MapData(keyframes, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3])
 
 
 def _pose(radius: float, angle: float) -> np.ndarray:

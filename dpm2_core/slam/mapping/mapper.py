@@ -182,7 +182,8 @@ class Mapper:
         follows = robot.last is not None and way is not None
         offset = robot.offset if follows else robot.ids
         keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
-        keyframe = replace(keyframe, id=keyframe.id + offset, cloud=NO_POINTS, thumbnail=None, origin=np.zeros(3))
+        keyframe = replace(keyframe, id=keyframe.id + offset, session=0)
+        keyframe = replace(keyframe, cloud=NO_POINTS, thumbnail=None, origin=np.zeros(3))
         packed = pack_cloud(cloud, origin)
         to_before = self._add_node(keyframe, way, robot.last if follows else None)
         self.clouds.append(packed)

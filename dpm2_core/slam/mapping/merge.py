@@ -39,7 +39,6 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
     loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}
     both = MapData(
         [*a.keyframes, *b.keyframes],
-        [*a.session, *b.session],
         np.concatenate([a.poses, T_a_b @ b.poses]),
         [*a.edges, *b.edges, *(e.between(e.from_node, e.to_node + n) for e in loops)],
         [*a.trail, *b.trail],

@@ -36,7 +36,8 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     """
     if not len(data):
         return []
-    positions, parts, session = data.poses[:, :3, 3] * [1, 1, HEIGHT], parts_of(data), np.array(data.session)
+    positions, parts = data.poses[:, :3, 3] * [1, 1, HEIGHT], parts_of(data)
+    session = np.array([keyframe.session for keyframe in data.keyframes])
     tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
     needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
     stays, described = np.ones(len(data), np.bool_), np.array([k.descriptors is not None for k in data.keyframes])
@@ -71,7 +72,7 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
         RemovedKeyframe(
             keyframe.id,
             keyframe.robot,
-            data.session[node],
+            keyframe.session,
             keyframe.stamp,
             anchors[node],
             se3.inverse(data.poses[anchors[node]]) @ data.poses[node],

@@ -46,7 +46,7 @@ class MapData:
     """A map. A node is a position among the keyframes.
 
     Attributes:
-        keyframes: without clouds. session: of each, from 1. poses: (N, 4, 4) optimized T_map_kf.
+        keyframes: without clouds. poses: (N, 4, 4) optimized T_map_kf.
         edges: odometry and loops, rejected ones too. trail: keyframes that were pruned. sessions: who wrote it.
         clouds: of each keyframe, read from the file when asked for.
         thumbnail: JPEG of a node, or None.
@@ -55,7 +55,6 @@ class MapData:
     """
 
     keyframes: list[Keyframe]
-    session: list[int]
     poses: Array
     edges: list[Edge]
     trail: list[RemovedKeyframe]
@@ -88,14 +87,14 @@ def load_map(store: MapStore, descriptors: bool = True) -> MapData:
 
 
 def _load(store: MapStore, descriptors: bool) -> MapData:
-    keyframes, session, loans = _load_keyframes(store, descriptors)
+    keyframes, loans = _load_keyframes(store, descriptors)
     nodes = range(len(keyframes))
     edges = []
     for number, edge in _made(store, "edges", edge_of):
         with _of("edge", number):
             check_ends(edge, nodes)
         edges.append(edge)
-    owner = [(keyframe.robot, number) for keyframe, number in zip(keyframes, session, strict=True)]
+    owner = [(keyframe.robot, keyframe.session) for keyframe in keyframes]
     for node, edge in odometry_by_node(edges).items():
         if owner[edge.from_node] == owner[node]:
             keyframes[node] = replace(keyframes[node], edge=edge.registration)
@@ -114,7 +113,6 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         raise ValueError("a pruned keyframe that belongs to none")
     return MapData(
         keyframes,
-        session,
         np.array([poses[node] for node in nodes]).reshape(-1, 4, 4),
         edges,
         trail,
@@ -128,14 +126,13 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
     )
 
 
-def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], list[int], dict[int, Loan]]:
-    """Keyframes with their odometry's pose, and descriptors if wanted; their sessions; those that borrow."""
-    keyframes, session, loans = [], [], {}
-    for position, (_, (node, keyframe, number, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
+def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], dict[int, Loan]]:
+    """Keyframes with their odometry's pose, and descriptors if wanted; those that borrow."""
+    keyframes, loans = [], {}
+    for position, (_, (node, keyframe, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
         if node != position:
             raise ValueError(f"keyframe {position} is missing")
         keyframes.append(keyframe)
-        session.append(number)
         if loan is not None:
             loans[node] = loan
     for node, loan in loans.items():  # a lender has a cloud of its own: there are no chains, and so no circles
@@ -152,7 +149,7 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
             raise ValueError(f"descriptors of {', '.join(map(str, sorted(widths)))} channels, which cannot be compared")
         for node, loan in loans.items():
             keyframes[node] = borrowing(keyframes[node], keyframes, loan)
-    return keyframes, session, loans
+    return keyframes, loans
 
 
 def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
@@ -212,7 +209,6 @@ def append_map(store: MapStore, data: MapData) -> None:
     first = store.size
     data = numbered_behind(data, first, max((row[0] for row in store.rows("sessions", "session")), default=0))
     store.add_sessions(data.sessions)
-    sessions = {first + node: number for node, number in enumerate(data.session)}
     ending: dict[int, list[Edge]] = {}
     for edge in data.edges:
         ending.setdefault(max(edge.from_node, edge.to_node), []).append(edge)
@@ -227,7 +223,7 @@ def append_map(store: MapStore, data: MapData) -> None:
             poses={first + node: data.poses[node]},
             moving={} if mask is None else {first + node: mask},
         )
-        store.write(change, sessions)
+        store.write(change)
     store.write(Change(trail=data.trail, georeference=None if first else data.georeference))
 
 
@@ -235,7 +231,7 @@ def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:
     """A map whose edges, trail and sessions count on after so many nodes, and the last session of another map."""
     return replace(
         data,
-        session=[number + sessions for number in data.session],
+        keyframes=[replace(keyframe, session=keyframe.session + sessions) for keyframe in data.keyframes],
         edges=[edge.shifted(nodes) for edge in data.edges],
         trail=[replace(p, node=p.node + nodes, session=p.session + sessions) for p in data.trail],
         sessions=[replace(session, number=session.number + sessions) for session in data.sessions],
@@ -254,7 +250,6 @@ def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: It
                         data.clouds.name)  # fmt: skip
     return MapData(
         [data.keyframes[node] for node in where],
-        [data.session[node] for node in where],
         data.poses[where],
         [e.between(new[e.from_node], new[e.to_node]) for e in edges if e.from_node in new and e.to_node in new],
         [replace(pruned, node=new[pruned.node]) for pruned in trail if pruned.node in new],
@@ -306,8 +301,7 @@ def ways(data: MapData) -> list[Way]:
     """
     led = odometry_by_node(data.edges)
     steps: list[tuple[str, int, int, int, int | None, Array]] = [
-        (k.robot, session, k.id, k.stamp, node, data.poses[node])
-        for node, (k, session) in enumerate(zip(data.keyframes, data.session, strict=True))
+        (k.robot, k.session, k.id, k.stamp, node, data.poses[node]) for node, k in enumerate(data.keyframes)
     ]
     steps += [(p.robot, p.session, p.id, p.stamp, None, data.poses[p.node] @ p.T_node_kf) for p in data.trail]
     steps.sort(key=lambda step: step[:4])

@@ -104,8 +104,8 @@ class MapStore:
             sql.executemany("INSERT INTO sessions VALUES (?,?,?,?,?)", rows)
         self._newest = max([self._newest, *(row[0] for row in rows)])
 
-    def write(self, change: Change, sessions: dict[int, int] | None = None) -> None:
-        """Take a change in, whole or not at all. `sessions`: of nodes that are not of the present one.
+    def write(self, change: Change) -> None:
+        """Take a change in, whole or not at all.
 
         Raises:
             Dpm2Error: it could not be written: a full disk, a read-only file, another writer.
@@ -113,9 +113,8 @@ class MapStore:
         with self._transaction() as sql:
             self._check_alone(sql)
             for node, keyframe, cloud, thumbnail in change.keyframes:
-                session = (sessions or {}).get(node, self.session)
                 loan = cloud if isinstance(cloud, Loan) else None
-                _insert(sql, "keyframes", [keyframe_row(node, keyframe, session, loan)])
+                _insert(sql, "keyframes", [keyframe_row(node, keyframe, self.session, loan)])
                 if keyframe.fix is not None:
                     _insert(sql, "fixes", [fix_row(node, keyframe.fix)])
                 if isinstance(cloud, bytes):

@@ -131,14 +131,14 @@ def with_crc(*values: Any) -> tuple[Any, ...]:
 
 
 def keyframe_row(node: int, keyframe: Keyframe, session: int, loan: Loan | None) -> tuple[Any, ...]:
-    """Of table `keyframes`."""
+    """Of table `keyframes`; `session`: the one that is being written."""
     k = keyframe
     lent = (None, None) if loan is None else (int(loan.lender), array_bytes(loan.T_kf_lender))
-    return with_crc(node, k.id, k.robot, session, k.stamp, k.index, array_bytes(k.T_odom_kf), *lent)
+    return with_crc(node, k.id, k.robot, k.session or session, k.stamp, k.index, array_bytes(k.T_odom_kf), *lent)
 
 
-def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, int, Loan | None]:
-    """Node, keyframe without cloud and descriptors, session, and whose cloud it borrows, of a row of `keyframes`.
+def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, Loan | None]:
+    """Node, keyframe without cloud and descriptors, and whose cloud it borrows, of a row of `keyframes`.
 
     Raises:
         ValueError: a value that no keyframe has.
@@ -146,11 +146,11 @@ def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, int, Loan | None]:
     node, id, robot, session, stamp, frame, T, lender, T_lent = row
     _check_types((stamp, frame), robot)
     _check_counts(node, id, session)
-    keyframe = Keyframe(id, stamp, frame, pose_of(T), NO_POINTS, None, robot)
+    keyframe = Keyframe(id, stamp, frame, pose_of(T), NO_POINTS, None, robot, session=session)
     if lender is None:
-        return node, keyframe, session, None
+        return node, keyframe, None
     _check_counts(lender)
-    return node, keyframe, session, Loan(lender, pose_of(T_lent))
+    return node, keyframe, Loan(lender, pose_of(T_lent))
 
 
 def edge_row(number: int, edge: Edge) -> tuple[Any, ...]:

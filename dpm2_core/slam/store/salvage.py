@@ -52,7 +52,7 @@ class Salvage:
 
     def run(self) -> MapData:
         """All that is good, without gaps."""
-        keyframes, session, loans = self._keyframes()
+        keyframes, loans = self._keyframes()
         poses = self._poses(keyframes)
         good = sorted(keyframes)
         last = max(good, default=-1) + 1
@@ -63,31 +63,29 @@ class Salvage:
                     unpack_mask(mask, len(unpack_cloud(cloud)))
                     moving[node] = mask
         self._fixes(keyframes)
-        edges = self._edges(keyframes, session)
+        edges = self._edges(keyframes)
         trail = self._trail(keyframes)
         # A map in the old numbers with holes, of which the good nodes are then taken.
         nothing = pack_cloud(NO_POINTS)
-        filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS)
+        filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS, session=1)
         whole = MapData(
             [keyframes.get(node, filler) for node in range(last)],
-            [session.get(node, 1) for node in range(last)],
             np.array([poses.get(node, np.eye(4)) for node in range(last)]).reshape(-1, 4, 4),
             [],
             [],
-            self._sessions(session),
+            self._sessions(keyframes),
             CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
             lambda node: self._payload(node)[2],
             georeference=self._georeference(),
         )
         return subset(whole, good, edges, trail)
 
-    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, int], dict[int, Loan]]:
+    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, Loan]]:
         keyframes: dict[int, Keyframe] = {}
-        session: dict[int, int] = {}
         loans: dict[int, Loan] = {}
         for row in self._rows("keyframes"):
             with self._noted(f"keyframe {row[0]}"):
-                node, keyframes[row[0]], session[row[0]], loan = rows.keyframe_of(row)
+                node, keyframes[row[0]], loan = rows.keyframe_of(row)
                 if loan is not None:
                     loans[node] = loan
         end = max(self._last[table] for table in ("keyframes", "payloads", "poses")) + 1
@@ -104,7 +102,7 @@ class Salvage:
             packed = self._payload(node)[1]
             descriptors = None if packed is None else rows.unpack_descriptors(packed)
             keyframes[node] = replace(keyframes[node], descriptors=descriptors)
-        return keyframes, session, loans
+        return keyframes, loans
 
     def _payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
         """Packed cloud, descriptors and thumbnail of a node, if they are good."""
@@ -161,7 +159,7 @@ class Salvage:
                 return rows.georeference_of(row)
         return None
 
-    def _edges(self, keyframes: dict[int, Keyframe], session: dict[int, int]) -> list[Edge]:
+    def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
         """Those between keyframes that are there, and what bridges the others."""
         edges, known = [], []
         for row in self._rows("edges"):
@@ -170,9 +168,9 @@ class Salvage:
                 known.append(edge)
                 rows.check_ends(edge, keyframes)
                 edges.append(edge)
-        return [*edges, *self._bridges(known, keyframes, session)]
+        return [*edges, *self._bridges(known, keyframes)]
 
-    def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe], session: dict[int, int]) -> Iterator[Edge]:
+    def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe]) -> Iterator[Edge]:
         """Odometry edges over the holes that lost keyframes and edges have left.
 
         `known`: edges, also from and to lost keyframes. A node to which no odometry leads begins a drive; where edges
@@ -182,7 +180,7 @@ class Salvage:
         tied = {edge.to_node for edge in known if edge.kind == "odometry" and edge.from_node in keyframes}
         newest: dict[tuple[str, int], int] = {}
         for node, b in sorted(keyframes.items()):
-            drive = b.robot, session[node]
+            drive = b.robot, b.session
             before, origin = newest.get(drive), _before(node, chain, keyframes)
             newest[drive] = node
             if before is None or node in tied:
@@ -202,12 +200,12 @@ class Salvage:
             self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
         return trail
 
-    def _sessions(self, session: dict[int, int]) -> list[Session]:
+    def _sessions(self, keyframes: dict[int, Keyframe]) -> list[Session]:
         try:
             return [rows.session_of(row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
         except (sqlite3.DatabaseError, ValueError) as error:
             self._problem(f"sessions: {error}")
-            return [Session(number, "", "", "", "") for number in sorted(set(session.values()))]
+            return [Session(number, "", "", "", "") for number in sorted({k.session for k in keyframes.values()})]
 
     def _rows(self, table: str) -> Iterator[tuple[Any, ...]]:
         """The good rows of a table, each fetched by its number so that a damaged page costs only what is on it."""

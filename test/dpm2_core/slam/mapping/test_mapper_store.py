@@ -175,7 +175,7 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
     with MapStore.open(path) as store:
         data = load_map(store)
         assert [k.id for k in data.keyframes] == list(range(LAP))
-        assert data.session == [1] * 8 + [2] * 12
+        assert [k.session for k in data.keyframes] == [1] * 8 + [2] * 12
         np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in drive], atol=1e-6)
         assert len([e for e in data.edges if e.kind == "odometry"]) == LAP - 1
 

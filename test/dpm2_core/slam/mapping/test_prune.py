@@ -35,13 +35,12 @@ def laps(count: int, steps: int = 40, session: bool = False) -> MapData:
     keyframes, edges = [], []
     for node, T in enumerate(poses):
         clouds.append(pack_cloud(np.full((10, 4), node / 100, np.float32)))
-        keyframes.append(Keyframe(node, node * 10**8, node, T, NO_POINTS))
+        keyframes.append(Keyframe(node, node * 10**8, node, T, NO_POINTS, session=1 + session * (node // steps)))
         for other, kind in ((node - 1, "odometry"), (node - steps, "loop")):
             if other >= 0:
                 T_other_node = se3.inverse(poses[other]) @ T
                 edges.append(Edge(kind, other, node, Registration(T_other_node, SIGMA)))
-    numbers = [1 + session * (node // steps) for node in range(len(poses))]
-    return MapData(keyframes, numbers, poses, edges, [], [Session(1, "", "", "", "")], clouds)
+    return MapData(keyframes, poses, edges, [], [Session(1, "", "", "", "")], clouds)
 
 
 def error(edge: Edge, poses: Array) -> Array:
@@ -119,7 +118,8 @@ def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revis
     """Without a place found, a second drive begins in the frame of the first, on top of it, wherever it was."""
     data = laps(2, session=True)
     assert redundant_nodes(data, 2.0, 20.0) == list(range(40, 79))
-    within = [edge for edge in data.edges if data.session[edge.from_node] == data.session[edge.to_node]]
+    session = [keyframe.session for keyframe in data.keyframes]
+    within = [edge for edge in data.edges if session[edge.from_node] == session[edge.to_node]]
     refused = [edge.rejected("no") for edge in data.edges if edge not in within]
     apart = replace(data, edges=[*within, *refused])
     assert redundant_nodes(apart, 2.0, 20.0) == []
@@ -205,7 +205,7 @@ def test_merged_side_by_side(tmp_path: Path, map_file: Path) -> None:
         with MapStore.open(tmp_path / "both.dpm2map") as store:
             both = load_map(store)
             assert len(both) == 24
-            assert both.session == [1] * 12 + [2] * 12
+            assert [k.session for k in both.keyframes] == [1] * 12 + [2] * 12
             np.testing.assert_allclose(both.poses[12:], T @ one.poses)
             np.testing.assert_array_equal(both.clouds[15], one.clouds[3])
             assert [(e.from_node, e.to_node) for e in both.edges[13:14]] == [(12, 13)]

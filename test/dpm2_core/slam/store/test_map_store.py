@@ -100,7 +100,7 @@ def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyfra
         store.write(Change([(13, keyframes[1], pack_cloud(keyframes[1].cloud), b"jpeg")], poses={13: np.eye(4)}))
     with MapStore.open(map_file) as store:
         data = load_map(store)
-        assert data.session[-2:] == [2, 2]
+        assert [k.session for k in data.keyframes[-2:]] == [2, 2]
         np.testing.assert_allclose(data.clouds[12][:, 0], data.clouds[3][:, 0] + 2, atol=1e-5)
         borrowed, lent = data.keyframes[12].descriptors, data.keyframes[3].descriptors
         assert borrowed is not None
@@ -260,7 +260,7 @@ def test_of_two_programs_that_go_on_with_a_map_only_the_later_one_writes(
     with MapStore.open(map_file) as store:
         data = load_map(store)
     assert [keyframe.robot for keyframe in data.keyframes[12:]] == ["one", "two", "two"]
-    assert data.session[12:] == [2, 3, 3]
+    assert [k.session for k in data.keyframes[12:]] == [2, 3, 3]
 
 
 def test_a_program_that_takes_over_other_maps_goes_on_with_its_own_session(
@@ -271,7 +271,7 @@ def test_a_program_that_takes_over_other_maps_goes_on_with_its_own_session(
         append_map(store, ring(3))
         store.write(Change([(3, keyframes[0], pack_cloud(keyframes[0].cloud), None)], poses={3: np.eye(4)}))
     with MapStore.open(tmp_path / "map") as store:
-        assert load_map(store).session == [2, 2, 2, 1]
+        assert [k.session for k in load_map(store).keyframes] == [2, 2, 2, 1]
 
 
 @pytest.mark.parametrize("size", [20_000, 60_000])
