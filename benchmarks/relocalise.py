@@ -60,7 +60,7 @@ def bench_relocalise(options: Options) -> Report:
         with MapStore.open(file) as store:
             data = load_map(store)
             network = load_network(settings.neural.weights, settings.threads)
-            relocalizer = relocalizer_in(settings, network, KnownMap(data.keyframes, data.clouds, data.poses))
+            relocalizer = relocalizer_in(settings, network, KnownMap(data.keyframes, data.clouds.item, data.poses))
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):

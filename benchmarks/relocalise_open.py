@@ -86,8 +86,7 @@ def _relocalised(
 
     keyframes = [keyframe(place.frame) for place in known]
     poses = np.stack([place.T_map_lidar for place in known])
-    clouds = [keyframe.cloud for keyframe in keyframes]
-    in_map = KnownMap(keyframes, clouds, poses, lambda node: keyframes[node].thumbnail)
+    in_map = KnownMap(keyframes, lambda n: keyframes[n].cloud, poses, lambda n: keyframes[n].thumbnail)
     relocalizer = relocalizer_in(settings, network, in_map)
     rows = []
     for place in visited:

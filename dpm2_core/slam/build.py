@@ -30,7 +30,6 @@ from dpm2_core.slam.registration.neural import NeuralScanRegistration
 from dpm2_core.slam.registration.protocol import ScanRegistration
 from dpm2_core.slam.registration.visual import VisualScanRegistration
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.lazy import Chosen
 from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import Slam
@@ -128,7 +127,7 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     nodes = np.flatnonzero(mapper.placed).tolist()  # where the others are in the map is not known
     known = KnownMap(
         [mapper.keyframes[node] for node in nodes],
-        Chosen(mapper.clouds, nodes),
+        lambda i: mapper.clouds[nodes[i]],
         mapper.poses[nodes],
         lambda i: mapper.thumbnail(nodes[i]),
     )
@@ -145,7 +144,7 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
     verifiers, network = _verifiers(s), _network(s)
 
     def around(data: MapData) -> Relocalizer:
-        known = KnownMap(data.keyframes, data.clouds, data.poses, data.thumbnail)
+        known = KnownMap(data.keyframes, data.clouds.item, data.poses, data.thumbnail)
         return Relocalizer(s.relocalise, s.visual, verifiers, network, known)
 
     relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).descriptors)

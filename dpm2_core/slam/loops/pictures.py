@@ -44,12 +44,12 @@ class KnownMap:
     """A map in which places are looked for.
 
     Attributes:
-        keyframes: with descriptors. clouds: (M, 4) of each. poses: (N, 4, 4) T_map_kf.
-        thumbnail: JPEG of a node, or None.
+        keyframes: with descriptors. poses: (N, 4, 4) T_map_kf.
+        cloud: (M, 4) of a node. thumbnail: JPEG of a node, or None.
     """
 
     keyframes: Sequence[Keyframe]
-    clouds: Sequence[Points]
+    cloud: Callable[[int], Points]
     poses: Array
     thumbnail: Callable[[int], bytes | None] = lambda node: None
 
@@ -141,7 +141,7 @@ class PicturedPlaces:
         if node not in view.registered:
             result = None
             if self._known.thumbnail(node) is not None:
-                around = view.verifier.surroundings([self._known.clouds[node]], np.eye(4)[None])
+                around = view.verifier.surroundings([self._known.cloud(node)], np.eye(4)[None])
                 result = view.verifier.register(view.source, around, view.T_across, _WIDEN)
             view.registered[node] = result
         return view.registered[node]
@@ -161,7 +161,7 @@ class PicturedPlaces:
         image = usable_image(self._known.thumbnail(node))
         if image is None:
             return None
-        return reference(self._known.clouds[node], textured(image), axis)
+        return reference(self._known.cloud(node), textured(image), axis)
 
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:

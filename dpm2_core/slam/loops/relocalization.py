@@ -79,7 +79,7 @@ class Relocalizer:
         known: KnownMap,
     ) -> None:
         self._settings = settings
-        self._keyframes, self._clouds, self._poses = known.keyframes, known.clouds, known.poses
+        self._keyframes, self._cloud, self._poses = known.keyframes, known.cloud, known.poses
         self._places = PlaceRecognition(network)
         self._places.update(self._keyframes)
         self._pictures = PicturedPlaces(visual, known)
@@ -136,7 +136,7 @@ class Relocalizer:
         nodes = near[np.argsort(distance[near])[: self._settings.keyframes]].tolist()
         T_at_map = se3.inverse(self._poses[nodes[0]])
         verifier = self._verifiers.suited_to(cloud)
-        around = verifier.surroundings([self._clouds[n] for n in nodes], T_at_map @ self._poses[nodes])
+        around = verifier.surroundings([self._cloud(n) for n in nodes], T_at_map @ self._poses[nodes])
         open_way = None if along is None else along(nodes)
         result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, along=open_way)
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)

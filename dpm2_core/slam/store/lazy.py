@@ -26,16 +26,3 @@ class LazySequence(Sequence[T_co]):
     def __getitem__(self, index: int | slice) -> T_co | list[T_co]:
         at = range(len(self))[index]
         return self.item(at) if isinstance(at, int) else [self.item(i) for i in at]
-
-
-class Chosen(LazySequence[T_co]):
-    """The items of another sequence at some of its positions."""
-
-    def __init__(self, items: Sequence[T_co], positions: Sequence[int]) -> None:
-        self._items, self._positions = items, positions
-
-    def __len__(self) -> int:
-        return len(self._positions)
-
-    def item(self, index: int) -> T_co:
-        return self._items[self._positions[index]]

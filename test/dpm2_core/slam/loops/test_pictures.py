@@ -54,7 +54,7 @@ def place(x: float) -> Array:
 def in_map(keyframes: list[Keyframe]) -> KnownMap:
     """Keyframes at each of `AT`."""
     poses = np.array([place(x) for x in AT])
-    return KnownMap(keyframes, [k.cloud for k in keyframes], poses, lambda node: keyframes[node].thumbnail)
+    return KnownMap(keyframes, lambda n: keyframes[n].cloud, poses, lambda n: keyframes[n].thumbnail)
 
 
 def searching(known: KnownMap, visual: VisualSettings) -> Relocalizer:

@@ -65,7 +65,7 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
     ]
     s = SlamSettings()
     verifiers = ByScale(*(make_verifier(one) for one in (s, s.indoors())))
-    return Relocalizer(s.relocalise, s.visual, verifiers, network, KnownMap(keyframes, clouds, poses))
+    return Relocalizer(s.relocalise, s.visual, verifiers, network, KnownMap(keyframes, clouds.__getitem__, poses))
 
 
 def lone(cloud: Points) -> Keyframe:
