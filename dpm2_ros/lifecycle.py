@@ -14,7 +14,6 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
-from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_ros.guard import GuardedNode, until
@@ -41,7 +40,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
 
     def __init__(self, name: str) -> None:
         GuardedNode.__init__(self, name, automatically_declare_parameters_from_overrides=True)
-        self._config, self._robot = load_parameters(self, NodeConfig), robot_name(self)
+        self._config, self._robot = load_parameters(self, NodeConfig), self.get_namespace().strip("/")
         self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what was there before each, and its way back
         follow_changes(self, self._config, self._apply)
 
@@ -202,8 +201,3 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
                     destroy(entity)
         for name in vars(self).keys() - names:
             delattr(self, name)
-
-
-def robot_name(node: Node) -> str:
-    """The namespace without slashes at its ends: what keyframes and folders are called after."""
-    return node.get_namespace().strip("/")

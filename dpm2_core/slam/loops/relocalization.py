@@ -129,7 +129,7 @@ class Relocalizer:
         self, cloud: Points, T_map_lidar: Array, along: Callable[[Sequence[int]], Along] | None = None
     ) -> Registration:
         """As `verify`; `along` gives, of the keyframes around, what finds the way along an open direction."""
-        distance = self._distance(T_map_lidar)
+        distance = _distance(self._poses, T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
             return nowhere("outside the map")
@@ -149,17 +149,14 @@ class Relocalizer:
 
     def _across(self, places: Sequence[Registration]) -> Array:
         """Where across the road, seen from a keyframe beside it that looks the same way, and with which heading."""
-        seen = [(place, self._seen_from_nearest(place.T_target_source)) for place in places]
+        nearest = [self._poses[_distance(self._poses, place.T_target_source).argmin()] for place in places]
+        seen = [(place, se3.inverse(T) @ place.T_target_source) for place, T in zip(places, nearest, strict=True)]
         ahead = [(place, T) for place, T in seen if place.confidence > 0 and T[0, 0] > 0]
         if not ahead:
             return np.eye(4)
         place, T = max(ahead, key=lambda one: one[0].confidence)
         way = T[:3, :3] @ place.open_direction
         return se3.make(T[:3, :3], T[:3, 3] - way * (way @ T[:3, 3]))
-
-    def _seen_from_nearest(self, T_map_lidar: Array) -> Array:
-        """T_kf_lidar (4, 4) of the nearest keyframe."""
-        return se3.inverse(self._poses[int(self._distance(T_map_lidar).argmin())]) @ T_map_lidar
 
     def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
         """T_map_lidar by each keyframe, the most confident first, one for each place."""
@@ -175,10 +172,6 @@ class Relocalizer:
             if all(_is_elsewhere(proposal, other) for other in proposals):
                 proposals.append(proposal)
         return proposals
-
-    def _distance(self, T_map_lidar: Array) -> Array:
-        """Of each keyframe (N,) from a pose (4, 4), m."""
-        return _distance(self._poses, T_map_lidar)
 
 
 def _unique(places: Sequence[Registration]) -> Registration:

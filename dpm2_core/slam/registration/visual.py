@@ -80,7 +80,8 @@ class VisualScanRegistration:
         image; as uncertain as these are apart where they exclude each other."""
         by_image = self._by_image(scan, result, information)
         seen = by_image.method == "visual"
-        by_intensity = self._by_intensity(scan, result if seen else by_image, information)
+        reach, _ = self._reach(result, information)
+        by_intensity = self._intensity.along(result if seen else by_image, scan.points, reach)
         if by_intensity.method != "intensity":
             return by_image if seen else by_intensity
         if seen and not agree(by_intensity, by_image):
@@ -109,11 +110,6 @@ class VisualScanRegistration:
         reach, of_speed = self._reach(result, information)
         image_now = replace(textured(placed(image, late, scan.twist)), sigma=of_speed * abs(late))
         return along(self._settings, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
-
-    def _by_intensity(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
-        """As `_by_image`, by the intensities of the LiDAR."""
-        reach, _ = self._reach(result, information)
-        return self._intensity.along(result, scan.points, reach)
 
     def _reach(self, result: Registration, information: Array | None) -> tuple[float, float]:
         """How far to look along the open direction, m, and the standard deviation of the speed along it, m/s."""

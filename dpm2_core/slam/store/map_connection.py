@@ -98,20 +98,16 @@ def _open_to_read(path: Path) -> MapConnection:
         return MapConnection(connection)
     except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
         connection.close()
-        return _copied(path)
+        folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
+        copy = Path(folder.name) / "map"
+        copy_with_log(path, copy)
+        return MapConnection(_connect(copy, "rw"), folder)
 
 
 def _head(path: Path) -> bytes:
     """The first 100 bytes, zeros where the file is shorter; see the SQLite file format."""
     with path.open("rb") as file:
         return file.read(100).ljust(100, b"\0")
-
-
-def _copied(path: Path) -> MapConnection:
-    folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
-    copy = Path(folder.name) / "map"
-    copy_with_log(path, copy)
-    return MapConnection(_connect(copy, "rw"), folder)
 
 
 def _migrated_copy(opened: MapConnection, path: Path, version: int) -> MapConnection:
