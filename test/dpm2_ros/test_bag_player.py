@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +28,13 @@ from dpm2_core.data.image_messages import decode_image
 from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import exit_code
-from dpm2_ros.bag_player import BagPlayer, Options, main
+from dpm2_ros.bag_player import main
 from dpm2_ros.tf_message import TFMessage
+from test.helpers.lockstep import play
+from test.helpers.recordings import write_bag
 from tools.replay import ros_environment, start
 
 LATCHED_DEPTH = 10
-OPTIONS = Options(
-    bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=90.0, subscribers=1, clock=True,
-    log=None, lockstep=False,
-)  # fmt: skip
 
 
 class Listener:
@@ -65,11 +62,7 @@ class Listener:
 
     def hear_here(self, bag: Path, **options: Any) -> None:
         """Play in this process, to the end: where it is not the process that matters, without its imports."""
-        node = rclpy.create_node("bag_player", use_global_arguments=False)
-        try:
-            BagPlayer(node, replace(OPTIONS, bag=bag, **options)).play()
-        finally:
-            node.destroy_node()
+        play(bag, lockstep=False, clock=True, **options)
 
 
 @pytest.fixture
@@ -147,14 +140,14 @@ def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(list
     types = get_typestore(Stores.ROS2_JAZZY)
     kind = "tf2_msgs/msg/TFMessage"
     links = [("lidar", 1.5), *(("camera", 0.1 * n) for n in range(150)), ("lidar", math.nan)]
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection(topics.TF_STATIC, kind, typestore=types)
-        for time, (child, x) in enumerate(links):
-            T = np.eye(4)
-            T[0, 3] = x
-            writer.write(connection, time, types.serialize_cdr(transforms(time, {child: ("base_link", T)}), kind))
-        writer.write(connection, len(links), b"\0\1\0\0\xff")
-    player = listener.play(str(tmp_path / "bag"), "--wait", "90", "--loop")
+    out = [(len(links), topics.TF_STATIC, b"\0\1\0\0\xff")]
+    for at, (child, x) in enumerate(links):
+        T = np.eye(4)
+        T[0, 3] = x
+        message = transforms(at, {child: ("base_link", T)})
+        out.append((at, topics.TF_STATIC, types.serialize_cdr(message, kind)))
+    recording = write_bag(tmp_path / "bag", {topics.TF_STATIC: kind}, out)
+    player = listener.play(str(recording), "--wait", "90", "--loop")
     placed = lambda: {t.child_frame_id: t.transform.translation.x for m in listener.static for t in m.transforms}  # noqa: E731
     listener.harness.wait(lambda: len(placed()) == 2, "both frames")
     assert placed() == {"lidar": 1.5, "camera": 0.1 * 149}
@@ -170,12 +163,10 @@ def test_a_recorded_clock_is_the_only_one(
     """Of a simulation, whose time is not that of the recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
     Time, RecordedClock = types.types["builtin_interfaces/msg/Time"], types.types["rosgraph_msgs/msg/Clock"]
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/clock", RecordedClock.__msgtype__, typestore=types)
-        for n in range(5):
-            message = types.serialize_cdr(RecordedClock(Time(100 + n, 0)), RecordedClock.__msgtype__)
-            writer.write(connection, 10**18 + n * 10**8, message)
-    listener.hear_here(tmp_path / "bag")
+    kind, out = RecordedClock.__msgtype__, list[tuple[int, str, bytes]]()
+    for n in range(5):
+        out.append((10**18 + n * 10**8, "/clock", types.serialize_cdr(RecordedClock(Time(100 + n, 0)), kind)))
+    listener.hear_here(write_bag(tmp_path / "bag", {"/clock": kind}, out))
     listener.harness.wait(lambda: len(listener.clock) == 5, "the clock")
     assert [message.clock.sec for message in listener.clock] == [100, 101, 102, 103, 104]
     assert "/clock is that of the recording" in capfd.readouterr().err

@@ -15,7 +15,6 @@ import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rosbags.rosbag2 import StoragePlugin, Writer
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.frames import FrameBuilder
@@ -31,6 +30,7 @@ from dpm2_ros.subscriptions import Inputs
 from test.dpm2_ros.test_subscriptions import node  # noqa: F401
 from test.helpers.livox import custom_message, livox_store
 from test.helpers.lockstep import play
+from test.helpers.recordings import write_bag
 
 CUSTOM = "livox_ros_driver2/msg/CustomMsg"
 POINTS = np.random.default_rng(0).uniform(-20, 20, (50, 3)).astype(np.float32)
@@ -85,11 +85,9 @@ def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  
 
 def recorded(folder: Path) -> Path:
     """Five clouds of a CustomMsg."""
-    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/livox/lidar", CUSTOM, typestore=livox_store())
-        for stamp in range(10**9, 15 * 10**8, 10**8):
-            writer.write(connection, stamp + 10**8, custom_message(stamp, POINTS, SECONDS))
-    return folder
+    stamps = range(10**9, 15 * 10**8, 10**8)
+    sent = [(stamp + 10**8, "/livox/lidar", custom_message(stamp, POINTS, SECONDS)) for stamp in stamps]
+    return write_bag(folder, {"/livox/lidar": CUSTOM}, sent, livox_store())
 
 
 def test_a_recording_is_played_in_lockstep(

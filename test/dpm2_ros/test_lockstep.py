@@ -16,7 +16,6 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
 
@@ -36,6 +35,7 @@ from dpm2_core.slam.settings import Config
 from dpm2_ros import lockstep
 from dpm2_ros.conversions import pose_to_msg
 from test.helpers.lockstep import Listener, contents, play
+from test.helpers.recordings import write_bag
 from tools.replay import ros_environment, start
 
 MS = 1_000_000
@@ -61,11 +61,7 @@ def with_shots(bag: Path, folder: Path, shots: Shots, later: int) -> Path:
         pixels = np.repeat(cv2.normalize(gray, None, 0, 255, cv2.NORM_MINMAX)[..., None], 3, 2)
         message = replace(image, data=pixels.reshape(-1))
         out.append((log_time, topics.IMAGE, bytes(types.serialize_cdr(message, source.types[topics.IMAGE]))))
-    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {t: writer.add_connection(t, kind, typestore=types) for t, kind in source.types.items()}
-        for log_time, topic, data in sorted(out, key=lambda message: message[0]):
-            writer.write(connections[topic], log_time, data)
-    return folder
+    return write_bag(folder, source.types, out)
 
 
 @pytest.fixture(scope="module")
@@ -142,20 +138,19 @@ def test_a_gap_is_no_clock_that_was_set(
     types, source = get_typestore(Stores.ROS2_JAZZY), open_bag(bag)
     kinds = {topic: source.types[topic] for topic in (topics.POINTS, f"{topics.KITTI.truth}/odom")} | {topics.IMU: IMU}
     set_at = BagSource(bag).stamps.tolist()[8]
-    messages = [(topic, time, bytes(data)) for topic, time, data in source.messages(list(kinds))]
+    messages = [(time, topic, bytes(data)) for topic, time, data in source.messages(list(kinds))]
     for time in BagSource(bag).stamps.tolist():  # none in the gap either: the last cloud before waits to its end
         sample = bag_messages.imu(time, np.full(3, 0.01), np.array([0, 0, 9.8]))
-        messages.append((topics.IMU, time + MS, bytes(types.serialize_cdr(sample, IMU))))
-    with Writer(tmp_path / "gap", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
-        for topic, time, data in sorted(messages, key=lambda message: message[1]):
-            later = time >= set_at
-            moved = restamped(data, serialized_stamp(data, time) + later * ahead * MS)
-            writer.write(connections[topic], time + later * gap * MS, moved)
-    expected = [frame.stepped for frame in BagSource(tmp_path / "gap").frames()]
+        messages.append((time + MS, topics.IMU, bytes(types.serialize_cdr(sample, IMU))))
+    for n, (time, topic, data) in enumerate(messages):
+        later = time >= set_at
+        moved = restamped(data, serialized_stamp(data, time) + later * ahead * MS)
+        messages[n] = time + later * gap * MS, topic, moved
+    recording = write_bag(tmp_path / "gap", kinds, messages)
+    expected = [frame.stepped for frame in BagSource(recording).frames()]
     assert sum(expected) == (gap == 0)
     node = ros("use_sim_time:=true").add(Listener(busy=0.05))
-    play(tmp_path / "gap", clock=True)
+    play(recording, clock=True)
     assert node.stepped == expected
 
 
@@ -188,12 +183,7 @@ def with_second(bag: Path, folder: Path, seed: int) -> Path:
             message = replace(cloud, header=header, width=len(row), row_step=row.size, data=row.reshape(-1).copy())
             data = bytes(types.serialize_cdr(message, kinds[topics.POINTS]))
             out.append((at + int(rng.choice([1, 60, 300])) * MS, SECOND, data))
-    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
-        kinds[SECOND] = kinds[topics.POINTS]
-        connections = {t: writer.add_connection(t, kind, typestore=types) for t, kind in kinds.items()}
-        for log_time, topic, data in sorted(out, key=lambda message: message[0]):
-            writer.write(connections[topic], log_time, data)
-    return folder
+    return write_bag(folder, kinds | {SECOND: kinds[topics.POINTS]}, out)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from dpm2_core.data import bag_messages, topics
@@ -19,6 +18,7 @@ from dpm2_core.data.messages import cloud_fields, decode_points, point_columns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Fix
 from test.helpers.lockstep import Listener, contents, play
+from test.helpers.recordings import write_bag
 
 MS = 1_000_000
 
@@ -43,12 +43,8 @@ def recorded(bag: Path, folder: Path) -> Path:
     for stamp in range(first, last, 70 * MS):
         fix = Fix(stamp, np.array([49.0, 8.4, 100.0]), np.eye(3), np.zeros(3))
         out.append((stamp + int(rng.integers(1, 450)) * MS, topics.FIX, bag_messages.nav_sat_fix(stamp, fix)))
-    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
-        kinds = {topic: message.__msgtype__ for _, topic, message in out}
-        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
-        for log_time, topic, message in sorted(out, key=lambda entry: entry[0]):
-            writer.write(connections[topic], log_time, types.serialize_cdr(message, kinds[topic]))
-    return folder
+    kinds = {topic: message.__msgtype__ for _, topic, message in out}
+    return write_bag(folder, kinds, [(t, topic, types.serialize_cdr(m, kinds[topic])) for t, topic, m in out])
 
 
 def test_the_samples_of_a_sweep_and_a_late_fix_are_those_of_dpm2_run(

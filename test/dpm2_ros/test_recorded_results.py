@@ -4,26 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as Way
 from rclpy.serialization import serialize_message
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.topics import POINTS
-from dpm2_ros.bag_player import BagPlayer
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, transform_to_msg
 from dpm2_ros.tf_message import TFMessage
-
-from .test_bag_player import OPTIONS
+from test.helpers.lockstep import play
+from test.helpers.recordings import write_bag
 
 KINDS = {POINTS: PointCloud2, "/dpm2/odom": Odometry, "/dpm2/path": Way, "/tf": TFMessage}
 LINKS = (("map", "odom"), ("odom", "base"), ("base", "wheel"))
@@ -33,21 +28,17 @@ EYE = np.eye(4)
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Five clouds, and beside each a pose, a path, and /tf."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        of = lambda kind: f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"  # noqa: E731
-        to = {topic: writer.add_connection(topic, of(kind), typestore=store) for topic, kind in KINDS.items()}
-        for n in range(5):
-            at = 1_000_000_000 + n * 10_000_000
-            sent = {
-                POINTS: cloud_to_msg(np.ones((3, 4), np.float32), at, "lidar"),
-                "/dpm2/odom": edge_to_msg(EYE, np.eye(6), at, "odom", "base"),
-                "/dpm2/path": Way(),
-                "/tf": TFMessage(transforms=[transform_to_msg(EYE, at, *link) for link in LINKS]),
-            }
-            for topic, message in sent.items():
-                writer.write(to[topic], at, bytes(serialize_message(message)))
-    return tmp_path / "bag"
+    kinds = {topic: f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}" for topic, kind in KINDS.items()}
+    out = list[tuple[int, str, bytes]]()
+    for at in range(1_000_000_000, 1_050_000_000, 10_000_000):
+        sent = {
+            POINTS: cloud_to_msg(np.ones((3, 4), np.float32), at, "lidar"),
+            "/dpm2/odom": edge_to_msg(EYE, np.eye(6), at, "odom", "base"),
+            "/dpm2/path": Way(),
+            "/tf": TFMessage(transforms=[transform_to_msg(EYE, at, *link) for link in LINKS]),
+        }
+        out += [(at, topic, bytes(serialize_message(message))) for topic, message in sent.items()]
+    return write_bag(tmp_path / "bag", kinds, out)
 
 
 @pytest.mark.parametrize("asked", [False, True], ids=["all", "by name"])
@@ -61,11 +52,7 @@ def test_what_a_node_publishes_now_is_not_played_beside_it(
     if runs:
         harness.publisher(Odometry, "/dpm2/odom")
     left = runs and not asked
-    node = rclpy.create_node("bag_player", use_global_arguments=False)
-    try:
-        BagPlayer(node, replace(OPTIONS, bag=recording, topics=tuple(KINDS) * asked)).play()
-    finally:
-        node.destroy_node()
+    play(recording, lockstep=False, clock=True, topics=tuple(KINDS) * asked)
     harness.wait(lambda: all(len(heard[topic]) == 5 for topic in (POINTS, "/dpm2/path", "/tf")), "the recording")
     links = [(t.header.frame_id, t.child_frame_id) for message in heard["/tf"] for t in message.transforms]
     assert links == list(LINKS[2:] if left else LINKS) * 5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag in lockstep into a node that makes frames as slam_node does, and notes them."""
+"""A bag, played here, and a node that makes frames of it as slam_node does, and notes them."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.subscriptions import Inputs
 
 OPTIONS = Options(
-    bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=20.0, subscribers=1, clock=False,
-    log=None, lockstep=True,
+    bag=Path(), rate=1.0, start=0.0, duration=None, loop=False, topics=(), wait=90.0, subscribers=1, clock=False,
+    log=None,
 )  # fmt: skip
 
 
-def play(bag: Path, clock: bool = False) -> None:
-    """In lockstep, to its end; `clock`: with /clock."""
-    player = rclpy.create_node("player", use_global_arguments=False)
+def play(bag: Path, lockstep: bool = True, **options: Any) -> None:
+    """In this process, to its end."""
+    player = rclpy.create_node("bag_player", use_global_arguments=False)
     try:
-        BagPlayer(player, replace(OPTIONS, bag=bag, clock=clock)).play()
+        BagPlayer(player, replace(OPTIONS, bag=bag, lockstep=lockstep, **options)).play()
     finally:
         player.destroy_node()
 

@@ -1,14 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a recording for the tests of bags, and what a source makes of them."""
+"""Recordings and their messages for the tests of bags, and what a source makes of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
+
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from dpm2_core.data.bags import BagSource
 
 POINTS, IMAGE, INFO = "/points", "/cam/image_raw", "/cam/camera_info"
 Message = tuple[float, str, Any]
+
+
+def write_bag(
+    folder: Path, kinds: Mapping[str, str], messages: Iterable[tuple[int, str, bytes]], types: Any = None
+) -> Path:
+    """A recording of serialized messages, each with its log time (ns) and topic; `kinds`: the type of each topic."""
+    types = types or get_typestore(Stores.ROS2_JAZZY)
+    with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
+        for log_time, topic, data in sorted(messages, key=lambda message: message[0]):
+            writer.write(connections[topic], log_time, data)
+    return folder
 
 
 def clouds(bags: Any, times: list[float], topic: str = POINTS) -> list[Message]:
