@@ -20,20 +20,18 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import UInt8MultiArray
 
 from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
-from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, keyframe_name
+from dpm2_ros.conversions import cloud_to_msg, keyframe_name
 from dpm2_ros.runtime import end_ros, ros_context
 from test.helpers.rig import Rig
 from tools.replay import ros_environment
@@ -317,25 +315,19 @@ def mapper(
 ) -> Any:
     """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes; with the network
     where its parameter says so."""
-    from dpm2_ros.keyframe_messages import payload_to_msgs  # these import the whole SLAM
-    from dpm2_ros.mapper_node import MapperNode
-    from dpm2_ros.mapping import KEEP_ALL
+    from dpm2_ros.mapper_node import MapperNode  # these import the whole SLAM
+    from test.helpers.mapping import Wires
 
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
     described = str(getattr(request, "param", False)).lower()
     harness = ros(f"ros.map_directory:={tmp_path / 'map'}", f"slam.loops.descriptors:={described}")
     harness.mapper = harness.add(MapperNode())
-    kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
-    wires = [harness.node.create_publisher(kind, f"/dpm2/keyframe_{end}".rstrip("_"), KEEP_ALL) for kind, end in kinds]
-    harness.wait(lambda: all(wire.get_subscription_count() for wire in wires), "the mapper's subscriptions")
+    wires = Wires(harness)
+    wires.wait()
 
     def send(id: int, T: np.ndarray, points: np.ndarray, cloud_first: bool = False, name: str = "") -> None:
-        name = name or keyframe_name("", id)
-        pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
         keyframe = Keyframe(id, 1000 + id, id, T, points.astype(np.float32))
-        messages = list(zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True))
-        for publisher, message in reversed(messages) if cloud_first else messages:
-            publisher.publish(message)
+        wires.send(keyframe, name or keyframe_name("", id), cloud_first=cloud_first)
 
     harness.send, harness.wires = send, wires
     return harness

@@ -83,7 +83,7 @@ def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper:
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
     odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 5, "odom", "base"))
     mapper.wait(lambda: len(heard) == 1, "/tf")
-    mapper.wires[0].publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name("", 0, OTHER)))
+    mapper.wires.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name("", 0, OTHER)))
     time.sleep(0.5)
     odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 6, "odom", "base"))
     time.sleep(1.0)

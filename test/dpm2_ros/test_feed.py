@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
+from std_msgs.msg import UInt32MultiArray
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe
@@ -26,10 +24,11 @@ from dpm2_ros.deliveries import Delivery
 from dpm2_ros.diagnostics import mapper_status
 from dpm2_ros.feed import Feed, keyframe_from
 from dpm2_ros.guard import GuardedNode
-from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
 from dpm2_ros.mapping import MapperThread
 from dpm2_ros.settings import NodeConfig, RosSettings
 from dpm2_ros.unsent import KeyframeFile
+
+from ..helpers.mapping import Wires
 
 COUNT = 45  # more than may wait for the mapper
 DRIVE, NEXT = "0123abcd", "89ab0123"  # sessions
@@ -70,18 +69,14 @@ class Robot:
 
     def __init__(self, ros: Callable[..., Any], folder: Path) -> None:
         self.harness, self.folder = ros(), folder
-        kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
-        self.wires = [self.harness.node.create_publisher(kind, f"/robot/dpm2/{topic}", WIRE) for kind, topic in kinds]
+        self.wires = Wires(self.harness, "/robot")
         self.heard = self.harness.hear(UInt32MultiArray, "/robot/dpm2/keyframes_received")
         self.node = self.harness.add(Node(folder))
-        self.harness.wait(lambda: all(wire.get_subscription_count() for wire in self.wires), "the feed")
+        self.wires.wait()
 
     def send(self, count: int, session: str) -> None:
         for id in range(count):
-            name = keyframe_name("robot", id, session)
-            pose = edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000 + id, "odom", name)
-            for wire, part in zip(self.wires, (pose, *payload_to_msgs(keyframe(id), name)), strict=True):
-                wire.publish(part)
+            self.wires.send(keyframe(id), keyframe_name("robot", id, session))
 
     def acknowledged(self, session: str) -> tuple[int, int]:
         """All below that, and how many above, by the last answer."""

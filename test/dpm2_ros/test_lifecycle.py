@@ -15,13 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from dpm2_core.data.topics import POINTS
@@ -31,13 +29,13 @@ from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.active_map import ActiveMap
-from dpm2_ros.conversions import edge_to_msg, keyframe_name
-from dpm2_ros.keyframe_messages import WIRE, payload_to_msgs
+from dpm2_ros.conversions import keyframe_name
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
 from tools.replay import ros_environment, start
 
 from ..helpers.lifecycle import Manager
+from ..helpers.mapping import Wires, points
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
@@ -87,19 +85,13 @@ class Robot:
     """Its keyframes as messages."""
 
     def __init__(self, harness: Any) -> None:
-        kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
-        self.harness = harness
-        self.wires = [harness.node.create_publisher(kind, f"/dpm2/{topic}", WIRE) for kind, topic in kinds]
+        self._wires = Wires(harness)
 
     def send(self, *ids: int) -> None:
-        self.harness.wait(lambda: all(wire.get_subscription_count() for wire in self.wires), "the mapper's ears")
+        self._wires.wait()
         for id in ids:
-            T, name = se3.exp([0, 0, 0, 5.0 * id, 0, 0]), keyframe_name("", id)
-            points = np.random.default_rng(id).uniform(0, 20, (500, 4)).astype(np.float32)
-            pose = edge_to_msg(T, np.eye(6) * 1e-4, 1000 + id, "odom", name)
-            parts = (pose, *payload_to_msgs(Keyframe(id, 1000 + id, id, T, points), name))
-            for wire, part in zip(self.wires, parts, strict=True):
-                wire.publish(part)
+            keyframe = Keyframe(id, 1000 + id, id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
+            self._wires.send(keyframe, keyframe_name("", id))
 
 
 def counts(message: DiagnosticArray) -> dict[str, str]:

@@ -28,28 +28,26 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
-from dpm2_ros.keyframe_messages import WIRE, descriptors_to_msg, payload_to_msgs
+from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
 from dpm2_ros.subscriptions import LAST_ONE
 from dpm2_ros.tf_message import TFMessage
 
-from ..helpers.mapping import S, core, keyframes, mapped, points, rejections, send_all
+from ..helpers.mapping import S, Wires, core, keyframes, mapped, points, rejections, send_all
 
 
 def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) -> None:
     fix = Fix(7, np.array([49.0, 8.4, 110.0]), np.diag([4.0, 4, 16]), np.array([0.1, -0.2, 1.5]))
-    keyframe = Keyframe(0, 1000, 0, np.eye(4), points(0).astype(np.float32), fix=fix)
+    keyframe = Keyframe(0, 1000, 0, np.eye(4), points(0), fix=fix)
     name = keyframe_name("", 0)
-    seen, cloud = payload_to_msgs(keyframe, name)
+    _, cloud = payload_to_msgs(keyframe, name)
     forged, cut = copy.deepcopy(cloud), copy.deepcopy(cloud)
     forged.data[-8:] = type(cloud.data)("B", struct.pack("<d", float("nan")))
     cut.data = cloud.data[:20]
-    wires = mapper.wires
     for wrong in (forged, cut):
-        wires[2].publish(wrong)
+        mapper.wires.cloud.publish(wrong)
     for why in ("fix", "size"):
         mapper.wait(lambda of=why: mapper.mapper.rejections.get(f"/dpm2/keyframe_cloud: {of}", 0), f"rejected: {why}")
-    for wire, message in zip(wires, (edge_to_msg(np.eye(4), np.eye(6), 1000, "odom", name), seen, cloud), strict=True):
-        wire.publish(message)
+    mapper.wires.send(keyframe, name)
     mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe")
     found = core(mapper).keyframes[0].fix
     assert found is not None
@@ -62,7 +60,7 @@ def test_a_fix_travels_with_its_keyframe_and_a_forged_one_does_not(mapper: Any) 
 def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_path: Path, cloud_first: bool) -> None:
     T = [se3.exp([0, 0, 0.1 * n, 5.0 * n, 0, 0]) for n in range(4)]
     for n in range(4):
-        mapper.send(n, T[n], points(n).astype(np.float32), cloud_first)
+        mapper.send(n, T[n], points(n), cloud_first)
     mapper.wait(lambda: keyframes(mapper) == 4, "four keyframes")
     mapper.remove(mapper.mapper)
     saved = read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum")
@@ -93,9 +91,9 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
 
 
 def test_a_keyframe_of_another_name_is_rejected_and_the_rest_goes_on(mapper: Any) -> None:
-    mapper.send(0, np.eye(4), points(0).astype(np.float32))
-    mapper.send(1, np.eye(4), points(0).astype(np.float32), name="not a keyframe")
-    mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1).astype(np.float32))
+    mapper.send(0, np.eye(4), points(0))
+    mapper.send(1, np.eye(4), points(0), name="not a keyframe")
+    mapper.send(1, se3.exp([0, 0, 0, 5, 0, 0]), points(1))
     mapper.wait(lambda: keyframes(mapper) == 2, "two keyframes")
 
 
@@ -108,7 +106,7 @@ def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(mapp
 
     for n, height in enumerate((0.0, 0.0, 2.8, 2.8)):
         before = len(grids)
-        mapper.send(n, se3.exp([0, 0, 0, 5.0 * (n % 2), 0, height]), points(n).astype(np.float32))
+        mapper.send(n, se3.exp([0, 0, 0, 5.0 * (n % 2), 0, height]), points(n))
         mapper.wait(lambda expected=n + 1: keyframes(mapper) == expected, "the keyframe")
         mapper.wait(lambda than=before: len(grids) > than, "its grid")
         assert n >= 2 or not said()
@@ -146,23 +144,14 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
 
 def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) -> None:
     """map -> odom would be that of the one and of the other in turn."""
-    told, announced = mapper.diagnostics, list[tuple[Any, Odometry]]()
-    for robot in ("red", "blue"):
-        kinds = ((Odometry, "odom"), (PointCloud2, ""), (UInt8MultiArray, "cloud"))
-        topics = [f"/{robot}/dpm2/keyframe_{end}".rstrip("_") for _, end in kinds]
-        wires = [
-            mapper.node.create_publisher(kind, topic, WIRE) for (kind, _), topic in zip(kinds, topics, strict=True)
-        ]
-        mapper.wait(lambda wires=wires: all(wire.get_subscription_count() for wire in wires), "the mapper's ears")
-        name, before = keyframe_name(robot, 0), keyframes(mapper)
-        pose = edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", name)
-        keyframe = Keyframe(0, 1000, 0, np.eye(4), points(0).astype(np.float32))
-        for wire, message in zip(wires, (pose, *payload_to_msgs(keyframe, name)), strict=True):
-            wire.publish(message)
-        mapper.wait(lambda before=before: keyframes(mapper) > before, "its keyframe")
-        announced.append((wires[0], pose))
-    for wire, pose in announced:  # what was heard more than 5 s ago is over, and this machine may be busy
-        wire.publish(pose)
+    told, keyframe = mapper.diagnostics, Keyframe(0, 1000, 0, np.eye(4), points(0))
+    wires = {robot: Wires(mapper, f"/{robot}") for robot in ("red", "blue")}
+    for count, (robot, its) in enumerate(wires.items()):
+        its.wait()
+        its.send(keyframe, keyframe_name(robot, 0))
+        mapper.wait(lambda before=count: keyframes(mapper) > before, "its keyframe")
+    for robot, its in wires.items():  # what was heard more than 5 s ago is over, and this machine may be busy
+        its.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name(robot, 0)))
 
     def said() -> bool:
         return any("one odom_frame of two robots: odom" in s.message for m in told for s in m.status)
@@ -202,7 +191,7 @@ def hostile_parts(id: int) -> list[Any]:
 @pytest.mark.parametrize("mapper", [True], ids=["descriptors"], indirect=True)
 def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
     """Unsound messages are rejected one by one, and counted by their reason; the robot's own then make its map."""
-    wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires, strict=True))
+    wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires.all, strict=True))
     bad = hostile_parts(1)
     for message in bad:
         wires[type(message)].publish(message)
@@ -230,10 +219,7 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
     """The keyframe is used, and what is compared with others comes from the mapper's own network."""
     name, cloud = keyframe_name("", 0, S), points(0)
     foreign = Descriptors.of(np.ones((256, 3), "f4"), np.ones((256, 128)))
-    pose, wire = edge_to_msg(np.eye(4), np.zeros((6, 6)), 9, "odom", name), mapper.wires
-    seen, packed = payload_to_msgs(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
-    for publisher, message in zip(wire, (pose, seen, packed), strict=True):
-        publisher.publish(message)
+    mapper.wires.send(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
     mapper.wait(lambda: keyframes(mapper) == 1, "the keyframe")
     assert mapper.mapper.rejections == {"/dpm2/keyframe: descriptors of other weights": 1}
     own = core(mapper).keyframes[0].descriptors

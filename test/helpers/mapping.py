@@ -6,14 +6,41 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import UInt8MultiArray
 
+from dpm2_core.estimates import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_ros.conversions import keyframe_name
+from dpm2_ros.conversions import edge_to_msg, keyframe_name
+from dpm2_ros.keyframe_messages import payload_to_msgs
+from dpm2_ros.mapping import KEEP_ALL
 
 from .diagnostics import having
 
 S, OTHER = "5f3a9c01", "00000bad"  # sessions
+
+
+class Wires:
+    """Publishers of a robot's keyframes: of their poses, of what they saw, of their clouds."""
+
+    def __init__(self, harness: Any, namespace: str = "") -> None:
+        kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
+        create, self._harness = harness.node.create_publisher, harness
+        self.all = [create(kind, f"{namespace}/dpm2/{topic}", KEEP_ALL) for kind, topic in kinds]
+        self.pose, _, self.cloud = self.all
+
+    def wait(self) -> None:
+        """For whoever makes the map."""
+        self._harness.wait(lambda: all(wire.get_subscription_count() for wire in self.all), "the mapper's ears")
+
+    def send(self, keyframe: Keyframe, name: str, weights: str = "", cloud_first: bool = False) -> None:
+        """Its three messages."""
+        pose = edge_to_msg(keyframe.T_odom_kf, np.eye(6) * 1e-4, keyframe.stamp, "odom", name)
+        parts = list(zip(self.all, (pose, *payload_to_msgs(keyframe, name, weights)), strict=True))
+        for wire, part in reversed(parts) if cloud_first else parts:
+            wire.publish(part)
 
 
 def core(mapper: Any) -> Mapper:
@@ -32,7 +59,7 @@ def mapped(mapper: Any, count: int) -> None:
 
 
 def points(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * [20, 20, 5, 1]
+    return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * np.float32([20, 20, 5, 1])
 
 
 def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:
