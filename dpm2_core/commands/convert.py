@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, Overrides, counted, note
+from dpm2_core.commands.options import ConfigFile, InputOverrides, counted, note
 from dpm2_core.config import load_settings
 
 
@@ -17,7 +17,7 @@ def convert(
     out: Annotated[Path, typer.Argument(help="rosbag2 folder to make.")],
     frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
     config: ConfigFile = None,
-    settings: Overrides = None,
+    settings: InputOverrides = None,
     zstd: Annotated[bool, typer.Option("--zstd", help="Compress: about a third smaller, and slower.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a bag that is there.")] = False,
 ) -> None:
@@ -28,9 +28,11 @@ def convert(
     """
     from dpm2_core.data.convert import convert as write_bag  # rosbags is slow to import for the other commands
     from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import input_settings
     from dpm2_core.data.source import parse_range
     from dpm2_core.slam.settings import Config
 
+    input_settings(settings or [])  # of the SLAM nothing is of use here
     chosen, span = load_settings(Config, config, settings or []).input, parse_range(frames)
     with counted(f"{src} -> {out}") as progress:
         notes = write_bag(open_source(src, chosen), out, span, zstd, overwrite, progress)

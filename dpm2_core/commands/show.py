@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpm2_core.commands.options import note
+from dpm2_core.commands.options import InputOverrides, note
 from dpm2_core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def show(
     point: Annotated[
         int | None, typer.Option(help="Reference point whose attention to the image of B is shown.")
     ] = None,
+    settings: InputOverrides = None,
 ) -> None:
     """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.
 
@@ -39,14 +40,16 @@ def show(
     """
     from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
     from dpm2_core.data.open import open_source
-    from dpm2_core.data.settings import InputSettings
+    from dpm2_core.data.settings import input_settings
     from dpm2_core.evaluation.image_attention import image_attention
     from dpm2_core.evaluation.matches import compared_png
     from dpm2_core.network.pretrained import load_network
 
     corruption = None if corrupt is None else parse_corruption(corrupt)
     models = {name: load_network(name, threads=2) for name in weights or ["small"]}
-    source: Source = open_source(src, InputSettings(images=any(m.encoder.image is not None for m in models.values())))
+    how = input_settings(settings or [])
+    images = how.images and any(model.encoder.image is not None for model in models.values())
+    source: Source = open_source(src, how.model_copy(update={"images": images}))
     if corruption is not None:
         source = CorruptedSource(source, corruption)
     target, moving = _frame(source, src, first), _frame(source, src, second)

@@ -21,7 +21,9 @@ if TYPE_CHECKING:  # torch is slow to import
 
 SourceArgument = Annotated[
     Path,
-    typer.Argument(help="SemanticKITTI, a drive of `dpm2 sim`, a folder of such, or the pairs of DSLR."),
+    typer.Argument(
+        help="SemanticKITTI (not dslr), a drive of `dpm2 sim`, a folder of such; dslr and ae_lidar: or pairs of DSLR."
+    ),
 ]
 
 
@@ -32,7 +34,7 @@ def tasks_data(
     settings: SetOption = None,
     workers: Workers = PROCESSORS,
 ) -> None:
-    """Synthetic drives for gndnet, dslr and ae_lidar, with exact labels and twins without traffic."""
+    """Synthetic drives for all tasks, with exact labels and twins without traffic."""
     from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 
     chosen = load_settings(TaskDriveSettings, config, settings or [])
@@ -48,6 +50,7 @@ SequencesOption = Annotated[
         help="Sequences of SRC, or numbers of its pairs, with commas, such as 00,01; all there are otherwise."
     ),
 ]
+ValSequencesOption = Annotated[str | None, typer.Option(help="Of --val, as --sequences.")]
 ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure on during training, as SRC.")]
 
 
@@ -62,7 +65,7 @@ def _add(name: str, help_: str) -> None:
         resume: ResumeOption = False,
         val: ValOption = None,
         sequences: SequencesOption = None,
-        val_sequences: SequencesOption = None,
+        val_sequences: ValSequencesOption = None,
     ) -> None:
         from dpm2_core.tasks.task import task_type  # torch is slow to import
 

@@ -79,9 +79,21 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
     assert "obstruction=1,seed=1" in done.stderr
 
 
+def test_one_of_several_sequences_is_shown(sequence: Path, tmp_path: Path) -> None:
+    """The error named a setting that the command did not take."""
+    for name in ("00", "01"):
+        shutil.copytree(sequence / "velodyne", tmp_path / "sequences" / name / "velodyne")
+    call = ("show", tmp_path, "0", "1", "--out", tmp_path / "m.png", "--weights", sequence / "tiny.safetensors")
+    assert "choose one with input.sequence: 00, 01" in dpm2(*call).stderr
+    done = dpm2(*call, "--set", "input.sequence=01")
+    assert done.returncode == 0, done.stderr
+    assert "01, frame 1 to frame 0" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["0", "1", "--set", "slam.map.voxel=1"], "allowed here: input"),
         (["0", "1", "--corrupt", "nothing=1"], "nothing"),
         (["0"], "Missing argument"),
         (["0", "7"], "2 frames"),

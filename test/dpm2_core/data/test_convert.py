@@ -239,6 +239,16 @@ def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     assert len(BagSource(out)) == 5
 
 
+def test_a_setting_of_the_slam_is_an_error(kitti_folder: MakeFolder, tmp_path: Path) -> None:
+    """The help named one as its example, and it did nothing."""
+    result = CliRunner().invoke(
+        app, ["convert", str(kitti_folder()), str(tmp_path / "bag"), "--set", "slam.map.voxel=1"]
+    )
+    assert isinstance(result.exception, UsageError)
+    assert "allowed here: input" in str(result.exception)
+    assert not (tmp_path / "bag").exists()
+
+
 def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     """Frames without a pose have none in the bag either: no zero pose, no repeated one."""
     folder = kitti_folder()
