@@ -19,7 +19,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.estimates import OdometryResult
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import in_other_frame, truth_by_stamp
-from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import (
     CLOUD,
@@ -59,6 +59,7 @@ class Result:
         frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
+        lengths: of the KITTI metric's segments, m.
     """
 
     source: Source
@@ -73,6 +74,7 @@ class Result:
     frame_states: list[str] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=dict)
     wall_s: float = 0.0
+    lengths: tuple[float, ...] = OFFICIAL_LENGTHS
     interrupted: bool = False
 
     def __len__(self) -> int:
@@ -173,7 +175,7 @@ class Result:
                 return None
             poses = self.sensor_poses
             truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
-        metrics = evaluate(truth, poses, stamps=stamps, failed_frames=self.methods["failed"])
+        metrics = evaluate(truth, poses, self.lengths, stamps=stamps, failed_frames=self.methods["failed"])
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 

@@ -59,14 +59,14 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
         result = run.run(counted(advance, len(run)))
         if result.interrupted:
             raise KeyboardInterrupt
+        result.lengths = tuple(drive["lengths"])
+        if result.metrics is None:
+            raise UsageError(f"{run.source.name}: no ground truth to compare with")
         result.save(folder, cloud=False)
-        truth = _truth(run.source, drive["frames"])
         seconds = {stage: float(np.sum(times)) for stage, times in result.seconds.items()}
         accepted = sum(loop.ok for loop in result.mapper.loops)
-        figures = _measured(folder, run.source, (result.recorder.stamps, truth, result.poses), drive, result.fps)
         return {
-            **figures,
-            "failed_frames": result.methods["failed"],
+            **result.metrics.model_dump(exclude={"per_length", "per_speed"}),
             "states": dict(result.states),
             "loops": {"accepted": accepted, "rejected": len(result.mapper.loops) - accepted},
             "stage_ms": {stage: round(1e3 * total / len(result), 3) for stage, total in seconds.items()},
