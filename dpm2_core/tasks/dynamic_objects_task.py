@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves or could move, learned from labelled scans; of the other tasks it uses the trainer, not the SLAM loss."""
+"""What moves or could move, learned from labeled scans; of the other tasks it uses the trainer, not the SLAM loss."""
 
 from __future__ import annotations
 

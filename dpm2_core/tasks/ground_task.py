@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GndNet as a task: the height of the ground from labelled scans, and from a SLAM on what stands above it."""
+"""GndNet as a task: the height of the ground from labeled scans, and from a SLAM on what stands above it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from dpm2_core.tasks.training import mean_figures
 GROUND = (40, 44, 48, 49, 60, 72)
 """Road, parking, sidewalk, other ground, lane marking, terrain: SemanticKITTI's classes of the ground."""
 UNCOUNTED = (0, 1)
-"""Unlabelled, outlier."""
+"""Unlabeled, outlier."""
 
 
 class GroundTraining(SlamTaskTraining):
