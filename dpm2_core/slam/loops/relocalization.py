@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 HEIGHT = 4.0
 """m that a meter of height counts for between two places: 3 m up, on the next storey, one sees other things."""
+_KEYFRAMES = 9  # make up the map around a place, at most
 _REACH = 1.0  # m, along the road around a place that a picture has found
 
 
@@ -48,9 +49,8 @@ class RelocalizationSettings(Settings):
     """Where they do not say how far along a road one is: so many keyframes, no two of them next to each other, are
     compared by their pictures."""
     surroundings: float = Field(22.0, gt=0)
-    """Keyframes so near to a candidate make up the map to register to, m; a meter of height counts for four..."""
-    keyframes: int = Field(9, ge=1)
-    """...but no more than so many, the nearest."""
+    """Keyframes so near to a candidate make up the map to register to, m; a meter of height counts for four;
+    of more than nine the nearest."""
     hint_radius: float = Field(20.0, gt=0)
     """With a hint, keyframes farther from it than this are no candidates, m."""
     max_failures: int = Field(3, ge=1)
@@ -133,7 +133,7 @@ class Relocalizer:
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
             return nowhere("outside the map")
-        nodes = near[np.argsort(distance[near])[: self._settings.keyframes]].tolist()
+        nodes = near[np.argsort(distance[near])[:_KEYFRAMES]].tolist()
         T_at_map = se3.inverse(self._poses[nodes[0]])
         verifier = self._verifiers.suited_to(cloud)
         around = verifier.surroundings([self._cloud(n) for n in nodes], T_at_map @ self._poses[nodes])

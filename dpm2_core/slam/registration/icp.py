@@ -38,14 +38,14 @@ class GeometricSettings(Settings):
     min_points: int = Field(80, ge=1)
     """A registration with fewer inliers is rejected."""
     min_inliers: float = Field(0.5, ge=0, le=1)
-    """A registration with a smaller ratio of inliers is rejected."""
-    min_inliers_expected: float = Field(0.3, ge=0, le=1)
-    """Lower threshold while the map has at most 3 scans and the result agrees with the predicted motion (0.3 m, 2
-    degrees): while traffic occludes parts of so small a map, fewer points match. In a larger map few matches mean a
-    wrong place."""
+    """A registration with a smaller ratio of inliers is rejected; with less than 0.3 where the map has at most 3 scans
+    and the result agrees with the predicted motion (0.3 m, 2 degrees)."""
 
 
 _STEPS = 15  # of Gauss-Newton, at most
+_EXPECTED = 0.3
+"""Least ratio of inliers of a result that was expected, in a map of few scans: while traffic occludes parts of so small
+a map, fewer points match. In a larger one few matches mean a wrong place."""
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
 CORRELATED = 10
 _NORMAL_NOISE = 0.12  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, on open roads over 0.2
@@ -122,7 +122,7 @@ class GeometricRegistration:
         T = se3.orthonormalized(T)  # what rounding has added up to
         ratio = inliers / len(points)
         expected = predicted and target.is_young and near(T_guess, T)
-        least = s.min_inliers_expected if expected else s.min_inliers
+        least = min(_EXPECTED, s.min_inliers) if expected else s.min_inliers
         ok = inliers >= s.min_points and ratio >= least
         reason = "" if ok else f"{inliers} of {len(points)} points fit the map"
         result = Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
@@ -285,7 +285,7 @@ class GeometricScanRegistration:
         order = np.argsort(fit)[::-1]
         rival = next((found[i] for i in order if not near(found[i], found[order[0]], _NEAR)), None)
         result, likelihood = self._fitted(source, found[order[0]])
-        if result.confidence < self._registration.settings.min_inliers_expected:
+        if result.confidence < _EXPECTED:
             return replace(result, ok=False)
         if rival is not None:
             other, its_likelihood = self._fitted(source, rival)

@@ -38,8 +38,6 @@ class NeuralSettings(Settings):
     """Residual at which `spacing` shrinks, as `keyframes.residual`."""
     frames: int = Field(2, ge=1, le=16)
     """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
-    radius: float = Field(20.0, gt=0)
-    """Frames farther than this from the predicted pose are not registered to, unless all are, m."""
     solver: Literal["consensus", "confident"] = "consensus"
     """How pairs of descriptors become a pose: by a consensus, and matched again with the pose at hand; or, as in the
     paper, by a robust SVD that starts from the most confident pairs. Loops and relocalization follow it."""
@@ -49,10 +47,10 @@ class NeuralSettings(Settings):
     min_confidence: float = Field(0.1, ge=0, le=1)
     """Probability that a pose is right, below which there is no result: here the motion so far can contradict it. In a
     search for a place, where nothing does, at least 0.6."""
-    max_sigma: float = Field(0.6, gt=0)
-    """Largest standard deviation of the position in its worst direction, m."""
 
 
+_RADIUS = 20.0  # m: frames farther than this from the predicted pose are not registered to, unless all are
+_MAX_SIGMA = 0.6  # m, standard deviation of the position in its worst direction
 _PLACE = 0.6
 """Least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and wrong ones
 agree with each other."""
@@ -67,7 +65,7 @@ class NeuralScanRegistration:
         self._preprocessor = preprocessor
         self._model = model
         self._spacing = Spacing(settings.spacing, settings.residual)
-        self._map = DescriptorMap(self._spacing, settings.radius)
+        self._map = DescriptorMap(self._spacing, _RADIUS)
 
     def __len__(self) -> int:
         return len(self._map)
@@ -111,7 +109,7 @@ class NeuralScanRegistration:
         least = self._settings.min_confidence
         if result.confidence < (max(least, _PLACE) if prediction.unique else least):
             return result.rejected(f"right with a probability of only {result.confidence:.0%}")
-        if (sigma := result.worst_sigma) > self._settings.max_sigma:
+        if (sigma := result.worst_sigma) > _MAX_SIGMA:
             return result.rejected(f"position uncertain by {sigma:.2f} m")
         if prediction.information is not None:
             covariance = np.linalg.inv(prediction.information).astype(np.float64)
