@@ -2,12 +2,11 @@
 """Where the network looks: the attention of a reference point to the image (the paper's Figure 7).
 
 The network keeps no attention weights, since that would cost time and memory in every frame. They are computed again
-here from what the last fusion layer's image attention was given and its own projections.
+of what the last fusion layer's image attention was given.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +86,7 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
         point = int(np.where(seen, off, np.inf).argmin())
     elif not 0 <= point < len(seen) or not seen[point]:
         raise UsageError(f"point {point}: want one in the image: {', '.join(map(str, np.flatnonzero(seen)))}")
-    weights = attention_weights(attention, *given[-1])[0, :, point].mean(0)
+    weights = attention.weights(*given[-1])[0, :, point].mean(0)
     sizes = [m.features.shape[-2:] for m in encoded.maps]
     heat = np.zeros((height, width), np.float32)
     for (h, w), part in zip(sizes, weights.float().cpu().split([h * w for h, w in sizes]), strict=True):
@@ -97,25 +96,6 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     heat /= max(float(heat.max()), 1e-9)
     pixels = views.pixels[0, 0].permute(1, 2, 0).cpu().numpy()
     return ImageAttention(pixels, xyz[0].cpu().numpy().astype(np.float64), uv, seen, point, heat)
-
-
-def attention_weights(
-    attention: Attention, x: Tensor, tokens: Tensor, bias: Tensor | None, mask: Tensor | None
-) -> Tensor:
-    """(B, heads, N, T), rows adding up to 1; the arguments are those of `Attention.forward`."""
-
-    def split(values: Tensor) -> Tensor:
-        return values.view(*values.shape[:2], attention.heads, -1).transpose(1, 2)
-
-    scores = torch.zeros((), device=x.device)
-    if attention.query is not None and attention.key is not None:
-        scores = split(attention.query(x)) @ split(attention.key(tokens)).transpose(-1, -2)
-        scores = scores / math.sqrt(x.shape[-1] // attention.heads)
-    if bias is not None:
-        scores = scores + bias
-    if mask is not None:
-        scores = scores.masked_fill(~mask, -1e4)
-    return scores.expand(-1, attention.heads, -1, -1).softmax(-1)
 
 
 def _projected(xyz: Tensor, views: Any) -> Array:

@@ -100,6 +100,17 @@ class Attention(nn.Module):
         batch, n, width = x.shape
         mask = hiding(mask)
         value = self._split(self.value(tokens))
+        weights = self.weights(x, tokens, bias, mask)
+        with torch.autocast(x.device.type, enabled=False):
+            out = weights.to(value.dtype) @ value
+        out = self.out(out.transpose(1, 2).reshape(batch, n, width))
+        if mask is None:
+            return out
+        readable = mask.any(-1).any(1)[..., None]  # (B, N or 1, 1)
+        return torch.where(readable, out, torch.zeros_like(out))
+
+    def weights(self, x: Tensor, tokens: Tensor, bias: Tensor | None, mask: Tensor | None) -> Tensor:
+        """How much of each token is read, (B, heads, N, T), rows adding up to 1; as `forward`."""
         query = key = None
         if self.query is not None and self.key is not None:
             query, key = self._split(self.query(x)), self._split(self.key(tokens))
@@ -107,7 +118,7 @@ class Attention(nn.Module):
         # stays in bf16 under autocast.
         with torch.autocast(x.device.type, enabled=False):
             if query is not None and key is not None:
-                scores = (query / math.sqrt(width // self.heads)) @ key.transpose(-1, -2)
+                scores = (query / math.sqrt(x.shape[-1] // self.heads)) @ key.transpose(-1, -2)
                 scores = scores if bias is None else scores.add_(bias.to(scores.dtype))
             elif bias is not None:
                 scores = bias.expand(-1, self.heads, -1, -1).clone()
@@ -115,12 +126,7 @@ class Attention(nn.Module):
                 raise ValueError("attention without learned similarity needs a spatial bias")
             if mask is not None:
                 scores = scores.masked_fill_(~mask, -1e4)  # finite: a row without tokens stays free of NaN
-            out = scores.softmax(-1).to(value.dtype) @ value
-        out = self.out(out.transpose(1, 2).reshape(batch, n, width))
-        if mask is None:
-            return out
-        readable = mask.any(-1).any(1)[..., None]  # (B, N or 1, 1)
-        return torch.where(readable, out, torch.zeros_like(out))
+            return scores.softmax(-1)
 
     def _split(self, x: Tensor) -> Tensor:
         return x.view(*x.shape[:2], self.heads, x.shape[2] // self.heads).transpose(1, 2)

@@ -7,33 +7,14 @@ import pickle
 
 import numpy as np
 import pytest
-import torch
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.image_attention import attention_weights, image_attention
+from dpm2_core.evaluation.image_attention import image_attention
 from dpm2_core.frame import Frame
-from dpm2_core.network.attention import Attention
 from dpm2_core.network.model import DeepPointMap2
 
 from ...helpers.networks import tiny
 from ...helpers.scenes import boxes, make_image
-
-
-@pytest.mark.parametrize("learnable", [True, False])
-def test_weights_give_what_the_module_gives(learnable: bool) -> None:
-    """Recomputed weights times the values, through the output projection, are the output of the module."""
-    torch.manual_seed(0)
-    attention = Attention(16, 4, learnable)
-    x, tokens, bias = torch.randn(2, 5, 16), torch.randn(2, 7, 16), torch.randn(2, 1, 5, 7)
-    mask = torch.ones(2, 1, 1, 7, dtype=torch.bool)
-    mask[..., 3:5] = False
-    weights = attention_weights(attention, x, tokens, bias, mask)
-    assert weights.shape == (2, 4, 5, 7)
-    assert weights[..., 3:5].max() < 1e-6
-    torch.testing.assert_close(weights.sum(-1), torch.ones(2, 4, 5))
-    value = attention.value(tokens).view(2, 7, 4, 4).transpose(1, 2)
-    out = attention.out((weights @ value).transpose(1, 2).reshape(2, 5, 16))
-    torch.testing.assert_close(out, attention(x, tokens, bias, mask))
 
 
 @pytest.fixture
