@@ -182,7 +182,7 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
         clock.append(perf_counter())
         pyramid = build_pyramid(cloud, network.settings, images)
         clock.append(perf_counter())
-        descriptors = encoder.encode_batch(collate([pyramid]), views, next(network.parameters()).device)[0]
+        descriptors = encoder.encode_batch(collate([pyramid]), views)[0]
         clock.append(perf_counter())
         network.register(descriptors, before or descriptors)
         clock.append(perf_counter())

@@ -86,7 +86,7 @@ def _described(
             out[i] = network.describe(Frame(i, points))
             continue
         pyramid = build_pyramid(crop(points, network.settings.points), network.settings)
-        out[i] = network.encoder.encode_batch(collate([pyramid]), None, next(network.parameters()).device)[0]
+        out[i] = network.encoder.encode_batch(collate([pyramid]), None)[0]
     return out
 
 

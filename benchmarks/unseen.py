@@ -77,7 +77,7 @@ class _Changed:
     """A packed drive whose samples are changed as they are read."""
 
     def __init__(self, drive: PackedDrive, change: Callable[[Sample, int], Sample]) -> None:
-        self._drive, self._change, self.poses = drive, change, drive.poses
+        self._drive, self._change, self.poses, self.about = drive, change, drive.poses, drive.about
 
     def __len__(self) -> int:
         return len(self._drive)

@@ -16,7 +16,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.network.images import in_encoded_axes
 from dpm2_core.network.model import DeepPointMap2
-from dpm2_core.network.packed_frames import check_images, cropped_anew, is_cropped_anew
+from dpm2_core.network.packed_frames import check_fits, fitted
 from dpm2_core.network.pyramid import build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import collate_views
@@ -43,9 +43,8 @@ class PairSet:
         noise = np.random.default_rng(0)
         self.drives = open_packed(root)
         self.network, self.images = network, images
-        self._cropped_anew = [is_cropped_anew(drive, network.points) for drive in self.drives]
-        for drive in self.drives if images else ():
-            check_images(drive, network)
+        for drive in self.drives:
+            check_fits(drive, network, images)
         self.frames: dict[tuple[int, int, float], int] = {}
         self.pairs: list[tuple[int, int, np.ndarray, float]] = []
         self._scale: list[float] = []
@@ -77,18 +76,15 @@ class PairSet:
         """Descriptors of every frame of the set."""
         keys = list(self.frames)
         out: list[Descriptors] = []
-        device = next(model.parameters()).device
         for begin in range(0, len(keys), 8):
             pyramids, images = [], []
             for drive, index, yaw in keys[begin : begin + 8]:
-                sample = self.drives[drive][index]
+                sample = fitted(self.drives[drive][index], self.drives[drive], self.network.points)
                 turn = se3.exp([0, 0, yaw, 0, 0, 0])
                 R = turn[:3, :3]
                 images.append([in_encoded_axes(image, R, 1.0) for image in sample.images] if self.images else [])
-                anew = self._cropped_anew[drive]
-                cloud = cropped_anew(sample.cloud, self.network.points) if anew else sample.cloud
-                pyramids.append(build_pyramid(se3.transform(turn, cloud), self.network, images[-1]))
-            out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image), device)
+                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network, images[-1]))
+            out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image))
         return out
 
     def errors(self, model: DeepPointMap2) -> np.ndarray:

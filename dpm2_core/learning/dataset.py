@@ -20,7 +20,7 @@ from dpm2_core.data.packed import PackedDrive, Sample, open_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.learning.augment import AugmentSettings, augment
-from dpm2_core.network.packed_frames import check_images, cropped_anew, is_cropped_anew
+from dpm2_core.network.packed_frames import check_fits, fitted
 from dpm2_core.network.pyramid import MIN_POINTS, PointBatch, Pyramid, build_pyramid, collate
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import Views, collate_views
@@ -155,9 +155,8 @@ class GroupDataset(Dataset[Batch]):
         self.drives = Mixture(settings)
         if settings.images and not any(drive.has_images for drive in self.drives.drives):
             raise UsageError("data.images: no packed drive of data.packed has images; data.images=false learns without")
-        for drive in self.drives.drives if settings.images else ():
-            check_images(drive, network)
-        self._cropped_anew = {d.folder for d in self.drives.drives if is_cropped_anew(d, network.points)}
+        for drive in self.drives.drives:
+            check_fits(drive, network, settings.images)
 
     def __getitem__(self, place: tuple[int, int]) -> Batch:
         """Batch of (step, rank of the process)."""
@@ -183,9 +182,7 @@ class GroupDataset(Dataset[Batch]):
         """
         for _ in range(_PLACES):
             drive = self.drives.choose(noise)
-            found = [drive[index] for index in self.draw(drive, noise)]
-            if drive.folder in self._cropped_anew:
-                found = [s._replace(cloud=cropped_anew(s.cloud, self.network.points)) for s in found]
+            found = [fitted(drive[index], drive, self.network.points) for index in self.draw(drive, noise)]
             if min(len(sample.cloud) for sample in found) >= _LEAST:
                 return [augment(sample, self.settings.augment, noise) for sample in found]
         raise Dpm2Error(f"of {_PLACES} places of the packed drives, each has a scan of fewer than {_LEAST} points")

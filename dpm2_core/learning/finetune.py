@@ -76,9 +76,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
     """
     groups, frames = poses.shape[:2]
     number = torch.arange(groups * frames, device=poses.device).view(groups, frames)
-    source, target = (
-        Tokens(*(field[index.flatten()] for field in tokens)) for index in (number[:, 1:], number[:, :-1])
-    )
+    source, target = tokens.at(number[:, 1:]), tokens.at(number[:, :-1])
     truth = (torch.linalg.inv(poses[:, :-1]) @ poses[:, 1:]).flatten(0, 1)
     T, usable = differentiable_poses(decoder, source, target, decoder(source, target), truth)
     steps = torch.where(usable[:, None, None], T, truth).unflatten(0, (groups, frames - 1))

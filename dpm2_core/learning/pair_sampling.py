@@ -78,12 +78,11 @@ def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -
     `to_tokens` has it in use.
     """
     batch, size = index.shape
-    flat = index.flatten()
+    members = tokens.at(index)
     if size == 1:  # its own frame
-        return Tokens(*(field[flat] for field in tokens))
+        return members
     T = T.flatten(0, 1)
-    xyz = transform(T, tokens.xyz[flat])
-    axis = tokens.axis[flat]
+    xyz, axis = transform(T, members.xyz), members.axis
     if view_aligned:
         axis = _turned(axis, T)
         axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
@@ -91,4 +90,4 @@ def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -
     def joined(x: Tensor) -> Tensor:
         return x.reshape(batch, -1, *x.shape[2:])
 
-    return Tokens(joined(xyz), joined(tokens.features[flat]), joined(axis), joined(tokens.mask[flat]))
+    return Tokens(joined(xyz), joined(members.features), joined(axis), joined(members.mask))

@@ -32,7 +32,6 @@ from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.solved import Solved, confidence_of, overlap_features
-from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.views import Views
 from dpm2_core.network.weights import load_weights, network_settings, save_weights
 
@@ -114,8 +113,7 @@ class OverlapTraining(nn.Module):
         with torch.no_grad():
             tokens = self.model.encoder(points, views).tokens
             number = torch.arange(len(tokens.xyz), device=tokens.xyz.device).view(-1, FRAMES)
-            source = Tokens(*(field[number[:, :1].expand(-1, FRAMES - 1).flatten()] for field in tokens))
-            target = Tokens(*(field[number[:, 1:].flatten()] for field in tokens))
+            source, target = tokens.at(number[:, :1].expand(-1, FRAMES - 1)), tokens.at(number[:, 1:])
             correlated = self.model.decoder(source, target)
             solved = solve_batch(self.model.decoder, source, target, correlated)
             nothing = source.xyz.new_zeros(len(source.xyz), POSE_FEATURES)

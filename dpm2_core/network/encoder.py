@@ -87,31 +87,31 @@ class Encoder(nn.Module):
         Raises:
             Dpm2Error: too few points in range, or the result is not finite.
         """
-        device = next(self.parameters()).device
         cloud, scale = crop(frame.points, self.settings.points), scale_of(frame.points)
         images = [small_image(image, self.settings.image) for image in frame.images] if self.image is not None else []
         up = tilt_of(cloud, frame.up)
         if scale != 1:
             cloud = crop(frame.points[:, :3] * np.float32(scale), self.settings.points)
         if up is None and scale == 1:
-            return self._encode(cloud, images, device)
+            return self._encode(cloud, images)
         R = np.eye(3, dtype=np.float32) if up is None else levelling(up)
         views = [in_encoded_axes(image, R, scale) for image in images]
-        made = self._encode(np.ascontiguousarray(cloud @ R.T), views, device)
+        made = self._encode(np.ascontiguousarray(cloud @ R.T), views)
         return replace(made, xyz=made.xyz @ R / np.float32(scale), up=up, scale=scale)
 
-    def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image], device: torch.device) -> Descriptors:
+    def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image]) -> Descriptors:
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
         points = collate([build_pyramid(cloud, self.settings, images)])
         views = collate_views([images], self.settings.image)
-        made = self.encode_batch(points, views, device)[0]
+        made = self.encode_batch(points, views)[0]
         if not np.isfinite(made.step).all():
             raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")
         return made
 
     @torch.inference_mode()
-    def encode_batch(self, points: PointBatch, views: Views | None, device: torch.device) -> list[Descriptors]:
+    def encode_batch(self, points: PointBatch, views: Views | None) -> list[Descriptors]:
         """Descriptors of a batch of prepared frames."""
+        device = next(self.parameters()).device
         with mixed_precision(device):
             tokens = self(*to_device((points, views), device)).tokens
         xyz, features, mask = (field.cpu() for field in (tokens.xyz, tokens.features.float(), tokens.mask))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.packed import PackedDrive
+from dpm2_core.data.packed import PackedDrive, Sample
 from dpm2_core.errors import UsageError
 from dpm2_core.network.pyramid import crop
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
@@ -19,14 +19,9 @@ def crop_of(points: PointsSettings) -> dict[str, float]:
     return {name: getattr(points, name) for name in _CROP}
 
 
-def is_cropped_anew(drive: PackedDrive, points: PointsSettings) -> bool:
-    """Whether the clouds of a drive have to be cropped anew, since a network wants less of them than was packed.
-
-    Raises:
-        UsageError: it wants more.
-    """
-    wanted = crop_of(points)
-    packed = drive.about.get("crop", crop_of(PointsSettings()))  # one that does not say is of the presets
+def check_fits(drive: PackedDrive, network: NetworkSettings, images: bool) -> None:
+    """Raise UsageError where a network wants more than was packed: of the clouds and, if they are read, the images."""
+    packed, wanted = _packed_crop(drive), crop_of(network.points)
     for name in _CROP:
         less = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
         if less > 0:
@@ -34,7 +29,12 @@ def is_cropped_anew(drive: PackedDrive, points: PointsSettings) -> bool:
                 f"{drive.folder}: packed with points.{name} {packed[name]:g}, the network has {wanted[name]:g}: its"
                 " clouds lack points"
             )
-    return wanted != packed
+    if images:
+        check_images(drive, network)
+
+
+def _packed_crop(drive: PackedDrive) -> dict[str, float]:
+    return drive.about.get("crop", crop_of(PointsSettings()))  # one that does not say is of the presets
 
 
 def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
@@ -45,6 +45,13 @@ def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
             f"{drive.folder}: packed with images of {packed[0]} x {packed[1]}, the network has {height} x {width}"
             " (image.size); pack it with the network's --preset"
         )
+
+
+def fitted(sample: Sample, drive: PackedDrive, points: PointsSettings) -> Sample:
+    """A sample of a drive as a network sees it, which may want less of its cloud than was packed."""
+    if _packed_crop(drive) == crop_of(points):
+        return sample
+    return sample._replace(cloud=cropped_anew(sample.cloud, points))
 
 
 def cropped_anew(cloud: NDArray[np.float32], points: PointsSettings) -> NDArray[np.float32]:

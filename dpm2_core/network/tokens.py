@@ -29,6 +29,10 @@ class Tokens(NamedTuple):
     axis: Tensor
     mask: Tensor
 
+    def at(self, index: Tensor) -> Tokens:
+        """The sets with these numbers, of any shape, one after the other."""
+        return Tokens(*(field[index.flatten()] for field in self))
+
 
 def to_tokens(sets: Sequence[Descriptors], view_aligned: bool, device: torch.device | str = "cpu") -> Tokens:
     """A padded batch."""

@@ -107,7 +107,7 @@ def test_where_there_is_nothing_to_level_the_descriptors_are_those_of_the_scan_a
     points = {"level": level, "leans by 3 degrees": level @ lean.T, "no ground": leaves}[what]
     found = network.describe(frame(points))
     pyramid = build_pyramid(crop(frame(points).points, network.settings.points), network.settings)
-    plain = network.encoder.encode_batch(collate([pyramid]), None, torch.device("cpu"))[0]
+    plain = network.encoder.encode_batch(collate([pyramid]), None)[0]
     assert found.up is None
     np.testing.assert_array_equal(found.xyz, plain.xyz)
     np.testing.assert_array_equal(found.features, plain.features)
