@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpm2_core.data.source import IndexedSource
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
@@ -16,6 +17,17 @@ from dpm2_core.sim.world import World, build_world
 
 Drive = tuple[list[Frame], Array]
 """Frames and their (N, 4, 4) true poses relative to the first."""
+
+
+class InMemory(IndexedSource):
+    """A drive of these frames."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        super().__init__("memory", len(frames))
+        self.all = frames
+
+    def frame(self, position: int) -> Frame:
+        return self.all[position]
 
 
 @cache

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from dpm2_core.data import bag_messages
 from dpm2_core.data.messages import cloud_fields, point_columns
@@ -64,8 +65,10 @@ class BagMaker:
 
     def cloud(self, stamp: float, x: float = 1.0, count: int = 60, frame: str = "velo_link") -> Any:
         """`count` points whose x says which cloud it is."""
-        points = np.full((count, 4), [x, 2, 3, 0.5], np.float32)
-        fields = cloud_fields(point_columns(points), self.store.types["sensor_msgs/msg/PointField"])
+        return self.cloud_of(stamp, point_columns(np.full((count, 4), [x, 2, 3, 0.5], np.float32)), frame)
+
+    def cloud_of(self, stamp: float, columns: Mapping[str, np.ndarray], frame: str = "velo_link") -> Any:
+        fields = cloud_fields(columns, self.store.types["sensor_msgs/msg/PointField"])
         return self.new("sensor_msgs/PointCloud2", header=self.header(stamp, frame), **fields)
 
     def image(self, stamp: float, value: int = 0, encoding: str = "mono8", size: tuple[int, int] = (8, 6)) -> Any:
@@ -81,8 +84,8 @@ class BagMaker:
                         distortion_model="plumb_bob", d=np.zeros(5), k=K, r=np.eye(3).reshape(-1), p=np.zeros(12),
                         binning_x=0, binning_y=0, roi=roi)  # fmt: skip
 
-    def transform(self, parent: str, child: str, xyz: tuple[float, float, float]) -> Any:
-        return bag_messages.transforms(0, {child: (parent, se3.make(np.eye(3), xyz))})
+    def transform(self, parent: str, child: str, xyz: Sequence[float], R: ArrayLike | None = None) -> Any:
+        return bag_messages.transforms(0, {child: (parent, se3.make(np.eye(3) if R is None else R, xyz))})
 
     def odometry(self, stamp: float, x: float, child: str = "velo_link") -> Any:
         return bag_messages.odometry(round(stamp * 1e9), child, se3.make(np.eye(3), [x, 0, 0]))

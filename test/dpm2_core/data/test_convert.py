@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.source import Span
+from dpm2_core.data.source import IndexedSource, Span
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Camera, Fix, Frame, Image, Inertial
 from dpm2_core.geometry import se3
@@ -259,13 +259,13 @@ def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_
     assert np.isnan(poses[3:]).all()
 
 
-class OtherDrive:
+class OtherDrive(IndexedSource):
     """A source as any other: two cameras with distortion, times of points, an IMU, GNSS, stamps since 1970."""
 
-    name, truth, T_cam_lidar = "other", "here", None
+    truth = "here"
 
     def __init__(self) -> None:
-        self.notes: list[str] = []
+        super().__init__("other", 3)
         self.poses = np.tile(np.eye(4), (3, 1, 1))
         self.poses[:, 0, 3] = [0, 1, np.nan]
         self.cameras = [
@@ -274,21 +274,17 @@ class OtherDrive:
             for y, distortion, name in ((0.3, (-0.2, 0.1, 1e-3, 0, 0), "left"), (-0.3, tuple(range(8)), "right"))
         ]  # fmt: skip
 
-    def __len__(self) -> int:
-        return 3
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+    def frame(self, position: int) -> Frame:
         """The second has no image of the left camera, and each has the last sample of the one before once more."""
-        for index in range(*slice(start, stop).indices(3)):
-            rng, stamp = np.random.default_rng(index), STAMP + index * 10**8
-            points = np.c_[rng.uniform(-20, 20, (30, 3)), rng.uniform(size=30)].astype(np.float32)
-            pixels = rng.integers(0, 256, (2, 20, 40, 3)).astype(np.uint8)
-            images = [Image(pixels[n], camera, 0.004 * n) for n, camera in enumerate(self.cameras)]
-            samples = np.arange(-10, 1) * 10**7 + stamp
-            imu = Inertial(samples, np.outer(samples - STAMP, [1, 2, 3]) * 1e-9, np.ones((11, 3)))
-            fix = Fix(stamp, np.array([49.0 + index * 1e-5, 8.4, 120.0]), np.diag([1.0, 1, 4]), np.array([0, 0, 0.5]))
-            offset = np.linspace(-0.1, 0, 30, dtype=np.float32)
-            yield Frame(stamp, points, offset, tuple(images[index == 1 :]), index, imu=imu, fix=fix)
+        rng, stamp = np.random.default_rng(position), STAMP + position * 10**8
+        points = np.c_[rng.uniform(-20, 20, (30, 3)), rng.uniform(size=30)].astype(np.float32)
+        pixels = rng.integers(0, 256, (2, 20, 40, 3)).astype(np.uint8)
+        images = [Image(pixels[n], camera, 0.004 * n) for n, camera in enumerate(self.cameras)]
+        samples = np.arange(-10, 1) * 10**7 + stamp
+        imu = Inertial(samples, np.outer(samples - STAMP, [1, 2, 3]) * 1e-9, np.ones((11, 3)))
+        fix = Fix(stamp, np.array([49.0 + position * 1e-5, 8.4, 120.0]), np.diag([1.0, 1, 4]), np.array([0, 0, 0.5]))
+        offset = np.linspace(-0.1, 0, 30, dtype=np.float32)
+        return Frame(stamp, points, offset, tuple(images[position == 1 :]), position, imu=imu, fix=fix)
 
 
 def test_any_drive_becomes_a_bag_of_the_same_frames(tmp_path: Path) -> None:

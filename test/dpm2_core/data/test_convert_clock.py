@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,23 +15,9 @@ from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.messages import serialized_stamp
 from dpm2_core.frame import Frame, Inertial
 
+from ...helpers.drives import InMemory
+
 STAMP = 1_700_000_000_000_000_000  # ns
-
-
-class Recording:
-    """A drive of these frames."""
-
-    name, truth, T_cam_lidar, poses = "clock", "", None, None
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self.all, self.notes = frames, list[str]()
-
-    def __len__(self) -> int:
-        return len(self.all)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """All of them."""
-        yield from self.all
 
 
 def test_clouds_are_recorded_at_the_end_of_their_sweeps(tmp_path: Path) -> None:
@@ -41,7 +26,7 @@ def test_clouds_are_recorded_at_the_end_of_their_sweeps(tmp_path: Path) -> None:
     drive = [frame_of(STAMP + i * 10**8, i, STAMP + i * 10**8 + np.arange(1, 11) * 10**7) for i in range(10)]
     ends = [0.101] * 5 + [1.5] + [0.1] * 4
     drive = [replace(f, time_offset=np.float32([0, end / 2, end])) for f, end in zip(drive, ends, strict=True)]
-    convert(Recording(drive), tmp_path / "bag")
+    convert(InMemory(drive), tmp_path / "bag")
     clouds, samples = list[tuple[int, int]](), 0
     for topic, time, data in open_bag(tmp_path / "bag").messages(["/points", "/imu"]):
         samples += topic == "/imu"
@@ -70,7 +55,7 @@ def frame_of(stamp: int, index: int, samples: np.ndarray, stepped: bool = False)
 def test_the_order_is_kept_where_the_clock_is_set(tmp_path: Path, stamps: list[int]) -> None:
     """Players and readers go by the time of recording, and nothing is lost."""
     frames = [frame_of(stamp, index, np.array([stamp - 10**7])) for index, stamp in enumerate(stamps)]
-    convert(Recording(frames), tmp_path / "bag")
+    convert(InMemory(frames), tmp_path / "bag")
     bag = open_bag(tmp_path / "bag")
     clouds = [bag.decode(topic, data) for topic, _, data in bag.messages(["/points"])]
     assert [float(np.frombuffer(cloud.data, "<f4")[0]) for cloud in clouds] == [0, 1, 2, 3]
@@ -85,7 +70,7 @@ def test_a_clock_that_was_set_ahead_is_no_pause_in_the_bag(tmp_path: Path, perio
     stamps = [STAMP + index * period + (2 * 10**9 if index > 4 else 0) for index in range(10)]
     ago = np.arange(10)[::-1] * period // 10
     drive = [frame_of(stamp, index, stamp - ago, index == 5) for index, stamp in enumerate(stamps)]
-    convert(Recording(drive), tmp_path / "bag")
+    convert(InMemory(drive), tmp_path / "bag")
     frames = [(frame.stamp, frame.stepped) for frame in BagSource(tmp_path / "bag").frames()]
     assert frames == [(frame.stamp, frame.stepped) for frame in drive]
     assert open_bag(tmp_path / "bag").counts["/imu"] == 100

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,6 +17,7 @@ from dpm2_core.data.corrupt import (
     parse_corruption,
     random_box,
 )
+from dpm2_core.data.source import IndexedSource
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Frame, Image
 from dpm2_core.geometry import se3
@@ -26,28 +25,21 @@ from dpm2_core.geometry import se3
 N = 20
 
 
-class Drive:
+class Drive(IndexedSource):
     """Twenty frames of 2,000 points and one image, whose brightness is its number."""
 
-    name = "drive"
     truth = "poses/drive.txt"
-    poses = None
-    T_cam_lidar = None
 
     def __init__(self) -> None:
-        self.notes: list[str] = []
+        super().__init__("drive", N)
         rng = np.random.default_rng(0)
         self.points = rng.uniform(-30, 30, (N, 2000, 4)).astype(np.float32)
         self.camera = Camera(np.eye(3), se3.exp([0.1, 0, 0, 1.0, 0, 0]), (6, 4))
 
-    def __len__(self) -> int:
-        return N
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        for i in range(N)[start:stop]:
-            image = Image(np.full((4, 6, 3), 10 + i, np.uint8), self.camera)
-            offset = np.linspace(0, 0.1, 2000, dtype=np.float32)
-            yield Frame(i * 10**8, self.points[i], offset, (image,), i)
+    def frame(self, position: int) -> Frame:
+        image = Image(np.full((4, 6, 3), 10 + position, np.uint8), self.camera)
+        offset = np.linspace(0, 0.1, 2000, dtype=np.float32)
+        return Frame(position * 10**8, self.points[position], offset, (image,), position)
 
 
 def corrupted(**settings: float) -> list[Frame]:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert
-from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.data.messages import point_columns
 from dpm2_core.geometry import se3
 
 from ...helpers.rooms import boxes, scan
@@ -23,24 +23,18 @@ Roll = tuple[float, float]
 """Of a frame in its parent, with its pitch, degrees."""
 
 
-def placed(bags: Any, parent: str, child: str, turn: Roll) -> Any:
-    message = bags.transform(parent, child, (0.5, 0, 1.7))
-    x, y, z, w = Rotation.from_euler("xy", turn, degrees=True).as_quat().tolist()
-    message.transforms[0].transform.rotation = bags.new("geometry_msgs/Quaternion", x, y, z, w)
-    return message
+def rotation(turn: Roll) -> NDArray[np.float64]:
+    return Rotation.from_euler("xy", turn, degrees=True).as_matrix()
 
 
 def read(bags: Any, folder: Path, links: Sequence[tuple[str, str, Roll]], turn: Roll = (0, 0)) -> BagSource:
     """A bag of two clouds of a street, of a LiDAR that is mounted with a turn."""
     hull, things = np.array([[-60, -12, 0], [60, 12, 30.0]]), boxes((-40, -8), (40, 8), 20, np.array([4.0, 2.0, 2.0]))
     points = scan(se3.make(np.eye(3), [0, 0, 1.7]), hull, things, 0)
-    T = se3.make(Rotation.from_euler("xy", turn, degrees=True).as_matrix().T, np.zeros(3))
-    fields = cloud_fields(point_columns(se3.transform(T, points)), bags.store.types["sensor_msgs/msg/PointField"])
-    clouds = [bags.new("sensor_msgs/PointCloud2", header=bags.header(t, "velo_link"), **fields) for t in (1.0, 1.1)]
-    messages = [(t, "/points", cloud) for t, cloud in zip((1.0, 1.1), clouds, strict=True)]
-    return BagSource(
-        bags.write(folder / "b", [*((0.5, "/tf_static", placed(bags, *link)) for link in links), *messages])
-    )
+    columns = point_columns(se3.transform(se3.make(rotation(turn).T, np.zeros(3)), points))
+    clouds = [(t, "/points", bags.cloud_of(t, columns)) for t in (1.0, 1.1)]
+    placed = [bags.transform(parent, child, (0.5, 0, 1.7), rotation(roll)) for parent, child, roll in links]
+    return BagSource(bags.write(folder / "b", [*((0.5, "/tf_static", message) for message in placed), *clouds]))
 
 
 def ups(source: BagSource) -> NDArray[np.float64]:

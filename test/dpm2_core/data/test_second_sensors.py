@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.messages import cloud_fields
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from test.helpers.recordings import IMAGE, POINTS, Message, by_time, clouds, rig
@@ -40,8 +39,7 @@ def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any,
     columns["t"] = np.linspace(0, 0.1, 60, dtype=np.float32)
     for name in "xyz":
         columns[name][:20], columns[name][20:30] = 0, np.nan
-    fields = cloud_fields(columns, bags.store.types["sensor_msgs/msg/PointField"])
-    second = bags.new("sensor_msgs/PointCloud2", header=bags.header(1, "left"), **fields)
+    second = bags.cloud_of(1, columns, "left")
     tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
     bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), (1, "/second", second), tree])
     (frame,) = BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic="/second")).frames()

@@ -5,17 +5,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.bags import BagSource
-from dpm2_core.data.messages import cloud_fields, point_columns
+from dpm2_core.data.convert import convert
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.frame import Array, Camera
+from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
@@ -26,51 +24,31 @@ from dpm2_core.slam.mapping.mapper import MapSettings
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
 from dpm2_core.slam.settings import SlamSettings
 
-FRAMES, WIDTH, HEIGHT = 5, 208, 64
-CONFIG = CameraConfig(width=WIDTH, height=HEIGHT, focal=120.0, shadows=False)
+from ...helpers.drives import InMemory
+
+FRAMES = 5
+CONFIG = CameraConfig(width=208, height=64, focal=120.0, shadows=False)
 AHEAD = calibration(CONFIG)
-BACK = replace(AHEAD, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ AHEAD.T_lidar_cam)
-CAMERAS = {"front": AHEAD, "rear": BACK}
+BACK = replace(AHEAD, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ AHEAD.T_lidar_cam, name="rear")
 
 
 @pytest.fixture(scope="module")
-def drive(bags: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Array]:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Array]:
     """The bag, whose third cloud has no image behind, and T_first_lidar (FRAMES, 4, 4)."""
     world, lidar = build_world("straight", "suburb", seed=3, length=150.0), Lidar(LidarConfig(columns=900))
     rng = np.random.default_rng(0)
     poses = [world.drive_pose(3.0 + 0.1 * n) for n in range(FRAMES)]
-    messages: list[tuple[float, str, Any]] = []
-    for name, camera in CAMERAS.items():
-        messages.append((1, "/tf_static", placed(bags, name, camera)))
-        messages.append((1, f"/{name}/camera_info", info(bags, name, camera)))
+    frames = []
     for n, T in enumerate(poses):
-        stamp = 1 + 0.1 * n
         points = lidar.scan(world, T, 3.0 + 0.1 * n, rng).points
-        fields = cloud_fields(point_columns(points), bags.store.types["sensor_msgs/msg/PointField"])
-        messages.append((stamp, "/points", bags.new("sensor_msgs/PointCloud2", header=bags.header(stamp), **fields)))
-        for name, camera in CAMERAS.items():
-            if (n, name) != (2, "rear"):
-                pixels = render(world, CONFIG, T @ camera.T_lidar_cam, 3.0 + 0.1 * n, rng)
-                message = bags.new("sensor_msgs/Image", header=bags.header(stamp + 0.01, name), height=HEIGHT,
-                                   width=WIDTH, encoding="rgb8", is_bigendian=0, step=3 * WIDTH,
-                                   data=pixels.reshape(-1))  # fmt: skip
-                messages.append((stamp + 0.01, f"/{name}/image", message))
-    bag = bags.write(tmp_path_factory.mktemp("two") / "bag", sorted(messages, key=lambda message: message[0]))
+        images = [
+            Image(render(world, CONFIG, T @ camera.T_lidar_cam, 3.0 + 0.1 * n, rng), camera, 0.01)
+            for camera in (AHEAD, BACK)[: 1 if n == 2 else 2]
+        ]
+        frames.append(Frame(n * 10**8, points, images=tuple(images), index=n))
+    bag = tmp_path_factory.mktemp("two") / "bag"
+    convert(InMemory(frames), bag)
     return bag, se3.inverse(poses[0]) @ np.array(poses)
-
-
-def placed(bags: Any, name: str, camera: Camera) -> Any:
-    message = bags.transform("velo_link", name, tuple(camera.T_lidar_cam[:3, 3].tolist()))
-    rotation = message.transforms[0].transform.rotation
-    rotation.x, rotation.y, rotation.z, rotation.w = Rotation.from_matrix(camera.T_lidar_cam[:3, :3]).as_quat().tolist()
-    return message
-
-
-def info(bags: Any, name: str, camera: Camera) -> Any:
-    message = bags.info(1)
-    message.header.frame_id, message.width, message.height = name, WIDTH, HEIGHT
-    message.k = camera.K.reshape(-1)
-    return message
 
 
 @pytest.mark.slow
@@ -78,7 +56,7 @@ def test_frames_with_two_images_are_described_registered_and_mapped(drive: tuple
     """By the shipped network alone; the map shows what the first camera saw, and where one image is missing, nothing
     else is."""
     bag, T_first_lidar = drive
-    source = BagSource(bag, InputSettings(image_topic="/front/image", second_image_topic="/rear/image"))
+    source = BagSource(bag, InputSettings(image_topic="/camera/image_raw", second_image_topic="/camera_2/image_raw"))
     frames = list(source.frames())
     assert [len(frame.images) for frame in frames] == [2, 2, 1, 2, 2]
     np.testing.assert_allclose(frames[0].images[1].camera.T_lidar_cam, BACK.T_lidar_cam, atol=1e-9)
