@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -119,8 +120,8 @@ class OfflineRun:
         began, problems = perf_counter(), list[str]()
         with interrupt_deferred() as interrupted:
             try:
-                frames = frames_in_order(self.source, self._start, self._stop, self._corrected)
-                for frame in prefetch(frames):
+                corrected = partial(note_corrected, self.source.notes)
+                for frame in prefetch(frames_in_order(self.source, self._start, self._stop, corrected)):
                     if frame.problem is None:
                         self._begun = None
                     else:
@@ -139,9 +140,6 @@ class OfflineRun:
         if problems and len(problems) == len(result) and not result.interrupted:
             raise Dpm2Error(f"{self.source.name}: none of {len(result)} scans could be read; the first: {problems[0]}")
         return result
-
-    def _corrected(self, number: int, stamp: int) -> None:
-        note_corrected(self.source.notes, number, stamp)
 
 
 def open_recording(path: Path | str, config: Config, images: bool) -> Source:

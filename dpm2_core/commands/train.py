@@ -56,25 +56,29 @@ def pack(
 ) -> None:
     """A recorded drive with ground truth, or all of a data set, packed for training frame by frame."""
     from dpm2_core.data.open import sequences_below
+    from dpm2_core.data.settings import input_settings
     from dpm2_core.learning.generate import check_same  # torch and embree are slow to import
+    from dpm2_core.network.settings import preset as network_preset
 
     overrides = settings or []
-    _check_packing(frames, preset, overrides)
+    input_settings(overrides), network_preset(preset), parse_range(frames)  # what is wrong is so whatever the drive
+    given = sorted(setting for setting in overrides if not setting.startswith("input.sequence="))
+    packing = {"frames": frames, "preset": preset, "input": given}
     if not every:
         if out.exists():
             raise UsageError(f"{out}: is there already; remove it, or choose another folder")
-        _pack_one(src, out, frames, preset, overrides)
+        _pack_one(src, out, packing, overrides)
         return
-    if any(setting.startswith("input.sequence=") for setting in overrides):
+    if len(given) < len(overrides):
         raise UsageError("--all: packs every drive; leave --set input.sequence= out")
     left_out = []
     names = sequences_below(src)
     for name in names:
         if (out / name).exists():
-            check_same(out / name, _packing(frames, preset, overrides))
+            check_same(out / name, packing)
             continue
         try:
-            _pack_one(src, out / name, frames, preset, [*overrides, f"input.sequence={name}"])
+            _pack_one(src, out / name, packing, [*overrides, f"input.sequence={name}"])
         except UsageError as error:  # of this drive; a full disk ends them all
             typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
             left_out.append(name)
@@ -82,39 +86,22 @@ def pack(
         raise Dpm2Error(f"{len(left_out)} of {len(names)} drives were left out: {', '.join(left_out)}")
 
 
-def _check_packing(frames: str, preset: str, overrides: list[str]) -> None:
-    """Raise UsageError for what is wrong whatever the drive."""
-    from dpm2_core.data.settings import input_settings
-    from dpm2_core.network.settings import preset as network_preset
-
-    input_settings(overrides)
-    network_preset(preset)
-    parse_range(frames)
-
-
-def _packing(frames: str, preset: str, overrides: list[str]) -> dict[str, Any]:
-    """What a packed drive is made by, beside its own frames."""
-    given = sorted(setting for setting in overrides if not setting.startswith("input.sequence="))
-    return {"frames": frames, "preset": preset, "input": given}
-
-
-def _pack_one(src: Path, out: Path, frames: str, preset: str, overrides: list[str]) -> None:
+def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str]) -> None:
+    """`packing`: what the packed drive is made by, beside its own frames; it keeps that."""
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import input_settings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
     from dpm2_core.network.settings import preset as network_preset
 
     source = open_source(src, input_settings(overrides))
-    network = network_preset(preset)
-    start, stop = parse_range(frames)
+    network, (start, stop) = network_preset(packing["preset"]), parse_range(packing["frames"])
     chosen = range(len(source))[start:stop]
     if not chosen:
-        raise UsageError(f"--frames {frames}: {src} has {len(source)} frames")
+        raise UsageError(f"--frames {packing['frames']}: {src} has {len(source)} frames")
     try:
         with progress_bar() as bar:
             task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
-            asked = _packing(frames, preset, overrides)
-            packed = write(source, out, network, chosen, lambda: bar.advance(task), asked)
+            packed = write(source, out, network, chosen, lambda: bar.advance(task), packing)
     finally:
         for text in source.notes:  # such as an image that cannot be read
             note(text)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -264,10 +264,8 @@ class BagSource:
 
     def _in_order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
         """With those stamps of clouds corrected that are not between their neighbors', which is noted."""
-        return in_order(messages, self.points_topic, self._corrected)
-
-    def _corrected(self, index: int, stamp: int) -> None:
-        note_corrected(self.notes, index, stamp, f"{self.points_topic}: ")
+        topic = self.points_topic
+        return in_order(messages, topic, partial(note_corrected, self.notes, whose=f"{topic}: "))
 
     def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
         buffer = self._imu if topic == self.imu_topic else self._gnss

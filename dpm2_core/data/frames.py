@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -128,21 +129,18 @@ class FrameBuilder:
     ) -> tuple[Points, Points | None]:
         """Points (N, 4) with those that a second LiDAR has measured, `late` s after them; their times (N,) with its."""
         topic = self._calibration.second_topic
-        try:
+        with self._or_else(topic, "going on without the second LiDAR"):
             second = self._decode(topic, second)
             others, other_offset = self._points(second)
             T = self._calibration.transforms.between(lidar_frame, second.header.frame_id)
-        except (MessageError, UsageError) as error:
-            self.problems[topic] = self._tell(topic, error, "; going on without the second LiDAR")
-            return points, offset
-        self.problems.pop(topic, None)
-        seen = returned(others)  # moved, the zeros of a missing return would be a point
-        others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
-        if offset is not None or other_offset is not None or late:
-            first = np.zeros(len(points), np.float32) if offset is None else offset
-            then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
-            offset = np.concatenate([first, then + np.float32(late)])
-        return np.concatenate([points, se3.transform(T, others)]), offset
+            seen = returned(others)  # moved, the zeros of a missing return would be a point
+            others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
+            if offset is not None or other_offset is not None or late:
+                first = np.zeros(len(points), np.float32) if offset is None else offset
+                then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
+                offset = np.concatenate([first, then + np.float32(late)])
+            return np.concatenate([points, se3.transform(T, others)]), offset
+        return points, offset
 
     def camera(self, camera: CameraTopic, lidar_frame: str, image_frame: str) -> Camera:
         """A camera by what is known now, named by its topic; `image_frame` counts where its CameraInfo names no frame.
@@ -177,18 +175,15 @@ class FrameBuilder:
         """The samples up to the last point of a scan, along the LiDAR's axes."""
         if buffer.last == -float("inf"):
             return None
-        found, topic = buffer.take(stamp, stamp + last_point(offset)), self._calibration.imu_topic
-        try:
+        found = buffer.take(stamp, stamp + last_point(offset))
+        with self._or_else(self._calibration.imu_topic, "going on without the IMU"):
             if found is None:
                 raise UsageError("no samples at the time of the scan")
             if not found.rates.any() and np.isnan(found.forces).all():  # no gyroscope is so still
                 raise UsageError("its rates and forces are all 0: it measures neither")
             R = self._imu_rotation(lidar_frame, buffer.frame)
-        except UsageError as error:
-            self.problems[topic] = self._tell(topic, error, "; going on without the IMU")
-            return None
-        self.problems.pop(topic, None)
-        return replace(found, rates=found.rates @ R.T, forces=found.forces @ R.T, up=self.up)
+            return replace(found, rates=found.rates @ R.T, forces=found.forces @ R.T, up=self.up)
+        return None
 
     def _imu_rotation(self, lidar_frame: str, imu_frame: str) -> Array:
         """R_lidar_imu (3, 3)."""
@@ -202,32 +197,32 @@ class FrameBuilder:
 
     def _fix(self, buffer: FixBuffer, lidar_frame: str, stamp: int) -> Fix | None:
         """The last fix before a scan, with the place of its antenna."""
-        fix, topic = buffer.take(stamp), self._calibration.gnss_topic
-        if fix is None:
+        if (fix := buffer.take(stamp)) is None:
             return None
-        try:
+        with self._or_else(self._calibration.gnss_topic, "the antenna is taken for the LiDAR"):
             if buffer.frame.lstrip("/") != lidar_frame.lstrip("/"):
                 fix = replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
-        except (UsageError, ValueError) as error:
-            self.problems[topic] = self._tell(topic, error, "; the antenna is taken for the LiDAR")
-            return fix
-        self.problems.pop(topic, None)
         return fix
 
     def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any, late: float) -> Image | None:
-        topic = taken_by.topic
-        try:
-            message = self._decode(topic, message)
+        with self._or_else(taken_by.topic, "images are left out"):
+            message = self._decode(taken_by.topic, message)
             camera = self.camera(taken_by, lidar_frame, message.header.frame_id)
             pixels = decode_image(message, camera.size)
             if is_fisheye(taken_by.info) and pixels.shape[1::-1] == camera.size:
                 pixels = rectified(pixels, taken_by.info)
-            image = Image(pixels, camera, late)
+            return Image(pixels, camera, late)
+        return None
+
+    @contextmanager
+    def _or_else(self, topic: str, without: str) -> Iterator[None]:
+        """Inside, a sensor beside the LiDAR is read; where it cannot be used that is its problem, and told."""
+        try:
+            yield
         except (UsageError, ValueError) as error:
-            self.problems[topic] = self._tell(topic, error, "; images are left out")
-            return None
-        self.problems.pop(topic, None)
-        return image
+            self.problems[topic] = self._tell(topic, error, f"; {without}")
+        else:
+            self.problems.pop(topic, None)
 
     def _tell(self, topic: str, error: Exception, more: str = "") -> str:
         """Complain unless it is known already; returns the problem as one line."""
