@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -150,7 +151,16 @@ def rotated(directions: Float, R: ArrayLike) -> Float:
 
 
 @dataclass(eq=False)
-class Hits:
+class Rows:
+    """Arrays with a row each for the same things."""
+
+    def part(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
+        """Some of them."""
+        return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))
+
+
+@dataclass(eq=False)
+class Hits(Rows):
     """Nearest hits of R rays.
 
     Attributes:
@@ -163,10 +173,6 @@ class Hits:
     normal: Float
     u: Float
     v: Float
-
-    def part(self, which: NDArray[np.bool_]) -> Hits:
-        """Some of the rays."""
-        return Hits(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 class Scene:

@@ -36,7 +36,7 @@ class Path:
         if closed:
             line = np.concatenate([line, line[:1]])
         line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])]
-        s = _arc_lengths(line)
+        s = arc_lengths(line)
         self.closed, self.length = closed, float(s[-1])
         self.s = np.linspace(0, self.length, max(round(self.length / STEP), 2) + 1)
         self.xy = np.stack([np.interp(self.s, s, line[:, k]) for k in (0, 1)], -1)
@@ -245,9 +245,9 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     raw = Path(position[keep, :2])
     smooth = _smooth(raw.xy, 2.0, False)
     drive = Path(smooth)
-    at = _arc_lengths(position[:, :2])
-    on_raw = np.interp(at, at[keep], _arc_lengths(position[keep, :2]))
-    travelled: Array = np.interp(on_raw, raw.s, _arc_lengths(smooth))
+    at = arc_lengths(position[:, :2])
+    on_raw = np.interp(at, at[keep], arc_lengths(position[keep, :2]))
+    travelled: Array = np.interp(on_raw, raw.s, arc_lengths(smooth))
     center = drive.shifted(preset.lane)
     z = gaussian_filter1d(np.interp(drive.s, travelled, position[:, 2]), 4)
     z = np.interp(np.linspace(0, 1, len(center.xy)), np.linspace(0, 1, len(z)), z)
@@ -268,7 +268,8 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     return Road([*streets, *sides], len(streets), drive, times, travelled, heights, slip)
 
 
-def _arc_lengths(xy: Array) -> Array:
+def arc_lengths(xy: Array) -> Array:
+    """(N,) m along a line of points (N, 2+), from its first."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
 
 

@@ -7,14 +7,14 @@ do not divide one another and with an own offset for each object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.sim.materials import Material
-from dpm2_core.sim.mesh import Float
+from dpm2_core.sim.mesh import Float, Rows
 from dpm2_core.sim.terrain import Terrain
 
 Int = NDArray[np.integer]
@@ -22,7 +22,7 @@ _TILE = 512
 
 
 @dataclass(eq=False)
-class VisiblePoints:
+class VisiblePoints(Rows):
     """P visible points.
 
     Attributes:
@@ -39,10 +39,6 @@ class VisiblePoints:
     material: Int
     color: Float
     footprint: Float
-
-    def part(self, which: NDArray[np.intp]) -> VisiblePoints:
-        """Some of the points."""
-        return VisiblePoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 class Textures:

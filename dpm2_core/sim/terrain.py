@@ -22,7 +22,7 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import Array
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
-from dpm2_core.sim.road import Road
+from dpm2_core.sim.road import Road, arc_lengths
 from dpm2_core.sim.settings import Preset
 
 RESOLUTION = 0.5
@@ -173,7 +173,7 @@ class Terrain:
     def contour(self, level: float) -> Iterator[Kerbline]:
         """The lines `level` m outside the kerb (negative: on the road), streets' ends included."""
         for line in self._lines(level):
-            length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+            length = arc_lengths(line)
             if length[-1] < 6:
                 continue
             s = np.linspace(0, length[-1], int(length[-1]) + 1)
@@ -265,9 +265,7 @@ def sheet(points: ArrayLike, label: Label, material: Material, color: ArrayLike)
     node = np.arange(n * m).reshape(n, m)
     a, b, c, d = node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]
     faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
-    middle = points[:, m // 2]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1))])
-    across = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[n // 2], axis=0), axis=1))])
+    along, across = arc_lengths(points[:, m // 2]), arc_lengths(points[n // 2])
     uv = np.stack(np.broadcast_arrays(along[:, None], across[None]), -1).reshape(-1, 2)
     return make(points.reshape(-1, 3), faces, label, material, color, uv[faces])
 

@@ -125,21 +125,16 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
     start = np.where(follows, rng.uniform(14, 90, n_cars), rng.uniform(0, length, n_cars))
     walk = rng.uniform(0.6, 1.4) + preset.half_width
     sides = rng.choice([-1, 1], n_people)
-    return Traffic(
-        road,
-        terrain,
-        cars + walkers,
-        np.concatenate([start, rng.uniform(0, length, n_people)]),
-        np.concatenate(
-            [
-                np.where(follows, 0.0, np.where(oncoming, -pace, pace)),
-                rng.choice([-1, 1], n_people) * rng.uniform(0.8, 1.9, n_people),
-            ]
-        ),
-        np.concatenate([lateral, sides * (walk + rng.uniform(0, 0.8, n_people)) + preset.lane]),
-        np.concatenate([follows, np.zeros(n_people, bool)]),
-        rng.uniform(0, 6.3, n_cars + n_people),
+    of_cars = start, np.where(follows, 0.0, np.where(oncoming, -pace, pace)), lateral, follows
+    of_people = (
+        rng.uniform(0, length, n_people),
+        rng.choice([-1, 1], n_people) * rng.uniform(0.8, 1.9, n_people),
+        sides * (walk + rng.uniform(0, 0.8, n_people)) + preset.lane,
+        np.zeros(n_people, bool),
     )
+    columns = [np.concatenate(both) for both in zip(of_cars, of_people, strict=True)]
+    columns.append(rng.uniform(0, 6.3, n_cars + n_people))
+    return Traffic(road, terrain, cars + walkers, *columns)
 
 
 def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> Traffic:
@@ -160,18 +155,11 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
             apart = np.abs(at) > 9 + lengths[kind] / 2
             kind, at = kind[apart], at[apart]
         parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lane_at, same_way))))
-    kind, at, speed, lateral, follows = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Traffic(
-        others.road,
-        others.terrain,
-        [library[k] for k in kind] + others.models,
-        np.concatenate([at, others.start]),
-        np.concatenate([speed, others.speed]),
-        np.concatenate([lateral, others.lateral]),
-        np.concatenate([follows, others.follows]).astype(bool),
-        np.concatenate([rng.uniform(0, 6.3, len(at)), others.phase]),
-        np.concatenate([np.full(len(at), ALONGSIDE), np.full(len(others.start), GAP)]),
-    )
+    kind, *queues = (np.concatenate(part) for part in zip(*parts, strict=True))
+    queues += [rng.uniform(0, 6.3, len(kind)), np.full(len(kind), ALONGSIDE)]
+    rest = others.start, others.speed, others.lateral, others.follows, others.phase, np.full(len(others.start), GAP)
+    columns = (np.concatenate(both) for both in zip(queues, rest, strict=True))
+    return Traffic(others.road, others.terrain, [library[k] for k in kind] + others.models, *columns)
 
 
 def _queue(
