@@ -4,27 +4,36 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from dpm2_core.cli import app
-from dpm2_core.commands.eval import eval_
 from dpm2_core.commands.options import parse_lengths
+from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import read_calib
+from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
+from ...helpers.command import dpm2
+
+
+def evaluated(gt: Path, est: Path, *options: object) -> dict[str, Any]:
+    """The figures of `dpm2 eval`."""
+    done = dpm2("eval", "--gt", gt, "--est", est, "--json", "-", *options)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
 
 @pytest.mark.parametrize(("name", "printed"), [("ORB", "0.006997 0.000044"), ("SPTAM", "0.014870 0.000097")])
-def test_it_prints_what_the_development_kit_prints(
-    kitti_excerpt: Path, capsys: pytest.CaptureFixture[str], name: str, printed: str
-) -> None:
-    eval_(kitti_excerpt / "gt_poses" / "00.txt", kitti_excerpt / "results" / f"KITTI_00_{name}.txt")
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+def test_it_prints_what_the_development_kit_prints(kitti_excerpt: Path, name: str, printed: str) -> None:
+    gt, est = kitti_excerpt / "gt_poses" / "00.txt", kitti_excerpt / "results" / f"KITTI_00_{name}.txt"
+    shown = " ".join(dpm2("eval", "--gt", gt, "--est", est).stdout.replace("│", " ").split())
     assert "3283 segments" in shown
     for figure in printed.split():
         assert figure in shown
@@ -43,16 +52,16 @@ def test_the_json_holds_the_fixed_keys_and_how_they_were_measured(tmp_path: Path
     est[:, 2, 3] *= 1.01
     write_kitti(tmp_path / "gt.txt", _drive())
     write_kitti(tmp_path / "est.txt", est[:-10], range(50))
-    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "new" / "m.json", "10,20")
-    result = json.loads((tmp_path / "new" / "m.json").read_text())
+    gt, est, out = tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "new" / "m.json"
+    assert dpm2("eval", "--gt", gt, "--est", est, "--lengths", "10,20", "--json", out).returncode == 0
+    result = json.loads(out.read_text())
     assert (result["frames"], result["failed_frames"], result["fps"]) == (60, 10, None)
     assert (result["lengths_m"], result["segments"]) == ([10, 20], 39 + 29)
     assert result["rpe_trans_m"] == pytest.approx(0.01)
     assert result["final_drift_percent"] == pytest.approx(1.0)
     assert result["t_err_percent"] == pytest.approx((39 * 1.1 + 29 * 1.05) / 68)
     assert "same sensor" in result["frame"]
-    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json")
-    assert json.loads((tmp_path / "m.json").read_text())["t_err_percent"] is None
+    assert evaluated(gt, est)["t_err_percent"] is None
 
 
 @pytest.mark.parametrize("faster", [1, 4])
@@ -63,8 +72,8 @@ def test_speeds_are_those_of_the_stamps(tmp_path: Path, faster: int) -> None:
     truth[:, 2, 3] = np.arange(len(truth)) / faster
     write_tum(tmp_path / "gt.txt", np.arange(len(truth)) * (200_000_000 // faster), truth)
     write_tum(tmp_path / "est.txt", np.arange(len(est)) * 200_000_000, est)
-    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json", "10")
-    assert [row["speed_mps"] for row in json.loads((tmp_path / "m.json").read_text())["per_speed"]] == [4.0]
+    found = evaluated(tmp_path / "gt.txt", tmp_path / "est.txt", "--lengths", "10")
+    assert [row["speed_mps"] for row in found["per_speed"]] == [4.0]
 
 
 @pytest.mark.parametrize("stamped", [True, False])
@@ -77,8 +86,7 @@ def test_a_gap_makes_no_drive_faster(tmp_path: Path, stamped: bool) -> None:
     else:
         write_kitti(tmp_path / "gt.txt", poses[there], there.tolist())
         write_kitti(tmp_path / "est.txt", poses[there])
-    eval_(tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "m.json", "10")
-    found = json.loads((tmp_path / "m.json").read_text())
+    found = evaluated(tmp_path / "gt.txt", tmp_path / "est.txt", "--lengths", "10")
     assert [(row["speed_mps"], row["segments"]) for row in found["per_speed"]] == [(8.0, found["segments"])]
 
 
@@ -88,10 +96,8 @@ def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: 
     T_cam_lidar = read_calib(folder / "calib.txt")["Tr"]
     T_lidar = se3.inverse(T_cam_lidar) @ read_trajectory(folder / "poses.txt").poses @ T_cam_lidar
     write_tum(tmp_path / "est.tum", np.arange(len(T_lidar)) * 10**8, T_lidar)
-    for calib, least, most in ((folder / "calib.txt", 0, 1e-5), (None, 0.1, 10)):
-        eval_(folder / "poses.txt", tmp_path / "est.tum", tmp_path / "m.json", calib=calib)
-        ape = json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"]
-        assert least <= ape <= most
+    for calib, least, most in ((("--calib", folder / "calib.txt"), 0, 1e-5), ((), 0.1, 10)):
+        assert least <= evaluated(folder / "poses.txt", tmp_path / "est.tum", *calib)["ape_rmse_m"] <= most
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["straight", "round"])
@@ -110,18 +116,17 @@ def test_poses_along_other_axes_are_said(tmp_path: Path, turned: bool) -> None:
     ):
         write_kitti(tmp_path / f"{name}.txt", of)
     for name, said in (("same", False), ("other", True)):
-        run = CliRunner().invoke(
-            app, ["eval", "--gt", str(tmp_path / "gt.txt"), "--est", str(tmp_path / f"{name}.txt")]
-        )
-        assert run.exit_code == 0, run.output
-        assert ("along other axes" in " ".join(run.stderr.split())) == said
+        done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / f"{name}.txt")
+        assert done.returncode == 0, done.stderr
+        assert ("along other axes" in " ".join(done.stderr.split())) == said
 
 
 def test_different_lengths_are_rejected_naming_both(tmp_path: Path) -> None:
     write_kitti(tmp_path / "gt.txt", _drive(60))
     write_kitti(tmp_path / "est.txt", _drive(50))
-    with pytest.raises(UsageError, match=r"60 poses .* 50 "):
-        eval_(tmp_path / "gt.txt", tmp_path / "est.txt")
+    done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt")
+    assert done.returncode == 2
+    assert re.search("60 poses .* 50 ", done.stderr)
 
 
 @pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
@@ -134,15 +139,16 @@ def test_a_calibration_without_tr_or_that_is_not_there_is_rejected(tmp_path: Pat
     write_kitti(tmp_path / "gt.txt", _drive())
     (tmp_path / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     for name, reason in (("calib.txt", "no Tr"), ("none.txt", "no such file")):
-        with pytest.raises(UsageError, match=f"{name}: {reason}"):
-            eval_(tmp_path / "gt.txt", tmp_path / "gt.txt", calib=tmp_path / name)
+        done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "gt.txt", "--calib", tmp_path / name)
+        assert done.returncode == 2
+        assert f"{name}: {reason}" in done.stderr
 
 
-def drive_with_truth(root: Path) -> tuple[Path, np.ndarray]:
-    """A KITTI sequence of six scans, and the poses (6, 4, 4) of its left camera."""
-    folder, poses = root / "sequences" / "07", np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(6)])
+def drive_with_truth(root: Path, numbers: Sequence[int] = range(6)) -> tuple[Path, np.ndarray]:
+    """A KITTI sequence of scans of these numbers, and the poses (N, 4, 4) of its left camera."""
+    folder, poses = root / "sequences" / "07", np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in numbers])
     (folder / "velodyne").mkdir(parents=True)
-    for n in range(6):
+    for n in numbers:
         np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
     write_kitti(folder / "poses.txt", poses)
@@ -153,15 +159,10 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
     """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
     folder, poses = drive_with_truth(tmp_path)
     write_kitti(tmp_path / "est.txt", poses[1:], range(1, 6))
-    for drive in ([str(folder)], [str(tmp_path), "--set", "input.sequence=07"]):
-        run = CliRunner().invoke(
-            app, ["eval", "--gt", *drive, "--est", str(tmp_path / "est.txt"), "--json", str(tmp_path / "m.json")]
-        )
-        assert run.exit_code == 0, run.output
-        assert json.loads((tmp_path / "m.json").read_text())["ape_rmse_m"] < 1e-6
+    for drive, options in ((folder, ()), (tmp_path, ("--set", "input.sequence=07"))):
+        assert evaluated(drive, tmp_path / "est.txt", *options)["ape_rmse_m"] < 1e-6
     (folder / "poses.txt").unlink()
-    run = CliRunner().invoke(app, ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.txt")])
-    assert "no ground truth" in str(run.exception)
+    assert "no ground truth" in dpm2("eval", "--gt", folder, "--est", tmp_path / "est.txt").stderr
 
 
 def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> None:
@@ -172,40 +173,29 @@ def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> N
     stamps = [100_000_000 * n for n in range(1, 6)]
     of_lidar = se3.inverse(T_cam_lidar) @ poses @ T_cam_lidar
     write_tum(tmp_path / "est.tum", stamps, of_lidar[1:])
-    arguments = ["eval", "--gt", str(folder), "--est", str(tmp_path / "est.tum"), "--json", str(tmp_path / "m.json")]
-    for extra, frame in (([], "LiDAR, as"), (["--calib", str(folder / "calib.txt")], "left camera; the estimate")):
-        run = CliRunner().invoke(app, [*arguments, *extra])
-        assert run.exit_code == 0, run.output
-        figures = json.loads((tmp_path / "m.json").read_text())
+    for options, frame in (((), "LiDAR, as"), (("--calib", folder / "calib.txt"), "left camera; the estimate")):
+        figures = evaluated(folder, tmp_path / "est.tum", *options)
         assert figures["ape_rmse_m"] < 1e-6
         assert figures["frame"].startswith(frame)
 
 
 def test_a_drive_that_is_one_file_is_its_own_ground_truth(tmp_path: Path) -> None:
     folder, poses = drive_with_truth(tmp_path)
-    made = CliRunner().invoke(app, ["convert", str(folder), str(tmp_path / "bag")])
-    assert made.exit_code == 0, made.output
+    convert(open_source(folder), tmp_path / "bag")
     write_kitti(tmp_path / "est.txt", poses)
     (bag,) = (tmp_path / "bag").glob("*.mcap")
     for drive in (bag.parent, bag):
-        eval_(drive, tmp_path / "est.txt", tmp_path / "m.json")
-        assert json.loads((tmp_path / "m.json").read_text())["frames"] == 6
+        assert evaluated(drive, tmp_path / "est.txt")["frames"] == 6
 
 
 def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
     """Scans 3 and 4 are missing, and the poses end at frame 6: the estimate's ten lines were taken for frames 0 to 9,
     as there are more of them than known poses; an exact one had a t_err of 28 %."""
-    folder = tmp_path / "sequences" / "07"
-    (folder / "velodyne").mkdir(parents=True)
-    poses = np.stack([se3.exp([0, 0.02 * n, 0, 0, 0, n]) for n in range(12)])
-    numbers = [n for n in range(12) if n not in (3, 4)]
-    for n in numbers:
-        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
-    (folder / "calib.txt").write_text("Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3\n")
-    (tmp_path / "poses").mkdir()
-    write_kitti(tmp_path / "poses" / "07.txt", poses[:7])
-    write_kitti(tmp_path / "est.txt", poses[numbers])
-    eval_(tmp_path, tmp_path / "est.txt", tmp_path / "m.json")
-    found = json.loads((tmp_path / "m.json").read_text())
+    folder, poses = drive_with_truth(tmp_path, range(12))
+    for n in (3, 4):
+        (folder / "velodyne" / f"{n:06d}.bin").unlink()
+    write_kitti(folder / "poses.txt", poses[:7])
+    write_kitti(tmp_path / "est.txt", np.delete(poses, (3, 4), axis=0))
+    found = evaluated(tmp_path, tmp_path / "est.txt")
     assert found["ape_rmse_m"] < 1e-6  # the file has 13 digits
     assert (found["frames"], found["failed_frames"]) == (10, 0)

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import dpm2_core
-from dpm2_core.cli import app
 from dpm2_core.data import topics
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
@@ -29,6 +27,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Camera, Fix, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
+from ...helpers.command import dpm2
 from ...helpers.full_disk import largest_file
 
 MakeFolder = Callable[..., Path]
@@ -229,13 +228,11 @@ def test_a_place_that_cannot_be_written_is_named(kitti_folder: MakeFolder, tmp_p
 
 def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
-    arguments = ["convert", str(folder), str(out), "--frames", "1:4", "--set", "input.images=false", "--zstd"]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    done = dpm2("convert", folder, out, "--frames", "1:4", "--set", "input.images=false", "--zstd")
+    assert done.returncode == 0, done.stderr
     assert len(BagSource(out)) == 3
-    result = CliRunner().invoke(app, ["convert", str(folder), str(out)])
-    assert isinstance(result.exception, UsageError)
-    assert CliRunner().invoke(app, ["convert", str(folder), str(out), "--overwrite"]).exit_code == 0
+    assert dpm2("convert", folder, out).returncode == 2
+    assert dpm2("convert", folder, out, "--overwrite").returncode == 0
     assert len(BagSource(out)) == 5
 
 
@@ -321,8 +318,8 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
     (tmp_path / "clouds").mkdir()
     for n in range(3):
         write_ply(tmp_path / "clouds" / f"{n}.ply", np.full((5, 4), n, np.float32))
-    result = CliRunner().invoke(app, ["convert", str(tmp_path / "clouds"), str(tmp_path / "bag"), "--frames", "1:"])
-    assert result.exit_code == 0, result.output
+    done = dpm2("convert", tmp_path / "clouds", tmp_path / "bag", "--frames", "1:")
+    assert done.returncode == 0, done.stderr
     source = BagSource(tmp_path / "bag")
     assert [(frame.stamp - EPOCH_NS, frame.points[0, 0]) for frame in source.frames()] == [(10**8, 1), (2 * 10**8, 2)]
     assert set(open_bag(tmp_path / "bag").types) == {"/points"}
@@ -342,5 +339,4 @@ def test_what_lies_beside_the_scans_does_not_hide_them(kitti_folder: MakeFolder,
     write_ply(folder / "map.ply", np.zeros((5, 4), np.float32))
     (folder / "metadata.yaml").write_text("notes: mine")
     assert isinstance(open_source(folder), KittiSource)
-    result = CliRunner().invoke(app, ["convert", str(tmp_path), str(tmp_path / "bag")])
-    assert "no KITTI sequence" in str(result.exception)
+    assert "no KITTI sequence" in dpm2("convert", tmp_path, tmp_path / "bag").stderr

@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from dpm2_core.data.kitti import KittiSource
 from dpm2_core.geometry import geodesy, se3
-from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.gnss import Receiver
-from dpm2_core.sim.settings import DriveConfig, GnssConfig, LidarConfig
+from dpm2_core.sim.settings import GnssConfig
 
 
 def local(receiver: Receiver, places: np.ndarray) -> np.ndarray:
@@ -38,14 +34,3 @@ def test_its_errors_are_as_large_as_it_says_and_stay_for_a_while() -> None:
     near, far = (np.mean(error[:, :-k] * error[:, k:]) / error.var() for k in (2, 60))
     assert near == pytest.approx(1.5**2 / (1.5**2 + 0.3**2) * np.exp(-2 / 20), abs=0.1)
     assert abs(far) < 0.2
-
-
-def test_it_lies_beside_the_scans_and_changes_nothing_else(tmp_path: Path) -> None:
-    config = DriveConfig(frames=3, seed=3, lidar=LidarConfig(beams=16, columns=360), images=False)
-    simulate(tmp_path / "without", config)
-    simulate(tmp_path / "with", config.model_copy(update={"gnss": GnssConfig(rate=10)}))
-    assert not KittiSource(tmp_path / "without").fixes
-    for a, b in zip(KittiSource(tmp_path / "without").frames(), KittiSource(tmp_path / "with").frames(), strict=True):
-        np.testing.assert_array_equal(a.points, b.points)
-        assert a.fix is None
-        assert (b.fix is None) == (b.index == 0)  # the first one comes after the first scan

@@ -15,7 +15,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.turning import turned
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.imu import GRAVITY, Imu
-from dpm2_core.sim.settings import DriveConfig, ImuConfig, LidarConfig
+from dpm2_core.sim.settings import DriveConfig, GnssConfig, ImuConfig, LidarConfig
 from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import World
 
@@ -69,17 +69,18 @@ def test_each_point_has_its_own_moment(city: World) -> None:
     assert (np.abs(hits.distance - reach) < 0.1).mean() > 0.85  # traffic, grass and rough surfaces apart
 
 
-def test_it_lies_beside_the_scans_and_changes_nothing_else(tmp_path: Path) -> None:
+def test_it_lies_beside_the_scans_with_fixes_and_changes_nothing_else(tmp_path: Path) -> None:
     config = DriveConfig(frames=3, seed=3, lidar=LIDAR, images=False)
     simulate(tmp_path / "without", config)
-    simulate(tmp_path / "with", config.model_copy(update={"imu": ImuConfig()}))
+    simulate(tmp_path / "with", config.model_copy(update={"imu": ImuConfig(), "gnss": GnssConfig(rate=10)}))
     without, source = KittiSource(tmp_path / "without"), KittiSource(tmp_path / "with")
-    assert without.imu is None
-    assert not list((tmp_path / "without").rglob("imu.txt"))
+    assert (without.imu, without.fixes) == (None, [])
+    assert not [*(tmp_path / "without").rglob("imu.txt"), *(tmp_path / "without").rglob("gnss.txt")]
     frames = list(source.frames())
     for a, b in zip(without.frames(), frames, strict=True):
         np.testing.assert_array_equal(a.points, b.points)
-        assert a.imu is None
+        assert (a.imu, a.fix) == (None, None)
+        assert (b.fix is None) == (b.index == 0)  # the first one comes after the first scan
     samples = [frame.imu for frame in frames if frame.imu is not None]
     assert [len(s) for s in samples] == [11, 10, 10]  # from a tenth of a second before the first
     assert all(s.stamps[-1] == f.stamp for s, f in zip(samples, frames, strict=True))
