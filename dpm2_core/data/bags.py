@@ -68,7 +68,9 @@ class BagSource:
         self.lidar_frame: str = first.header.frame_id if first else ""
         second = self._topics.second("second_points_topic", self.points_topic, CLOUDS, "point clouds")
         correction = self._recorded_correction()
-        self._calibration = Calibration(self.points_topic, second_topic=second, angle_correction_deg=correction)
+        self._calibration = Calibration(
+            self.points_topic, second_topic=second, lidar_frame=self.lidar_frame, angle_correction_deg=correction
+        )
         self.transforms = self._calibration.transforms
         self._add_transforms()
         self.T_cam_lidar: Array | None = None

@@ -42,6 +42,7 @@ class Calibration:
     Attributes:
         points_topic, second_topic, imu_topic, gnss_topic: full names; empty where there is none.
         camera, second_camera: None where there is none, or none is wanted.
+        lidar_frame: that of the drive's clouds: one in another frame cannot be used. Empty: any can.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
     """
@@ -52,6 +53,7 @@ class Calibration:
     gnss_topic: str = ""
     camera: CameraTopic | None = None
     second_camera: CameraTopic | None = None
+    lidar_frame: str = ""
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
 
@@ -102,6 +104,7 @@ class FrameBuilder:
         beside, topic = beside or {}, self._calibration.points_topic
         try:
             cloud = self._decode(topic, cloud)
+            self._check_frame(cloud.header.frame_id)
             points, offset = self._points(cloud)
         except MessageError as error:
             problem = self._tell(topic, error)
@@ -118,6 +121,13 @@ class FrameBuilder:
         found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in taken)
         images = tuple(image for image in found if image is not None)
         return Frame(stamp, points, offset, images, index, imu=imu, fix=fix)
+
+    def _check_frame(self, frame: str) -> None:
+        """Raises MessageError for that of another LiDAR: poses of two would be taken for the motion of one."""
+        of_drive = self._calibration.lidar_frame
+        if of_drive and frame.lstrip("/") != of_drive.lstrip("/"):
+            found = f"a cloud in frame {frame[:80]!r}, the drive's are in {of_drive!r}"
+            raise MessageError(f"{found}: one drive has one LiDAR")
 
     def _points(self, cloud: Any) -> tuple[Points, Points | None]:
         """(N, 4), and (N,) s after the stamp, of a decoded message."""

@@ -97,6 +97,20 @@ def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -
             BagSource(bag, InputSettings(points_topic=POINTS, second_points_topic=wrong))
 
 
+def test_two_lidars_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp_path: Path) -> None:
+    """As slam_node, which rejects them: what the second one sees is no motion of the first. One name of a frame has a
+    slash in ROS 1 and none in ROS 2."""
+    frames = ["velo_link", "left", "/velo_link", "left"]
+    sent = [(t, POINTS, bags.cloud(t, frame=frame)) for t, frame in zip((1, 1.1, 1.2, 1.3), frames, strict=True)]
+    bag = bags.write(tmp_path / "b", [(1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0))), *sent])
+    source = BagSource(bag)
+    read = list(source.frames())
+    problem = "a cloud in frame 'left', the drive's are in 'velo_link': one drive has one LiDAR"
+    assert [frame.problem for frame in read] == [None, problem, None, problem]
+    assert [len(frame.points) for frame in read] == [60, 0, 60, 0]
+    assert f"{POINTS}: {problem}" in source.notes
+
+
 # --- a second camera
 
 REAR, REAR_INFO = "/rear/image_raw", "/rear/camera_info"
