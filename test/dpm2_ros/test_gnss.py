@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import NavSatFix, PointCloud2
+from sensor_msgs.msg import NavSatFix
 
-from dpm2_core.data.topics import POINTS
 from dpm2_core.frame import Array
 from dpm2_core.geometry import geodesy, se3
-from dpm2_ros.conversions import header, transform_to_msg
-from dpm2_ros.slam_node import SlamNode
-from dpm2_ros.tf_message import TFMessage
+from dpm2_ros.conversions import header
+from test.helpers.rig import Rig, publish_static
 
 from ..helpers.diagnostics import having
 
@@ -36,21 +33,13 @@ def nav(stamp: int, place: Array) -> NavSatFix:
 
 
 @pytest.mark.slow
-def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    harness = ros(
-        "input.images:=false", "ros.base_frame:=base_link", "input.gnss_topic:=fix", "slam.keyframes.distance:=1.0"
-    )
-    lidar = harness.publisher(PointCloud2, POINTS)
-    receiver = harness.publisher(NavSatFix, "/fix", reliable=False)
-    static = harness.publisher(TFMessage, "/tf_static", latched=True)
-    places = [("base_link", "lidar", T_BASE_LIDAR), ("lidar", "gnss", T_LIDAR_ANTENNA)]
-    static.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child) for parent, child, T in places]))
-    odom = harness.hear(Odometry, "/dpm2/odom")
-    node: SlamNode = harness.add(SlamNode())
-    harness.wait(lambda: lidar.get_subscription_count() and receiver.get_subscription_count(), "subscriptions")
-    harness.wait(lambda: "gnss" in node.calibration.transforms.frames, "/tf_static")
-    assert harness.status(": gnss", lambda s: s.message == "no fix on /fix yet").level == DiagnosticStatus.WARN
+def test_fixes_place_the_map_on_earth(rig: Callable[..., Rig], drive: Any) -> None:
+    r = rig("ros.base_frame:=base_link", "input.gnss_topic:=fix", "slam.keyframes.distance:=1.0")
+    receiver = r.harness.publisher(NavSatFix, "/fix", reliable=False)
+    publish_static(r, "base_link", "lidar", T_BASE_LIDAR)
+    publish_static(r, "lidar", "gnss", T_LIDAR_ANTENNA)
+    r.wait(receiver.get_subscription_count, "the subscription to the fixes")
+    assert r.status("gnss", lambda s: s.message == "no fix on /fix yet").level == DiagnosticStatus.WARN
     rng = np.random.default_rng(0)
     for n in range(drive.frames):
         if n:  # of the scan before, as a receiver that takes a tenth of a second has it
@@ -59,17 +48,15 @@ def test_fixes_place_the_map_on_earth(ros: Callable[..., Any], drive: Any, monke
             receiver.publish(nav(drive.stamp(n - 1), place))
             for wrong in ([np.nan, 8.4, 110.0], [91.0, 8.4, 110.0], [0.0, 0.0, 0.0]):
                 receiver.publish(nav(drive.stamp(n - 1) + 1, np.array(wrong)))
-        before = len(odom)
-        lidar.publish(drive.cloud(n))
-        harness.wait(lambda before=before: len(odom) > before, f"the odometry of cloud {n}")
-    mapper = node.slam.mapper
-    harness.wait(lambda: mapper.graph.georeference is not None, "the map's place on Earth")
-    harness.status(": gnss", lambda s: s.message == "in use")
+        r.send_and_wait(n)
+    mapper = r.node.slam.mapper
+    r.wait(lambda: mapper.graph.georeference is not None, "the map's place on Earth")
+    r.status("gnss", lambda s: s.message == "in use")
     receiver.publish(nav(drive.stamp(n) + 18 * 10**9, place))  # GPS has no leap seconds
-    status = harness.status(": gnss", lambda s: s.message == "stamps of another clock, +18 s from the clouds'")
+    status = r.status("gnss", lambda s: s.message == "stamps of another clock, +18 s from the clouds'")
     assert status.level == DiagnosticStatus.WARN
-    harness.status(": mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m a scan: every second one
-    harness.wait(lambda: sum(node.rejections.values()) >= 3 * (drive.frames - 1), "the rejections")
+    r.status("mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m a scan: every second one
+    r.wait(lambda: sum(r.node.rejections.values()) >= 3 * (drive.frames - 1), "the rejections")
     # map is the frame of the base's first pose, `base` over the ground
     known, T_start_map = mapper.graph.georeference, se3.inverse(T_BASE_LIDAR)
     found = geodesy.enu_frame(known.origin) @ known.T_enu_map

@@ -13,7 +13,6 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2, PointField
 
 from dpm2_core.data.messages import cloud_fields, stamp_ns
-from dpm2_core.data.topics import POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -21,6 +20,7 @@ from dpm2_core.geometry import se3
 from dpm2_ros.conversions import edge_to_msg, header, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf_message import TFMessage
+from test.helpers.rig import ACCURATE, Rig, publish_static
 
 from ..helpers.diagnostics import figures, having, saying
 from .conftest import pose, scan
@@ -28,29 +28,18 @@ from .conftest import pose, scan
 T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
 JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
 STEPS = 5  # samples of the wheels to a cloud
-ACCURATE = 0.05
 NONE = "ros.publish_tf_odom:=false"
 
 
-class Robot:
+class Robot(Rig):
     """Its wheels, its LiDAR 0.8 m ahead of the base and 1.2 m above, and slam_node."""
 
     def __init__(self, ros: Callable[..., Any], drive: Any, source: str, *parameters: str) -> None:
-        given = ("input.images:=false", f"ros.odom_source:={source}", *parameters)
-        self.harness, self.drive = ros(*given), drive
-        self.wait = self.harness.wait
-        publisher = self.harness.publisher
-        self.lidar, self.tf = publisher(PointCloud2, POINTS), publisher(TFMessage, "/tf")
-        self.topic = publisher(Odometry, "/odom") if source == "topic" else None
-        static = publisher(TFMessage, "/tf_static", latched=True)
-        static.publish(TFMessage(transforms=[transform_to_msg(T_BASE_LIDAR, 0, "base_link", "lidar")]))
-        self.heard = self.harness.hear(TFMessage, "/tf")
-        self.odom = self.harness.hear(Odometry, "/dpm2/odom")
-        self.diagnostics = self.harness.diagnostics
-        self.node: SlamNode = self.harness.add(SlamNode())
-        wheels = self.topic or self.tf
-        self.wait(lambda: self.lidar.get_subscription_count() and wheels.get_subscription_count(), "subscriptions")
-        self.wait(lambda: "lidar" in self.node.calibration.transforms.frames, "/tf_static")
+        super().__init__(ros, drive, f"ros.odom_source:={source}", *parameters)
+        self.tf, self.heard = self.harness.publisher(TFMessage, "/tf"), self.harness.hear(TFMessage, "/tf")
+        self.topic = self.harness.publisher(Odometry, "/odom") if source == "topic" else None
+        publish_static(self, "base_link", "lidar", T_BASE_LIDAR)
+        self.wait((self.topic or self.tf).get_subscription_count, "the subscription to the wheels")
         self.covariance = lambda n: 1e-4 * np.eye(6)  # that the topic states by cloud n
         self._T, self.wheels = se3.exp([0.0, 0.0, 1.0, 5.0, 0.0, 0.0]), {}  # an origin of their own
 
@@ -77,13 +66,11 @@ class Robot:
             if not n:
                 break
 
-    def send(self, *numbers: int, wheels: bool = True) -> None:
+    def go(self, *numbers: int, wheels: bool = True) -> None:
         for n in numbers:
-            before = len(self.odom)
             if wheels:
                 self.turn_wheels(n)
-            self.lidar.publish(self.drive.cloud(n))
-            self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+            self.send_and_wait(n)
 
     def links(self) -> dict[tuple[str, str], dict[int, Array]]:
         """What is on /tf by parent and child, at each stamp."""
@@ -93,15 +80,6 @@ class Robot:
                 link = out.setdefault((t.header.frame_id, t.child_frame_id), {})
                 link[stamp_ns(t.header)] = transform_matrix(t.transform)
         return out
-
-    def status(self, condition: Callable[[DiagnosticStatus], Any], **options: int) -> DiagnosticStatus:
-        """Of the other odometry, once it is so."""
-        found: DiagnosticStatus = self.harness.status("other odometry", condition, **options)
-        return found
-
-    def processed(self, count: int) -> None:
-        """Until the node is done with so many clouds: their transforms come after their odometry."""
-        self.harness.status("slam_node: odometry", having(processed=count))
 
 
 @pytest.fixture
@@ -116,7 +94,7 @@ def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) 
 def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any, source: str) -> None:
     """At the stamp of every cloud map -> odom and the wheels' odom -> base make our pose, right to centimeters."""
     r = robot(source)
-    r.send(*range(drive.frames))
+    r.go(*range(drive.frames))
     r.wait(lambda: len(r.links().get(("map", "odom"), {})) == drive.frames, "map -> odom of every cloud")
     links = r.links()
     assert set(links) == {("map", "odom"), ("odom", "base_link")}  # one parent each
@@ -126,10 +104,10 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
         T_map_base = links["map", "odom"][stamp] @ r.wheels[stamp]
         np.testing.assert_allclose(T_map_base, transform_matrix(message.pose.pose), atol=1e-6)
         assert np.linalg.norm((T_map_base - r.base(n))[:3, 3]) < ACCURATE
-    said = r.status(saying("outweighed"), since=0)  # for a while after the jump
+    said = r.status("other odometry", saying("outweighed"), since=0)  # for a while after the jump
     assert said.level == DiagnosticStatus.WARN
     assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
-    values = figures(r.status(having(**{"clouds with it": drive.frames, "without": 0})))
+    values = figures(r.status("other odometry", having(**{"clouds with it": drive.frames, "without": 0})))
     assert float(values["its ways too long by (%)"]) == pytest.approx(100 * SLIP, abs=0.3)
     assert (values["clouds with it"], values["outweighed"]) == (str(drive.frames), "1")
 
@@ -138,20 +116,20 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
 def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) -> None:
     """The drive goes on without it, /diagnostics says so, and map -> odom is sent where it is known alone."""
     r = robot("tf")
-    r.send(0, 1, 2, wheels=False)
+    r.go(0, 1, 2, wheels=False)
     missing = "no transform from 'base_link' to 'odom'"
-    assert "going on without" in r.status(saying(missing)).message
+    assert "going on without" in r.status("other odometry", saying(missing)).message
     r.processed(3)
     for n in range(3):
         r.turn_wheels(n)  # too late
-    r.send(*range(3, 7))
-    assert "going on without" not in r.status(saying("too long")).message
-    r.send(7, 8, wheels=False)
-    assert "going on without" in r.status(saying("ends 0.")).message
+    r.go(*range(3, 7))
+    assert "going on without" not in r.status("other odometry", saying("too long")).message
+    r.go(7, 8, wheels=False)
+    assert "going on without" in r.status("other odometry", saying("ends 0.")).message
     r.processed(9)
     for n in (7, 8):
         r.turn_wheels(n)
-    r.send(*range(9, 12))
+    r.go(*range(9, 12))
     r.wait(lambda: len(r.links().get(("map", "odom"), {})) >= 7, "map -> odom")
     assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in (3, 4, 5, 6, 9, 10, 11)]
     for n, message in enumerate(r.odom):
@@ -161,7 +139,7 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
 def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
     """Another frame, numbers that are none: counted, and the drive goes on."""
     r = robot("topic")
-    r.send(0, 1)
+    r.go(0, 1)
     good, nan = np.eye(4), np.full((6, 6), np.nan)
     r.topic.publish(edge_to_msg(good, np.eye(6), drive.stamp(2), "elsewhere", "base_link"))
     r.topic.publish(edge_to_msg(good, np.eye(6), drive.stamp(2), "odom", ""))
@@ -171,7 +149,7 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
     r.wait(lambda: sum(r.node.rejections.values()) == 3, "three rejections")
     stated = edge_to_msg(r.wheels[drive.stamp(1)], nan, drive.stamp(1) + 1, "odom", "base_link")
     r.topic.publish(stated)  # a sound pose; its covariance is left out
-    r.send(2, 3)
+    r.go(2, 3)
     assert sum(r.node.rejections.values()) == 3
     for n, message in enumerate(r.odom):
         assert np.linalg.norm((transform_matrix(message.pose.pose) - r.base(n))[:3, 3]) < ACCURATE
@@ -185,16 +163,16 @@ def test_a_topic_without_odometry_of_use_is_named(
     r = robot("topic")
     r.topic.publish(edge_to_msg(np.eye(4), np.eye(6), drive.stamp(0), frame, child))
     r.wait(lambda: list(r.node.rejections.values()) == [1], "the rejection")
-    r.send(0, wheels=False)
-    assert r.status(having(without=1)).message == "nothing of use on /odom yet; going on without"
+    r.go(0, wheels=False)
+    assert r.status("other odometry", having(without=1)).message == "nothing of use on /odom yet; going on without"
 
 
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
     """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from what the scans show" was said of what is right."""
     r = robot("topic")
     r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
-    r.send(*range(5))
-    said = r.status(saying("left out: by its own covariance"))
+    r.go(*range(5))
+    said = r.status("other odometry", saying("left out: by its own covariance"))
     assert "outweighed" not in said.message
     assert having(outweighed=0)(said)
 
@@ -210,7 +188,7 @@ def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], dr
     columns["t"] = np.linspace(0, drive.period, len(points)).astype(np.uint32)
     r.lidar.publish(PointCloud2(header=header(drive.stamp(0), "lidar"), **cloud_fields(columns, PointField)))
     r.wait(lambda: r.odom, "the odometry of the cloud")
-    r.status(having(**{"clouds with it": 1, "without": 0}))
+    r.status("other odometry", having(**{"clouds with it": 1, "without": 0}))
 
 
 @pytest.mark.parametrize(
@@ -231,7 +209,7 @@ def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], dr
 def test_every_frame_has_one_parent(robot: Callable[..., Robot], parameters: tuple[str], expected: set) -> None:
     """`publish_tf_odom` is for odom -> base alone: beside another odometry it cut the tree between map and odom."""
     r = robot(*parameters)
-    r.send(0, 1, 2, wheels=parameters[0] == "tf")
+    r.go(0, 1, 2, wheels=parameters[0] == "tf")
     r.wait(lambda: set(r.links()) == expected and min(map(len, r.links().values())) >= 2, f"{expected}")
     children = [child for _, child in r.links()]
     assert len(children) == len(set(children))

@@ -14,12 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import PointCloud2
 
-from dpm2_core.data import topics
-from dpm2_core.data.messages import stamp_ns
-from dpm2_ros.slam_node import SlamNode
+from test.helpers.rig import Rig
 from tools.replay import ros_environment, start, stop
 
 from ..helpers.diagnostics import figures
@@ -66,30 +62,25 @@ def test_started_at_the_same_moment_nothing_is_lost(
     assert "lost on the way" in account[3]
 
 
-def test_losses_are_in_diagnostics(ros: Callable[..., Any], drive: Any) -> None:
+def test_losses_are_in_diagnostics(rig: Callable[..., Rig], drive: Any) -> None:
     """Real ones: while the executor is held up, DDS keeps as many clouds as the queue may hold, and no more."""
-    harness = ros("input.images:=false", "ros.queue_depth:=2")
-    lidar, odometry = harness.publisher(PointCloud2, topics.POINTS), harness.hear(Odometry, "/dpm2/odom")
-    diagnostics = harness.diagnostics
-    node = harness.add(SlamNode())
-    harness.wait(lambda: lidar.get_subscription_count() and node.count_subscribers("/dpm2/odom"), "the node")
-    lidar.publish(drive.cloud(0))
-    harness.wait(lambda: odometry, "the first")
+    r = rig("ros.queue_depth:=2")
+    r.send_and_wait(0)
     holding, going_on = threading.Event(), threading.Event()
-    harness.node.create_timer(0.05, lambda: holding.is_set() or (holding.set(), going_on.wait(120)))
-    harness.wait(holding.is_set, "the executor to be held up")
+    r.harness.node.create_timer(0.05, lambda: holding.is_set() or (holding.set(), going_on.wait(120)))
+    r.wait(holding.is_set, "the executor to be held up")
     try:
         for n in range(1, drive.frames):
-            lidar.publish(drive.cloud(n))
+            r.send(n)
         time.sleep(0.5)  # until DDS has delivered them
     finally:
         going_on.set()
-    harness.wait(lambda: stamp_ns(odometry[-1].header) == drive.stamp(drive.frames - 1), "the last")
-    values = figures(harness.status("slam_node: odometry", all_gone(drive.frames)))
+    r.wait(lambda: r.stamps()[-1] == drive.stamp(drive.frames - 1), "the last")
+    values = figures(r.status("odometry", all_gone(drive.frames)))
     dropped, lost = int(values["dropped (queue full)"]), int(values["lost on the way"])
     assert int(values["processed"]) + dropped + lost == int(values["received"]) + lost == drive.frames
     assert lost >= 5
-    info = [one.message for message in diagnostics for one in message.status]
+    info = [one.message for message in r.diagnostics for one in message.status]
     assert any(f"{lost} clouds lost on the way" in text for text in info)
 
 

@@ -18,7 +18,7 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
-from dpm2_ros.conversions import cloud_to_msg, transform_to_msg
+from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.tf_message import TFMessage
 from test.helpers.rig import ACCURATE, Rig, publish_static
 
@@ -47,9 +47,7 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
     """The pose of base_link, which starts at the origin, although the LiDAR is mounted ahead, above and turned."""
     T_base_lidar = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5])
     r = rig()
-    static = r.harness.publisher(TFMessage, "/tf_static", latched=True)
-    static.publish(TFMessage(transforms=[transform_to_msg(T_base_lidar, 0, "base_link", "lidar")]))
-    r.wait(lambda: "lidar" in r.node.calibration.transforms.frames, "/tf_static")
+    publish_static(r, "base_link", "lidar", T_base_lidar)
     r.send_and_wait(*range(8))
     for n, message in enumerate(r.odom):
         assert message.child_frame_id == "base_link"
