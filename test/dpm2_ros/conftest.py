@@ -34,7 +34,7 @@ from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, keyframe_name
 from dpm2_ros.runtime import end_ros, ros_context
 from test.helpers.rig import Rig
-from tools.replay import ros_environment
+from tools.replay import ros_environment, start
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_DISCOVERY_RANGE"]
 
@@ -158,6 +158,7 @@ class Harness:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._closing: list[Any] = []
+        self._processes: list[subprocess.Popen[bytes]] = []
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
@@ -179,6 +180,12 @@ class Harness:
         self._executor.remove_node(node)
         node.close()  # type: ignore[attr-defined]
         node.destroy_node()
+
+    def start(self, name: str, arguments: Sequence[str], log: Path, **variables: str) -> subprocess.Popen[bytes]:
+        """One of the executables as a process that sees these nodes, and in the end is killed."""
+        environment = ros_environment(self.node.context.get_domain_id()) | variables
+        self._processes.append(start(name, arguments, environment, log))
+        return self._processes[-1]
 
     def hear(self, kind: type, topic: str, qos: Any = 100) -> list[Any]:
         """The messages of a topic, as they come."""
@@ -283,7 +290,10 @@ class Harness:
             time.sleep(max(0.01, 5 * (time.thread_time() - began)))
 
     def close(self) -> None:
-        """Close the nodes under test, then everything else."""
+        """Kill the processes, close the nodes under test, then everything else."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
         try:
             for node in self._closing:
                 node.close()

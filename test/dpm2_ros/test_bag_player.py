@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ from dpm2_ros.bag_player import main
 from dpm2_ros.tf_message import TFMessage
 from test.helpers.lockstep import play
 from test.helpers.recordings import write_bag
-from tools.replay import ros_environment, start
 
 LATCHED_DEPTH = 10
 
@@ -40,22 +39,20 @@ LATCHED_DEPTH = 10
 class Listener:
     """Subscribers to the KITTI topics, and the player as a process."""
 
-    def __init__(self, harness: Any, domain: int, log: Path) -> None:
+    def __init__(self, harness: Any, log: Path) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
-        self.harness, self._domain, self._log = harness, domain, log
+        self.harness, self._log = harness, log
         self.clouds = harness.hear(PointCloud2, topics.POINTS)
         self.images = harness.hear(Image, topics.IMAGE)
         self.infos = harness.hear(CameraInfo, f"{topics.KITTI.camera}/camera_info")
         self.clock = harness.hear(Clock, "/clock", 1000)
         latched = QoSProfile(depth=LATCHED_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.static = harness.hear(TFMessage, topics.TF_STATIC, latched)
-        self.process: subprocess.Popen[bytes] | None = None
 
     def play(self, *arguments: str) -> subprocess.Popen[bytes]:
-        environment = ros_environment(self._domain)
-        self.process = start("bag_player", arguments, environment, self._log)
-        return self.process
+        process: subprocess.Popen[bytes] = self.harness.start("bag_player", arguments, self._log)
+        return process
 
     def output(self) -> str:
         return self._log.read_text()
@@ -66,14 +63,8 @@ class Listener:
 
 
 @pytest.fixture
-def listener(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Listener]:
-    harness = ros()
-    domain = harness.node.context.get_domain_id()
-    made = Listener(harness, domain, tmp_path / "player.log")
-    yield made
-    if made.process is not None and made.process.poll() is None:
-        made.process.kill()
-        made.process.wait()
+def listener(ros: Callable[..., Any], tmp_path: Path) -> Listener:
+    return Listener(ros(), tmp_path / "player.log")
 
 
 def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Path, drive: Any, tmp_path: Path) -> None:
@@ -175,39 +166,31 @@ def test_a_recorded_clock_is_the_only_one(
 def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
     """Nothing is lost to a subscriber that comes later than the player."""
     harness = ros()
-    environment = ros_environment(harness.node.context.get_domain_id())
-    player = start("bag_player", [str(bag), "--wait", "90", "--rate", "4"], environment, tmp_path / "log")
-    try:
-        harness.wait(lambda: "waiting 90 s" in (tmp_path / "log").read_text(), "the player")
-        clouds = harness.hear(PointCloud2, topics.POINTS)
-        assert player.wait(180) == 0
-        harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
-    finally:
-        player.kill()
+    player = harness.start("bag_player", [str(bag), "--wait", "90", "--rate", "4"], tmp_path / "log")
+    harness.wait(lambda: "waiting 90 s" in (tmp_path / "log").read_text(), "the player")
+    clouds = harness.hear(PointCloud2, topics.POINTS)
+    assert player.wait(180) == 0
+    harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
 
 
 def test_it_waits_for_the_nodes_that_it_is_told(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
     """Two of a name, in namespaces of their own; what another node hears, as RViz does, starts nothing."""
     harness = ros()
     clouds = harness.hear(PointCloud2, topics.POINTS)
-    environment = ros_environment(harness.node.context.get_domain_id())
     awaited = ["--for", "robot", "--subscribers", "2", "--wait", "90", "--rate", "4"]
-    player = start("bag_player", [str(bag), *awaited], environment, tmp_path / "log")
-    try:
-        says = f"waiting 90 s at most for 2 subscribers named robot to {topics.POINTS}"
-        harness.wait(lambda: says in (tmp_path / "log").read_text(), "the player")
-        received: list[list[Any]] = [[], []]
-        for n, heard in enumerate(received):
-            assert not clouds
-            node = rclpy.create_node("robot", namespace=f"robot_{n}", context=harness.node.context)
-            node.create_subscription(PointCloud2, topics.POINTS, heard.append, 100)
-            node.close = lambda: None  # type: ignore[attr-defined]
-            harness.add(node)
-            time.sleep(1.0)  # with one of two it does not begin
-        assert player.wait(180) == 0
-        harness.wait(lambda: [len(heard) for heard in received] == [drive.frames] * 2, "every cloud, twice")
-    finally:
-        player.kill()
+    player = harness.start("bag_player", [str(bag), *awaited], tmp_path / "log")
+    says = f"waiting 90 s at most for 2 subscribers named robot to {topics.POINTS}"
+    harness.wait(lambda: says in (tmp_path / "log").read_text(), "the player")
+    received: list[list[Any]] = [[], []]
+    for n, heard in enumerate(received):
+        assert not clouds
+        node = rclpy.create_node("robot", namespace=f"robot_{n}", context=harness.node.context)
+        node.create_subscription(PointCloud2, topics.POINTS, heard.append, 100)
+        node.close = lambda: None  # type: ignore[attr-defined]
+        harness.add(node)
+        time.sleep(1.0)  # with one of two it does not begin
+    assert player.wait(180) == 0
+    harness.wait(lambda: [len(heard) for heard in received] == [drive.frames] * 2, "every cloud, twice")
 
 
 def play_here(*arguments: str) -> int:

@@ -15,7 +15,7 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,6 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud, unpack_cloud
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
-from tools.replay import ros_environment, start
 
 from ..helpers.diagnostics import figures
 
@@ -231,7 +230,6 @@ class Nodes:
 
     def __init__(self, harness: Any, folder: Path) -> None:
         self.harness, self.file = harness, folder / "map.dpm2map"
-        environment = ros_environment(harness.node.context.get_domain_id())
         common = ("-p", "ros.map_directory:=''")
         robot = ["input.points_topic:=points", "ros.embed_mapper:=false", "slam.keyframes.distance:=2.0",
                  "slam.registration:=geometric",
@@ -239,13 +237,9 @@ class Nodes:
         pairs = [part for pair in robot for part in ("-p", pair)]
         mapper = ("-p", f"ros.map_file:={self.file}")
         self.logs = {name: folder / f"{name}.log" for name in ("slam_node", "mapper_node")}
+        given = {"slam_node": ("-r", "__ns:=/red", *common, *pairs), "mapper_node": (*common, *mapper)}
         self.processes: dict[str, subprocess.Popen[bytes]] = {
-            "slam_node": start(
-                "slam_node", ["--ros-args", "-r", "__ns:=/red", *common, *pairs], environment, self.logs["slam_node"]
-            ),
-            "mapper_node": start(
-                "mapper_node", ["--ros-args", *common, *mapper], environment, self.logs["mapper_node"]
-            ),
+            name: harness.start(name, ["--ros-args", *words], self.logs[name]) for name, words in given.items()
         }
         self.lidar = harness.publisher(PointCloud2, "/red/points")
         self.odom = harness.hear(Odometry, "/red/dpm2/odom")
@@ -276,17 +270,10 @@ class Nodes:
         page = os.sysconf("SC_PAGE_SIZE")
         return {n: int(Path(f"/proc/{p.pid}/statm").read_text().split()[1]) * page for n, p in self.processes.items()}
 
-    def close(self) -> None:
-        for process in self.processes.values():
-            process.kill()
-            process.wait()
-
 
 @pytest.fixture
-def nodes(ros: Callable[..., Any], tmp_path: Path) -> Iterator[Nodes]:
-    made = Nodes(ros(), tmp_path)
-    yield made
-    made.close()
+def nodes(ros: Callable[..., Any], tmp_path: Path) -> Nodes:
+    return Nodes(ros(), tmp_path)
 
 
 def rejections(status: DiagnosticStatus) -> int:

@@ -33,7 +33,6 @@ from dpm2_ros.parameters import CONFIG_FILE, load_parameters
 from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import NodeConfig
 from dpm2_ros.share import share_directory
-from tools.replay import ros_environment, start
 
 from ..helpers.lifecycle import Manager
 
@@ -83,15 +82,10 @@ def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     given = {"use_sim_time": False} | quick | empty | launch_file.parameters(defaults(launch_file))
     file = write(given, tmp_path / "p.yaml")
     harness = ros()
-    environment = ros_environment(harness.node.context.get_domain_id())
-    process = start(name, ["--ros-args", "--params-file", str(file)], environment, tmp_path / "log")
-    try:
-        harness.wait(lambda: name in harness.node.get_node_names() or process.poll() is not None, f"{name} to be there")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(180) == 0, (tmp_path / "log").read_text()
-    finally:
-        process.kill()
-        process.wait()
+    process = harness.start(name, ["--ros-args", "--params-file", str(file)], tmp_path / "log")
+    harness.wait(lambda: name in harness.node.get_node_names() or process.poll() is not None, f"{name} to be there")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(180) == 0, (tmp_path / "log").read_text()
 
 
 def test_arguments_left_alone_override_no_file(launch_file: ModuleType) -> None:
@@ -300,35 +294,29 @@ def test_what_it_starts_with_lifecycle_is_managed_over_the_services(
     value = defaults(launch_file) | {"lifecycle": "true", "embed_mapper": "false", "namespace": "red", "rviz": "false"}
     value |= {"params_file": str(file), "map_directory": str(maps), "points_topic": "points"}
     harness = ros()
-    environment = ros_environment(harness.node.context.get_domain_id())
     clouds, odom = harness.publisher(PointCloud2, "/red/points"), harness.hear(Odometry, "/red/dpm2/odom")
     received = harness.hear(UInt32MultiArray, "/red/dpm2/keyframes_received")
-    running = {name: start(name, words, environment, tmp_path / name)
-               for name, words in commands(launch_file, value, tmp_path)}  # fmt: skip
-    try:
-        slam, mapper = managers = [Manager(harness, f"/red/{name}") for name in ("slam_node", "mapper_node")]
-        assert [manager.state for manager in managers] == ["unconfigured"] * 2
-        assert not maps.exists()
-        assert all(manager.change(Transition.TRANSITION_CONFIGURE) for manager in managers)
-        assert not clouds.get_subscription_count()
-        assert all(manager.change(Transition.TRANSITION_ACTIVATE) for manager in (mapper, slam))
-        harness.wait(clouds.get_subscription_count, "the subscription to the clouds")
-        for n in range(6):
-            clouds.publish(drive.cloud(n))
-            harness.wait(lambda n=n: len(odom) > n, f"the odometry of cloud {n}")
-        harness.wait(lambda: received and received[-1].data[0] >= 3, "keyframes in the map file")
-        assert all(manager.change(Transition.TRANSITION_DEACTIVATE) for manager in managers)
-        harness.wait(lambda: not clouds.get_subscription_count(), "the end of the subscription")
-        assert [manager.state for manager in managers] == ["inactive"] * 2
-        assert all(manager.change(Transition.TRANSITION_CLEANUP) for manager in managers)
-        assert [manager.state for manager in managers] == ["unconfigured"] * 2
-        (path,) = maps.glob("*.dpm2map")
-        result = check_map(path)
-        assert (result.problems, result.keyframes >= 3) == ([], True)
-        for process in running.values():
-            process.send_signal(signal.SIGINT)
-        assert {name: process.wait(180) for name, process in running.items()} == {"slam_node": 0, "mapper_node": 0}
-    finally:
-        for process in running.values():
-            process.kill()
-            process.wait()
+    parts = commands(launch_file, value, tmp_path)
+    running = {name: harness.start(name, words, tmp_path / name) for name, words in parts}
+    slam, mapper = managers = [Manager(harness, f"/red/{name}") for name in ("slam_node", "mapper_node")]
+    assert [manager.state for manager in managers] == ["unconfigured"] * 2
+    assert not maps.exists()
+    assert all(manager.change(Transition.TRANSITION_CONFIGURE) for manager in managers)
+    assert not clouds.get_subscription_count()
+    assert all(manager.change(Transition.TRANSITION_ACTIVATE) for manager in (mapper, slam))
+    harness.wait(clouds.get_subscription_count, "the subscription to the clouds")
+    for n in range(6):
+        clouds.publish(drive.cloud(n))
+        harness.wait(lambda n=n: len(odom) > n, f"the odometry of cloud {n}")
+    harness.wait(lambda: received and received[-1].data[0] >= 3, "keyframes in the map file")
+    assert all(manager.change(Transition.TRANSITION_DEACTIVATE) for manager in managers)
+    harness.wait(lambda: not clouds.get_subscription_count(), "the end of the subscription")
+    assert [manager.state for manager in managers] == ["inactive"] * 2
+    assert all(manager.change(Transition.TRANSITION_CLEANUP) for manager in managers)
+    assert [manager.state for manager in managers] == ["unconfigured"] * 2
+    (path,) = maps.glob("*.dpm2map")
+    result = check_map(path)
+    assert (result.problems, result.keyframes >= 3) == ([], True)
+    for process in running.values():
+        process.send_signal(signal.SIGINT)
+    assert {name: process.wait(180) for name, process in running.items()} == {"slam_node": 0, "mapper_node": 0}

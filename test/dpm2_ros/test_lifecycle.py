@@ -32,7 +32,6 @@ from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import keyframe_name
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
-from tools.replay import ros_environment, start
 
 from ..helpers.lifecycle import Manager
 from ..helpers.mapping import Wires, points
@@ -275,12 +274,8 @@ def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_
     """Without a map, which it has not begun."""
     harness = ros()
     options = ["--lifecycle", "--ros-args", "-p", f"ros.map_directory:={tmp_path / 'maps'}"]
-    process = start(name, options, ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
-    try:
-        assert Manager(harness, f"/{name}").state == "unconfigured"
-        process.send_signal(signal.SIGINT)
-        assert process.wait(180) == 0, (tmp_path / "log").read_text()
-        assert not (tmp_path / "maps").exists()
-    finally:
-        process.kill()
-        process.wait()
+    process = harness.start(name, options, tmp_path / "log")
+    assert Manager(harness, f"/{name}").state == "unconfigured"
+    process.send_signal(signal.SIGINT)
+    assert process.wait(180) == 0, (tmp_path / "log").read_text()
+    assert not (tmp_path / "maps").exists()

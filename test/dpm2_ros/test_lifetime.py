@@ -45,14 +45,10 @@ def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Ite
     """slam_node in a process of its own, from when it listens: its map in `folder`/map, its log, which has no trace of
     a bug, in `folder`/log."""
     given = [part for parameter in (f"ros.map_directory:={folder / 'map'}", *parameters) for part in ("-p", parameter)]
-    environment = ros_environment(harness.node.context.get_domain_id())
-    process = start("slam_node", ["--ros-args", *given, *GEOMETRIC], environment, folder / "log")
-    try:
-        harness.wait(lidar.get_subscription_count, "slam_node")
-        harness.find("slam_node")
-        yield process
-    finally:
-        process.kill()
+    process = harness.start("slam_node", ["--ros-args", *given, *GEOMETRIC], folder / "log")
+    harness.wait(lidar.get_subscription_count, "slam_node")
+    harness.find("slam_node")
+    yield process
     assert "Traceback" not in (folder / "log").read_text()
 
 
@@ -91,7 +87,7 @@ def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
 def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: Path) -> None:
     """Its node is there, and does not listen yet."""
     harness = ros()
-    process = start("slam_node", [], ros_environment(harness.node.context.get_domain_id()), tmp_path / "log")
+    process = harness.start("slam_node", [], tmp_path / "log")
     harness.wait(lambda: "slam_node" in harness.node.get_node_names(), "the node")
     process.send_signal(signal.SIGINT)
     assert process.wait(180) == 0
@@ -234,29 +230,20 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
         """Keyframes; one that the mapper has not acknowledged yet is sent again."""
         return len({message.child_frame_id for message in keyframes})
 
-    environment = ros_environment(harness.node.context.get_domain_id())
     apart = ["-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
     saving = ["-p", f"ros.map_directory:={tmp_path / 'map'}"]
-    processes = {
-        "slam_node": start("slam_node", ["--ros-args", *apart, *GEOMETRIC], environment, tmp_path / "slam.log"),
-        "mapper_node": start("mapper_node", ["--ros-args", *saving, *GEOMETRIC], environment, tmp_path / "mapper.log"),
-    }
-    try:
-        harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper")
-        harness.find("slam_node")
-        slowly = ["--wait", "90", "--rate", "0.25"]  # on a busy machine, too, nothing is dropped
-        player = start("bag_player", [str(bag), *slowly], environment, tmp_path / "player.log")
-        processes["player"] = player
-        assert player.wait(180) == 0
-        harness.wait(lambda: len(odometry) == drive.frames, "every pose")
-        processes["slam_node"].send_signal(signal.SIGINT)
-        assert processes["slam_node"].wait(180) == 0
-        harness.wait(lambda: paths and len(paths[-1].poses) == made(), "the last keyframe in the map")
-        processes["mapper_node"].send_signal(signal.SIGINT)
-        assert processes["mapper_node"].wait(180) == 0
-    finally:
-        for process in processes.values():
-            process.kill()
+    slam = harness.start("slam_node", ["--ros-args", *apart, *GEOMETRIC], tmp_path / "slam.log")
+    mapper = harness.start("mapper_node", ["--ros-args", *saving, *GEOMETRIC], tmp_path / "mapper.log")
+    harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper")
+    harness.find("slam_node")
+    slowly = ["--wait", "90", "--rate", "0.25"]  # on a busy machine, too, nothing is dropped
+    assert harness.start("bag_player", [str(bag), *slowly], tmp_path / "player.log").wait(180) == 0
+    harness.wait(lambda: len(odometry) == drive.frames, "every pose")
+    slam.send_signal(signal.SIGINT)
+    assert slam.wait(180) == 0
+    harness.wait(lambda: paths and len(paths[-1].poses) == made(), "the last keyframe in the map")
+    mapper.send_signal(signal.SIGINT)
+    assert mapper.wait(180) == 0
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in odometry] == stamps
     assert f"map of {made()} keyframes saved" in (tmp_path / "mapper.log").read_text()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
 from dpm2_ros.tf_message import TFMessage
-from tools.replay import ros_environment, start
 
 from ..helpers.command import dpm2
 
@@ -62,7 +61,7 @@ class Robot:
         self.diagnostics = harness.diagnostics
         pairs = ["input.images:=false", "ros.map_directory:=''", ODOMETRY.replace("=", ":="), *parameters]
         arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
-        self.process = start("slam_node", arguments, ros_environment(harness.node.context.get_domain_id()), log)
+        self.process = harness.start("slam_node", arguments, log)
         harness.wait(self._ready, "slam_node")
         harness.find("slam_node")
 
@@ -116,24 +115,12 @@ class Robot:
 
     def close(self) -> int:
         self.process.send_signal(signal.SIGINT)
-        try:
-            return self.process.wait(180)
-        finally:
-            self.process.kill()
+        return self.process.wait(180)
 
 
 @pytest.fixture
-def robot(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Callable[..., Robot]]:
-    robots: list[Robot] = []
-
-    def make(*parameters: str) -> Robot:
-        robots.append(Robot(ros(), recording, tmp_path / "log", *parameters))
-        return robots[-1]
-
-    yield make
-    for r in robots:
-        r.process.kill()
-        r.process.wait()
+def robot(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Callable[..., Robot]:
+    return lambda *parameters: Robot(ros(), recording, tmp_path / "log", *parameters)
 
 
 def place(recording: Path, n: int) -> Array:

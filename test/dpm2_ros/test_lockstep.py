@@ -36,7 +36,6 @@ from dpm2_ros import lockstep
 from dpm2_ros.conversions import pose_to_msg
 from test.helpers.lockstep import Listener, contents, play
 from test.helpers.recordings import write_bag
-from tools.replay import ros_environment, start
 
 MS = 1_000_000
 
@@ -74,20 +73,18 @@ def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_lockstep_gives_the_trajectory_of_dpm2_run(
-    ros: Callable[..., Any], processes: list[Any], fast_camera: Path, drive: Any, tmp_path: Path
+    ros: Callable[..., Any], fast_camera: Path, drive: Any, tmp_path: Path
 ) -> None:
     """Bit for bit, images included: here every pose is moved by the image of its cloud."""
     settings = ["slam.odometry.degraded_sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
     settings += ["slam.registration=geometric", "slam.loops.descriptors=false"]  # else the network would be loaded
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
-    environment = ros_environment(harness.node.context.get_domain_id())
     given = [*(text.replace("=", ":=") for text in settings), "ros.base_frame:=velo_link", "ros.map_directory:=''"]
     arguments = ["--ros-args", *(part for one in given for part in ("-p", one))]
-    processes.append(start("slam_node", arguments, environment, tmp_path / "node"))
+    harness.start("slam_node", arguments, tmp_path / "node")
     harness.find("slam_node")  # its odometry of the first clouds would be lost otherwise
-    player = start("bag_player", [str(fast_camera), "--lockstep"], environment, tmp_path / "player")
-    processes.append(player)
+    player = harness.start("bag_player", [str(fast_camera), "--lockstep"], tmp_path / "player")
     assert player.wait(180) == 0, (tmp_path / "player").read_text()
     assert f"each of {drive.frames} clouds had its odometry" in (tmp_path / "player").read_text()
     harness.wait(lambda: len(odometry) == drive.frames, "the odometry")

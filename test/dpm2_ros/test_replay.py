@@ -30,20 +30,17 @@ def all_gone(sent: int) -> Callable[[DiagnosticStatus], bool]:
 
 
 def test_started_at_the_same_moment_nothing_is_lost(
-    ros: Callable[..., Any], processes: list[Any], bag: Path, drive: Any, tmp_path: Path
+    ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
     """The node subscribes when it is ready; no cloud waits for an import. Then too fast: what is dropped is counted."""
     harness = ros()
     diagnostics = harness.diagnostics
-    imports = {"PYTHONPROFILEIMPORTTIME": "1"}  # each is a line of the log
     arguments = ["--ros-args", "-p", "ros.map_directory:=''"]
-    environment = ros_environment(harness.node.context.get_domain_id())
-    node = start("slam_node", arguments, environment | imports, tmp_path / "node")
-    processes.append(node)
+    node = harness.start("slam_node", arguments, tmp_path / "node", PYTHONPROFILEIMPORTTIME="1")  # imports in the log
     # In time also on a busy machine, where 0.1 s may be too little for a cloud.
     for rate, name in (("0.3", "in time"), ("20", "too fast")):
-        processes.append(start("bag_player", [str(bag), "--wait", "90", "--rate", rate], environment, tmp_path / name))
-        assert processes[-1].wait(180) == 0
+        player = harness.start("bag_player", [str(bag), "--wait", "90", "--rate", rate], tmp_path / name)
+        assert player.wait(180) == 0
         assert f"{drive.frames} of them clouds" in (tmp_path / name).read_text()
         if name == "in time":
             ready, _, driving = (tmp_path / "node").read_text().partition("waiting for clouds")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,6 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.keyframe_messages import descriptors_from_msg, descriptors_to_msg, payload_to_msgs
 from dpm2_ros.tf_message import TFMessage
-from tools.replay import ros_environment, start
 
 GEOMETRIC = ("-p", "slam.registration:=geometric", "-p", "slam.loops.descriptors:=false")
 """Without the network, where it does not matter what a keyframe is made of: a node starts in half the time."""
@@ -43,17 +42,13 @@ class Fleet:
         """`parameters`: of all nodes."""
         self.harness, self.folder, self._parameters = harness, folder, parameters
         self.source = open_source(recording, InputSettings(images=False))
-        self.environment = ros_environment(harness.node.context.get_domain_id())
         self.tf = harness.hear(TFMessage, "/tf")
-        self.processes: list[subprocess.Popen[bytes]] = []
         self._lidars: dict[str, Any] = {}
         self._odom: dict[str, list[Any]] = {}
         self._stamp = 0
 
     def _start(self, name: str, log: str, *arguments: str) -> subprocess.Popen[bytes]:
-        process = start(name, ["--ros-args", *arguments, *self._parameters], self.environment, self.folder / log)
-        self.processes.append(process)
-        return process
+        return self.harness.start(name, ["--ros-args", *arguments, *self._parameters], self.folder / log)
 
     def mapper(self, file: str = "map.dpm2map") -> subprocess.Popen[bytes]:
         """A mapper_node for all robots."""
@@ -118,18 +113,10 @@ class Fleet:
             return None
         return last[f"{name}/odom"] @ last[f"{name}/lidar"]
 
-    def close(self) -> None:
-        for process in self.processes:
-            process.send_signal(signal.SIGCONT)
-            process.kill()
-            process.wait()
-
 
 @pytest.fixture
-def fleet(request: pytest.FixtureRequest, ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Iterator[Fleet]:
-    made = Fleet(ros(), recording, tmp_path, getattr(request, "param", GEOMETRIC))
-    yield made
-    made.close()
+def fleet(request: pytest.FixtureRequest, ros: Callable[..., Any], recording: Path, tmp_path: Path) -> Fleet:
+    return Fleet(ros(), recording, tmp_path, getattr(request, "param", GEOMETRIC))
 
 
 @pytest.mark.long

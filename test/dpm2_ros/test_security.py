@@ -13,7 +13,6 @@ import pytest
 
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
-from tools.replay import ros_environment, start, stop
 
 POLICY = Path(__file__).parents[2] / "config" / "sros2_policy.xml"
 KINDS = {"publish": "publisher", "subscribe": "subscriber", "reply": "service", "request": "client"}
@@ -86,12 +85,8 @@ def test_nodes_do_what_the_policy_allows(
 def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
     """With a bag that `dpm2 convert` makes of KITTI."""
     harness = ros()
-    environment = ros_environment(harness.node.context.get_domain_id())
-    player = start("bag_player", [str(bag), "--wait", "180", "--lockstep"], environment, tmp_path / "log")
+    harness.start("bag_player", [str(bag), "--wait", "180", "--lockstep"], tmp_path / "log")
     expected = allowed("bag_player")
     expected["publisher"].discard("/imu")  # this bag has none
-    try:
-        found = done(harness, "bag_player", lambda graph: any(expected[kind] - graph[kind] for kind in graph))
-    finally:
-        stop(player)
+    found = done(harness, "bag_player", lambda graph: any(expected[kind] - graph[kind] for kind in graph))
     assert found == expected
