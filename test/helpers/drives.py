@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives through the synthetic city, in memory and as the start of a recording."""
+"""Drives through the synthetic city, in memory and as the start of a recording; and what the odometry makes of one."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from dpm2_core.data.source import IndexedSource
+from dpm2_core.estimates import OdometryResult
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.slam.build import make_odometry
+from dpm2_core.slam.settings import SlamSettings
 
 Drive = tuple[list[Frame], Array]
 """Frames and their (N, 4, 4) true poses relative to the first."""
@@ -56,6 +60,19 @@ def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start:
         scan = lidar.scan(world, T, start + 0.1 * i, rng, twist=twist)
         out.append(Frame(i * 10**8, scan.points, None if deskewed else scan.time_offset, index=i))
     return out, se3.inverse(poses[0]) @ poses
+
+
+def track(frames: Iterable[Frame], **settings: object) -> list[OdometryResult]:
+    """The odometry of each; `settings`: those of the SLAM that are not as by default."""
+    odometry = make_odometry(SlamSettings.model_validate(settings))
+    return [odometry.process(frame) for frame in frames]
+
+
+def off(tracked: Sequence[OdometryResult], poses: Array) -> Array:
+    """(N,) m from the true position relative to the first."""
+    T_odom_lidar = np.array([t.T_odom_lidar for t in tracked])
+    T = se3.inverse(se3.inverse(poses[0]) @ poses) @ se3.inverse(T_odom_lidar[0]) @ T_odom_lidar
+    return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
 
 
 def first_scans(recording: Path, count: int, out: Path) -> Path:

@@ -5,23 +5,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
 
 from benchmarks.gaps import evaluated, gaps, summary
 from dpm2_core.data.open import open_source
-from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import World, build_world
-from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import SlamSettings
 
+from ...helpers.drives import off, track
+
+run = partial(track, threads=1)
 Pose = Callable[[float], Array]  # seconds to T_world_lidar (4, 4)
 
 
@@ -43,18 +45,6 @@ def seen(world: World, pose: bytes, second: float, beams: int) -> Points:
     T = np.frombuffer(pose).reshape(4, 4)
     lidar = Lidar(LidarConfig(columns=1024, beams=beams))
     return lidar.scan(world, T, second, np.random.default_rng(round(1e3 * second))).points
-
-
-def run(frames: Sequence[Frame]) -> list[OdometryResult]:
-    odometry = make_odometry(SlamSettings(threads=1))
-    return [odometry.process(frame) for frame in frames]
-
-
-def off(tracked: Sequence[OdometryResult], poses: Array) -> Array:
-    """(N,) m from the true position relative to the first."""
-    T_odom_lidar = np.array([t.T_odom_lidar for t in tracked])
-    T = se3.inverse(se3.inverse(poses[0]) @ poses) @ se3.inverse(T_odom_lidar[0]) @ T_odom_lidar
-    return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
 
 
 def with_gap(before: int, gap: float, after: int) -> list[float]:

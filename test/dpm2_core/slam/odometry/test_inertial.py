@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,13 +18,13 @@ from dpm2_core.sim.imu import GRAVITY, Imu
 from dpm2_core.sim.settings import ImuConfig, LidarConfig
 from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import build_world
-from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.inertial import InertialMotion
-from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers import rooms
+from ....helpers.drives import off, track
 
 COUNT = 40
+run = partial(track, registration="geometric", preset="outdoor")
 
 
 @pytest.fixture(scope="module")
@@ -32,18 +33,9 @@ def robot() -> tuple[list[Frame], Array]:
     return rooms.turning(COUNT)
 
 
-def run(frames: list[Frame], **settings: object) -> list[OdometryResult]:
-    odometry = make_odometry(
-        SlamSettings.model_validate({"registration": "geometric", "preset": "outdoor", **settings})
-    )
-    return [odometry.process(frame) for frame in frames]
-
-
 def error(tracked: list[OdometryResult], truth: Array) -> float:
     """Root mean square of the positions' errors, m."""
-    poses = np.array([t.T_odom_lidar for t in tracked])
-    off = se3.inverse(se3.inverse(truth[0]) @ truth) @ se3.inverse(poses[0]) @ poses
-    return float(np.sqrt((off[:, :3, 3] ** 2).sum(1).mean()))
+    return float(np.sqrt((off(tracked, truth) ** 2).mean()))
 
 
 def without(frames: list[Frame], since: int = 0) -> list[Frame]:
@@ -198,8 +190,8 @@ def test_indoors_scans_know_the_heading_better(
     sound, wrong = frames[:30], with_imu(frames[30:], lambda rates, forces: (change(rates), forces))
     tracked = run(sound + wrong, preset="auto")
     assert error(tracked, truth) < 0.03
-    off = se3.inverse(tracked[0].T_odom_lidar) @ tracked[-1].T_odom_lidar
-    assert np.degrees(se3.angle(se3.inverse(se3.inverse(truth[0]) @ truth[-1]) @ off)) < 1.5
+    moved = se3.inverse(tracked[0].T_odom_lidar) @ tracked[-1].T_odom_lidar
+    assert np.degrees(se3.angle(se3.inverse(se3.inverse(truth[0]) @ truth[-1]) @ moved)) < 1.5
 
 
 @pytest.mark.slow

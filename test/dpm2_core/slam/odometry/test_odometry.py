@@ -16,16 +16,10 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry, make_slam
-from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers import rooms
-from ....helpers.drives import Drive, make_drive, straight
-
-
-def run(frames: list[Frame], settings: SlamSettings | None = None) -> list[OdometryResult]:
-    odometry = make_odometry(settings or SlamSettings())
-    return [odometry.process(frame) for frame in frames]
+from ....helpers.drives import Drive, make_drive, straight, track
 
 
 def errors(tracked: list[OdometryResult], truth: np.ndarray) -> np.ndarray:
@@ -43,7 +37,7 @@ def skewed_drive() -> Drive:
 @pytest.fixture(scope="module")
 def suburb_tracked(suburb_drive: Drive) -> list[OdometryResult]:
     """The odometry of that drive."""
-    return run(suburb_drive[0])
+    return track(suburb_drive[0])
 
 
 @pytest.mark.slow
@@ -75,7 +69,7 @@ def test_covariance_covers_the_error_of_a_frame(suburb_drive: Drive, suburb_trac
 
 @pytest.mark.slow
 def test_same_input_same_result(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
-    for a, b in zip(suburb_tracked[:8], run(suburb_drive[0][:8]), strict=True):
+    for a, b in zip(suburb_tracked[:8], track(suburb_drive[0][:8]), strict=True):
         np.testing.assert_array_equal(a.T_odom_lidar, b.T_odom_lidar)
 
 
@@ -83,7 +77,7 @@ def test_same_input_same_result(suburb_drive: Drive, suburb_tracked: list[Odomet
 def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
     """Nor is a start at speed in it more certain than it is: 3 standard deviations of its steps cover their errors."""
     frames, truth = tunnel_drive
-    tracked = run(frames)
+    tracked = track(frames)
     assert State.TRACKING not in {t.state for t in tracked}
     for i in (1, 2, 3):
         step = se3.inverse(tracked[i - 1].T_odom_lidar) @ tracked[i].T_odom_lidar
@@ -119,7 +113,7 @@ def test_the_edge_between_keyframes_along_a_tunnel_covers_its_error(tunnel_drive
 def test_follows_a_drive_with_skewed_scans(skewed_drive: Drive) -> None:
     """Also right at the start, where the first scan is taken before any velocity is known."""
     frames, truth = skewed_drive[0][:12], skewed_drive[1][:12]
-    assert errors(run(frames), truth)[:, 0].max() < 0.05
+    assert errors(track(frames), truth)[:, 0].max() < 0.05
 
 
 @pytest.mark.slow
@@ -181,7 +175,7 @@ def test_one_bad_cloud_among_good_ones(suburb_drive: Drive, name: str, bad: np.n
     frames, truth = suburb_drive
     frames = list(frames[:8])
     frames[4] = replace(frames[4], points=bad)
-    tracked = run(frames)
+    tracked = track(frames)
     assert not tracked[4].registration.ok, name
     assert tracked[4].registration.reason
     assert tracked[4].state == State.DEGRADED
@@ -201,7 +195,7 @@ def test_some_nan_points_are_dropped(suburb_drive: Drive) -> None:
         points[1::10, 3] = np.nan
         points[5::10] = 0
         dirty.append(replace(frame, points=points))
-    tracked = run(dirty)
+    tracked = track(dirty)
     assert errors(tracked, truth[:6])[:, 0].max() < 0.05
     assert all(np.isfinite(t.keyframe.cloud).all() for t in tracked if t.keyframe is not None)
 
@@ -210,7 +204,7 @@ def test_some_nan_points_are_dropped(suburb_drive: Drive) -> None:
 def test_bad_frames_before_the_first_good_one(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     empty = Frame(-(10**8), np.zeros((0, 4), np.float32))
-    tracked = run([empty, *frames[:6]])
+    tracked = track([empty, *frames[:6]])
     assert tracked[0].state == State.INITIALIZING
     assert not tracked[0].registration.ok
     assert errors(tracked[1:], truth[:6])[:, 0].max() < 0.05
@@ -221,7 +215,7 @@ def test_an_empty_second_scan_while_no_velocity_is_known(suburb_drive: Drive) ->
     """At the start, and after a pause."""
     frames, truth = suburb_drive
     empty = [replace(frames[i], points=np.zeros((0, 4), np.float32)) for i in (1, 18)]
-    tracked = run([frames[0], empty[0], *frames[2:8], frames[17], empty[1], *frames[19:28]])
+    tracked = track([frames[0], empty[0], *frames[2:8], frames[17], empty[1], *frames[19:28]])
     assert not tracked[1].registration.ok
     assert not tracked[9].registration.ok
     assert errors(tracked[2:8], truth[2:8])[:, 0].max() < 0.05
@@ -235,7 +229,7 @@ def test_the_beginning_of_a_sweep_that_is_refused_does_not_become_the_map(skewed
     first = frames[0]
     assert first.time_offset is not None
     part = replace(first, points=first.points[:60], time_offset=first.time_offset[:60])
-    tracked = run([part, *frames[1:]])
+    tracked = track([part, *frames[1:]])
     assert not tracked[0].registration.ok
     assert tracked[-1].state == State.TRACKING
     assert errors(tracked[1:], se3.inverse(truth[1]) @ truth[1:])[:, 0].max() < 0.05
@@ -249,7 +243,7 @@ def test_a_first_cloud_that_is_a_part_of_a_sweep_is_not_gone_by(skewed_drive: Dr
     assert times is not None
     last = times > 0.025
     part = replace(frames[0], points=frames[0].points[last], time_offset=times[last]).later(float(times[last].min()))
-    tracked = run([part, *(frame.later(-0.05) for frame in frames[1:])])
+    tracked = track([part, *(frame.later(-0.05) for frame in frames[1:])])
     poses = np.array([t.T_odom_lidar for t in tracked])
     steps = se3.inverse(se3.inverse(truth[2:-1]) @ truth[3:]) @ se3.inverse(poses[2:-1]) @ poses[3:]
     assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 0.05  # as of whole ones; 0.34 before
@@ -264,7 +258,7 @@ def test_a_cloud_that_is_sent_again_is_no_halt(suburb_drive: Drive, often: int) 
     frames, truth = suburb_drive
     again = range(12, 12 + often)
     hung = [replace(frame, points=frames[11].points) if i in again else frame for i, frame in enumerate(frames)]
-    results = run(hung)
+    results = track(hung)
     for i in again:
         assert "same cloud as before" in results[i].registration.reason
         assert results[i].state is not State.TRACKING
@@ -283,7 +277,7 @@ def test_one_of_two_lidars_that_sends_its_last_cloud_again_holds_nothing(suburb_
         frame if i < first else replace(frame, points=np.concatenate([frame.points[frame.points[:, 0] > 0], behind]))
         for i, frame in enumerate(frames)
     ]
-    results = run(joined)
+    results = track(joined)
     assert all("a part of the cloud is that of before" in result.registration.reason for result in results[first + 1 :])
     assert np.linalg.norm((se3.inverse(truth[-1]) @ results[-1].T_odom_lidar)[:3, 3]) < 0.15  # m, with half of the view
     assert results[-1].state is State.TRACKING
@@ -327,7 +321,7 @@ def test_where_a_lift_opens_the_way_is_not_known(closed: int, breaks: int) -> No
 def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
     """In a simulation without noise; also where the caller uses one array for all clouds."""
     frames, _ = suburb_drive
-    results = run([replace(frames[0], stamp=frame.stamp) for frame in frames[:12]])
+    results = track([replace(frames[0], stamp=frame.stamp) for frame in frames[:12]])
     assert all(result.registration.ok for result in results)
     assert results[-1].state is State.TRACKING
     odometry, states = make_odometry(SlamSettings()), []
@@ -343,7 +337,7 @@ def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> No
 def test_skewed_scans_with_a_failed_one_at_the_start(skewed_drive: Drive) -> None:
     """The motion within the first scan is that of the time since, not of one period."""
     frames, truth = skewed_drive[0][:8], skewed_drive[1][:8]
-    tracked = run([frames[0], replace(frames[1], problem="cut off"), *frames[2:]])
+    tracked = track([frames[0], replace(frames[1], problem="cut off"), *frames[2:]])
     assert errors(tracked[2:], truth[2:])[:, 0].max() < 0.05  # 0.1 m with twice the speed
 
 
@@ -354,7 +348,7 @@ def test_a_clock_that_is_set_from_uptime_to_utc(suburb_drive: Drive) -> None:
     R = se3.exp([0, np.radians(-20), 0, 0, 0, 0])[:3, :3] @ se3.exp([0, 0, np.radians(45), 0, 0, 0])[:3, :3]
     turned = [replace(f, points=np.c_[f.points[:, :3] @ R.T, f.points[:, 3]].astype(np.float32)) for f in frames]
     late = [replace(f, stamp=f.stamp + 17 * 10**17) for f in turned[8:]]
-    tracked = run([*turned[:8], *late])
+    tracked = track([*turned[:8], *late])
     assert tracked[-1].state == State.TRACKING
 
 
@@ -363,7 +357,7 @@ def test_a_clock_that_is_set_from_uptime_to_utc(suburb_drive: Drive) -> None:
 def test_a_stamp_that_is_late_is_no_leap(suburb_drive: Drive, ms: int) -> None:
     """One cloud is stamped on its arrival, so long before the next one: it was a meter off for good, as `tracking`."""
     frames, truth = suburb_drive
-    tracked = run([*frames[:12], replace(frames[12], stamp=frames[13].stamp - ms * 10**6), *frames[13:]])
+    tracked = track([*frames[:12], replace(frames[12], stamp=frames[13].stamp - ms * 10**6), *frames[13:]])
     assert errors(tracked, truth)[:, 0].max() < 0.05  # as without
     assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
 
@@ -375,7 +369,7 @@ def test_frames_that_are_held_back_and_come_in_a_burst_are_no_leap(skewed_drive:
     frames, truth = skewed_drive
     arrival = frames[first + 4].stamp
     held = [replace(frames[first + k], stamp=arrival - (4 - k) * 8 * 10**6) for k in range(5)]
-    tracked = run([*frames[:first], *held, *frames[first + 5 :]])
+    tracked = track([*frames[:first], *held, *frames[first + 5 :]])
     assert errors(tracked, truth)[:, 0].max() < 0.05  # as without
     assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
 
@@ -385,7 +379,7 @@ def test_of_lost_frames_the_stamps_are_believed(suburb_drive: Drive) -> None:
     """A node that gets every third cloud, and then all: they counted as 0.3 s each, 0.8 m off for good."""
     kept = [*range(0, 18, 3), *range(18, 30)]
     frames, truth = suburb_drive
-    tracked = run([frames[i] for i in kept])
+    tracked = track([frames[i] for i in kept])
     assert errors(tracked, truth[kept])[:, 0].max() < 0.05  # as without
     assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(kept) - 2)
     np.testing.assert_allclose(np.diff([t.twist[3] for t in tracked[2:]]), 0, atol=0.3)  # 2 errors of 1 cm over 0.1 s
@@ -397,7 +391,7 @@ def test_delays_of_several_periods_are_no_motion(suburb_drive: Drive) -> None:
     frames, truth = suburb_drive
     stamps = np.array([frame.stamp for frame in frames]) + np.random.default_rng(3).exponential(1.5e8, len(frames))
     stamps = np.maximum.accumulate(stamps + 1e7 * np.arange(len(frames)))
-    tracked = run([replace(frame, stamp=int(stamp)) for frame, stamp in zip(frames, stamps, strict=True)])
+    tracked = track([replace(frame, stamp=int(stamp)) for frame, stamp in zip(frames, stamps, strict=True)])
     assert errors(tracked, truth)[-1, 0] < 0.05
     assert [t.state for t in tracked[2:]] == [State.TRACKING] * (len(frames) - 2)
 
@@ -407,10 +401,10 @@ def test_scans_that_were_left_out_for_want_of_time_are_no_pause(suburb_drive: Dr
     """What a pause asks for takes more time yet, and more would be left out: up to 2 s the stream is a slow one."""
     frames, truth = suburb_drive
     late = [replace(frame, dropped=9) for frame in frames[18::10]]
-    tracked = run([*frames[:8], *late])
+    tracked = track([*frames[:8], *late])
     assert [t.state for t in tracked[8:]] == [State.TRACKING] * len(late)
     assert errors(tracked[8:], truth[18::10])[:, 0].max() < 0.1
-    paused = run([*frames[:8], frames[18]])
+    paused = track([*frames[:8], frames[18]])
     assert "pause" in paused[-1].registration.reason
 
 
@@ -445,14 +439,14 @@ def test_after_a_pause_of_a_month_the_map_goes_on_behind_a_break(suburb_drive: D
 def test_an_unreadable_scan_keeps_its_reason(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     broken = Frame(6 * 10**8, np.zeros((0, 4), np.float32), problem="000006.bin: 13 bytes")
-    assert run([*frames[:6], broken])[-1].registration.reason == "000006.bin: 13 bytes"
+    assert track([*frames[:6], broken])[-1].registration.reason == "000006.bin: 13 bytes"
 
 
 @pytest.mark.slow
 def test_lost_after_a_long_gap_and_back_again(suburb_drive: Drive) -> None:
     frames, _ = suburb_drive
     gap = [replace(f, points=np.zeros((0, 4), np.float32)) for f in frames[8:14]]
-    tracked = run([*frames[:8], *gap, *frames[14:20]])
+    tracked = track([*frames[:8], *gap, *frames[14:20]])
     assert tracked[13].state == State.LOST
     growing = [np.trace(t.covariance) for t in tracked[8:14]]
     assert growing == sorted(growing)
@@ -465,7 +459,7 @@ def test_velocity_after_a_gap_is_that_since_the_last_registered_scan(suburb_driv
     """The car slowed down unseen: what the prediction was off by is no motion of the last period."""
     frames, truth = suburb_drive
     gap = [Frame((8 + i) * 10**8, np.zeros((0, 4), np.float32)) for i in range(5)]
-    last = run([*frames[:8], *gap, replace(frames[12], stamp=13 * 10**8)])[-1]
+    last = track([*frames[:8], *gap, replace(frames[12], stamp=13 * 10**8)])[-1]
     assert last.registration.ok
     true = se3.log(se3.inverse(truth[7]) @ truth[12]) / 0.6
     np.testing.assert_allclose(last.twist[3:], true[3:], atol=0.1)  # two errors of 3 cm over 0.6 s
@@ -476,7 +470,7 @@ def test_a_new_map_is_begun_when_nothing_fits_for_long(suburb_drive: Drive) -> N
     """Carried elsewhere: the odometry goes on, and the next edge of the pose graph says that it knows nothing."""
     elsewhere = np.random.default_rng(5).uniform(-40, 40, (3000, 4)).astype(np.float32)
     frames = [*suburb_drive[0][:8], *(Frame((8 + i) * 10**8, elsewhere) for i in range(12))]
-    tracked = run(frames, SlamSettings(odometry=OdometrySettings(restart_after=4)))
+    tracked = track(frames, odometry={"restart_after": 4})
     assert State.LOST in {t.state for t in tracked}
     assert tracked[-1].registration.ok
     edges = [t.keyframe.edge for t in tracked[10:] if t.keyframe and t.keyframe.edge]
@@ -487,7 +481,7 @@ def test_a_new_map_is_begun_when_nothing_fits_for_long(suburb_drive: Drive) -> N
 @pytest.mark.parametrize("stamps", [[0] * 8, [0, 1, 2, 3, 2, 1, 0, 1], [0, 1, 2, 600, 601, 602, 603, 604]])
 def test_stamps_that_repeat_jump_back_or_pause(suburb_drive: Drive, stamps: list[int]) -> None:
     frames = [replace(f, stamp=s * 10**8) for f, s in zip(suburb_drive[0], stamps, strict=False)]
-    tracked = run(frames)
+    tracked = track(frames)
     assert errors(tracked, suburb_drive[1][:8])[:, 0].max() < 0.05
     assert all(np.isfinite(t.twist).all() for t in tracked)
 
@@ -496,7 +490,7 @@ def test_stamps_that_repeat_jump_back_or_pause(suburb_drive: Drive, stamps: list
 def test_fast_start(suburb_drive: Drive) -> None:
     """Three meters between the first two scans: no velocity is known yet."""
     frames = [replace(f, stamp=i * 10**8) for i, f in enumerate(suburb_drive[0][::3])]
-    assert errors(run(frames), suburb_drive[1][::3])[:, 0].max() < 0.06
+    assert errors(track(frames), suburb_drive[1][::3])[:, 0].max() < 0.06
 
 
 @pytest.mark.slow
@@ -506,7 +500,7 @@ def test_a_drive_may_begin_in_a_curve(x: float, yaw: float) -> None:
     world, lidar, rng = straight("suburb"), Lidar(), np.random.default_rng(0)
     T_world_lidar = [world.drive_pose(2.0) @ se3.exp([0, 0, np.radians(yaw * i), x * i, 0, 0]) for i in range(4)]
     frames = [Frame(i * 2 * 10**8, lidar.scan(world, T, 0.0, rng).points) for i, T in enumerate(T_world_lidar)]
-    tracked = run(frames)
+    tracked = track(frames)
     off = errors(tracked, se3.inverse(T_world_lidar[0]) @ np.array(T_world_lidar))
     assert off[:, 0].max() < 0.05
     assert tracked[1].state == State.TRACKING
@@ -522,7 +516,7 @@ def test_a_drive_may_begin_in_a_column() -> None:
         truth = np.array([world.drive_pose(0.1 * i) for i in range(12)])
         scans = [lidar.scan(world, T, 0.1 * i, np.random.default_rng(i)) for i, T in enumerate(truth)]
         moving = float(np.mean([scan.moving.mean() for scan in scans]))
-    tracked = run([Frame(i * 10**8, scan.points) for i, scan in enumerate(scans)])
+    tracked = track([Frame(i * 10**8, scan.points) for i, scan in enumerate(scans)])
     assert all(t.registration.ok for t in tracked)
     # The column moves by 1.6 m per frame against the road. What little of that stands holds the car to an eighth of
     # such a step in every scan, which is said, and to a few centimeters at the end
@@ -538,7 +532,7 @@ def test_real_scans_follow_the_ground_truth(kitti_root: object) -> None:
     from dpm2_core.evaluation.metrics import evaluate
 
     source = open_source(f"{kitti_root}/sequences/04")
-    tracked = run(list(source.frames(0, 30)))
+    tracked = track(list(source.frames(0, 30)))
     assert source.poses is not None
     metrics = evaluate(source.poses[:30], np.array([t.T_odom_lidar for t in tracked]))
     # KISS-ICP 1.3.0 has 0.023 m and 0.045 deg on the whole excerpt; the ground truth's own noise is 2 to 6 cm a frame

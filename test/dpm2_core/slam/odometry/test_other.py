@@ -5,36 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame, Guess, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import LidarConfig
 from dpm2_core.sim.simulated_drive import wheel_odometry
 from dpm2_core.sim.world import build_world
-from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.other import OtherMotion
-from dpm2_core.slam.settings import SlamSettings
 
-from ....helpers.drives import Drive
+from ....helpers.drives import Drive, off, track
 
+run = partial(track, registration="geometric")
 pytestmark = pytest.mark.slow
 JUMP = 15  # frame, in the middle
 TURN = [0, 0, np.radians(1), 0, 0, 0]
-
-
-def run(frames: list[Frame]) -> list[OdometryResult]:
-    odometry = make_odometry(SlamSettings(registration="geometric"))
-    return [odometry.process(frame) for frame in frames]
-
-
-def off(tracked: list[OdometryResult], truth: Array) -> Array:
-    """(N,) m."""
-    return np.linalg.norm((se3.inverse(truth) @ np.array([t.T_odom_lidar for t in tracked]))[:, :3, 3], axis=1)
 
 
 def beside(drive: Drive, **wrong: float) -> list[Frame]:

@@ -17,12 +17,12 @@ from dpm2_core.estimates import Registration, State
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry, make_registration, make_slam
-from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.registration.protocol import Prediction
 from dpm2_core.slam.registration.texture import VisualSettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint, seen, stripes, with_intensities
+from ....helpers.drives import track
 
 
 def registered(first: Frame, second: Frame, **visual: object) -> Registration:
@@ -248,10 +248,7 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
 def test_points_images_and_intensities_of_a_real_drive_agree(kitti_root: Path) -> None:
     """Asked where nothing is open, the others move the result by centimeters: three measurements of one motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
-    tracks = []
-    for sigma in (0.08, 1e-4):
-        odometry = make_odometry(SlamSettings(odometry=OdometrySettings(degraded_sigma=sigma)))
-        tracks.append([odometry.process(frame) for frame in frames])
+    tracks = [track(frames, odometry={"degraded_sigma": sigma}) for sigma in (0.08, 1e-4)]
     methods = [tracked.registration.method for tracked in tracks[1][1:]]
     assert methods.count("visual") >= 4  # of 11: until there are scans enough to ask the intensities
     assert methods.count("visual") + methods.count("intensity") >= 9
