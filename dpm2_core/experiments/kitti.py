@@ -70,7 +70,7 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
     if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
         notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
     runs = run_folders(names, sequences, request.out)
-    _pictures(runs, sequences, request.out, notes)
+    trajectory_pictures(runs, request.out, notes)
     return Outcome([table, speed], notes, runs)
 
 
@@ -86,14 +86,17 @@ def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outco
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)
     notes = missing_note(sequences, TESTED_360)
-    _pictures(runs, sequences, request.out, notes)
+    trajectory_pictures(runs, request.out, notes)
     return Outcome([table], notes, runs)
 
 
-def _pictures(runs: Sequence[tuple[str, Path]], sequences: Sequence[str], out: Path, notes: list[str]) -> None:
-    """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence."""
-    for sequence in sequences:
-        folders = {label.rpartition(", ")[0]: path for label, path in runs if path.name == sequence}
+def trajectory_pictures(runs: Mapping[str, Mapping[str, Path]], out: Path, notes: list[str]) -> None:
+    """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence.
+
+    Args:
+        runs: folders by sequence and method.
+    """
+    for sequence, folders in runs.items():
         ways, truth = aligned_ways(folders)
         draw = partial(trajectories_png, ways=ways, truth=truth, title=sequence)
         if not drawn(out / f"trajectories_{sequence}.png", notes, draw):

@@ -123,8 +123,9 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome
         outcome.notes.append(f"parts were made at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", name, _record(request, outcome, figures), threads=request.workers)
     tables = [html_table(table.record()) for table in outcome.tables]
+    runs = [(f"{row}, {sequence}", path) for sequence, of in outcome.runs.items() for row, path in of.items()]
     with atomic_write(request.out / f"{name}.html") as file:
-        file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", outcome.runs, tables))
+        file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", runs, tables))
     return outcome
 
 

@@ -54,12 +54,12 @@ class Outcome:
 
     Attributes:
         tables: the paper's, with ours beside. notes: what a reader must know, in words.
-        runs: folders of runs by label and sequence, for the report.
+        runs: folders of runs by sequence and name, for the report.
     """
 
     tables: list[ResultTable]
     notes: list[str] = field(default_factory=list)
-    runs: list[tuple[str, Path]] = field(default_factory=list)
+    runs: dict[str, dict[str, Path]] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
 
 

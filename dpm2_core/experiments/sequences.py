@@ -121,9 +121,9 @@ def add_runs(
     table.add(label or name, cells, note="; ".join(filter(None, notes)))
 
 
-def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> list[tuple[str, Path]]:
-    """Folders of the runs, by what they are called in the report."""
-    return [(f"{name}, {sequence}", out / _folder(name) / sequence) for sequence in sequences for name in names]
+def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> dict[str, dict[str, Path]]:
+    """Folders of the runs by sequence and name."""
+    return {sequence: {name: out / _folder(name) / sequence for name in names} for sequence in sequences}
 
 
 def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:

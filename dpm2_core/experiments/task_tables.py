@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from math import isfinite
 from statistics import mean
 from typing import Any
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.figures import trajectories_png
-from dpm2_core.experiments.kitti import aligned_ways
+from dpm2_core.experiments.kitti import trajectory_pictures
 from dpm2_core.experiments.paired import paired_gain
-from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
+from dpm2_core.experiments.request import Experiment, Outcome, Request
 from dpm2_core.experiments.sequences import learned_note
 from dpm2_core.experiments.table import Cells, ResultTable
 from dpm2_core.experiments.task_part import (
@@ -137,7 +135,7 @@ class TaskTable:
         notes = [*self.notes, *self._warnings(request, of, figures)]
         if self.measured == SLAM:
             self._pictures(request, figures, notes)
-        return Outcome([table, gain_table], notes, [], {"gains": gains})
+        return Outcome([table, gain_table], notes, extra={"gains": gains})
 
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
@@ -157,13 +155,10 @@ class TaskTable:
 
     def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
         """The paper's figure 3: trajectories on the output of both arms of the first seed, a picture a sequence."""
-        for sequence in figures[self._measured(0, "with")]["sequences"]:
-            name = folder_name(sequence)
-            ways = {ROWS[arm]: request.out / self._measured(0, arm) / name / "output" for arm in ("without", "with")}
-            positions, truth = aligned_ways(ways)
-            draw = partial(trajectories_png, ways=positions, truth=truth, title=name)
-            if not drawn(request.out / f"trajectories_{name}.png", notes, draw):
-                break
+        names = map(folder_name, figures[self._measured(0, "with")]["sequences"])
+        folders = {ROWS[arm]: request.out / self._measured(0, arm) for arm in ("without", "with")}
+        runs = {name: {row: folder / name / "output" for row, folder in folders.items()} for name in names}
+        trajectory_pictures(runs, request.out, notes)
 
     def _training(self, request: Request, seed: int, arm: Arm) -> Training:
         defaults = () if request.config is not None else self.defaults
