@@ -55,7 +55,7 @@ def experiment(
     from dpm2_core.learning.begun import check_one_process
 
     if listed:
-        table = FigureTable("Experiments", names=["name", "of"], text=["what"])
+        table = FigureTable("Experiments", names=["name"], text=["of", "what"])
         for key, entry in EXPERIMENTS.items():
             table.add_row(key, entry.paper, entry.summary)
         show(table, {key: {"of": entry.paper, "what": entry.summary} for key, entry in EXPERIMENTS.items()}, json_file)

@@ -234,4 +234,9 @@ def test_the_list_has_every_experiment() -> None:
         "kitti", "kitti360", "robustness", "reference-points", "fusion", "attention", "gndnet", "dslr", "dslr-slam",
         "ae-lidar", "ae-lidar-slam",
     ]  # fmt: skip
-    assert "Differentiable SLAM, table 4" in dpm2("experiment", "--list").stdout
+    lines = [line.split("  ") for line in dpm2("experiment", "--list").stdout.splitlines()]
+    named = {
+        words[1]: " ".join(words[2:]) for words in lines if len(words) > 1
+    }  # a line begins with each, in 80 columns
+    assert "DeepPointMap2, table 1" in named["kitti"]
+    assert set(json.loads(done.stdout)) <= set(named)
