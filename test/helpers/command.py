@@ -30,6 +30,21 @@ def dpm2(*arguments: object) -> Done:
     return Done(int(end.value.code or 0), out.getvalue(), err.getvalue())
 
 
+def succeeded(*arguments: object) -> Done:
+    """The same, which must end well."""
+    done = dpm2(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def refused(*arguments: object) -> str:
+    """What `dpm2` says of a request that cannot be: one line, and exit code 2."""
+    done = dpm2(*arguments)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done
+    assert done.stderr.startswith("dpm2: ")
+    return done.stderr
+
+
 def dpm2_process(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
     """The command in its own process, as a shell starts it."""
     command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]

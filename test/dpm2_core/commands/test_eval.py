@@ -20,13 +20,12 @@ from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, refused, succeeded
 
 
 def evaluated(gt: Path, est: Path, *options: object) -> dict[str, Any]:
     """The figures of `dpm2 eval`."""
-    done = dpm2("eval", "--gt", gt, "--est", est, "--json", "-", *options)
-    assert done.returncode == 0, done.stderr
+    done = succeeded("eval", "--gt", gt, "--est", est, "--json", "-", *options)
     return json.loads(done.stdout)
 
 
@@ -116,17 +115,15 @@ def test_poses_along_other_axes_are_said(tmp_path: Path, turned: bool) -> None:
     ):
         write_kitti(tmp_path / f"{name}.txt", of)
     for name, said in (("same", False), ("other", True)):
-        done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / f"{name}.txt")
-        assert done.returncode == 0, done.stderr
+        done = succeeded("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / f"{name}.txt")
         assert ("along other axes" in " ".join(done.stderr.split())) == said
 
 
 def test_different_lengths_are_rejected_naming_both(tmp_path: Path) -> None:
     write_kitti(tmp_path / "gt.txt", _drive(60))
     write_kitti(tmp_path / "est.txt", _drive(50))
-    done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt")
-    assert done.returncode == 2
-    assert re.search("60 poses .* 50 ", done.stderr)
+    error = refused("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt")
+    assert re.search("60 poses .* 50 ", error)
 
 
 @pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
@@ -139,9 +136,8 @@ def test_a_calibration_without_tr_or_that_is_not_there_is_rejected(tmp_path: Pat
     write_kitti(tmp_path / "gt.txt", _drive())
     (tmp_path / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     for name, reason in (("calib.txt", "no Tr"), ("none.txt", "no such file")):
-        done = dpm2("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "gt.txt", "--calib", tmp_path / name)
-        assert done.returncode == 2
-        assert f"{name}: {reason}" in done.stderr
+        error = refused("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "gt.txt", "--calib", tmp_path / name)
+        assert f"{name}: {reason}" in error
 
 
 def drive_with_truth(root: Path, numbers: Sequence[int] = range(6)) -> tuple[Path, np.ndarray]:

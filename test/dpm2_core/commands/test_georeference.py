@@ -30,7 +30,7 @@ from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import RemovedKeyframe
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, refused, succeeded
 from ...helpers.drives import first_scans
 from ...helpers.maps import ring
 
@@ -74,8 +74,7 @@ def truth(drive: Path) -> tuple[list[int], Array]:
 def run(recording: Path, drive: Path, out: Path, *settings: str, epoch: int = 0) -> Result:
     path, line = out / "a.dpm2map", out / "a.geojson"
     words = [word for setting in (*OPTIONS, *settings) for word in ("--set", setting)]
-    done = dpm2("run", recording, "--out", out / "run", "--map", path, *words)
-    assert done.returncode == 0, done.stderr
+    succeeded("run", recording, "--out", out / "run", "--map", path, *words)
     assert dpm2("map", "export", path, line).returncode == 0
     assert dpm2("map", "info", path, "--json", out / "info.json").returncode == 0
     (feature,) = json.loads(line.read_text())["features"]
@@ -184,8 +183,7 @@ def test_a_drive_that_nothing_ties_to_the_map_is_written_where_its_own_fixes_are
 
 def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> None:
     save_as(two_drives(fixes=False), tmp_path / "map")
-    done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
-    assert done.returncode == 0
+    done = succeeded("map", "export", tmp_path / "map", tmp_path / "a.geojson")
     assert "without 40 of the 40 keyframes of session 2" in done.stderr
     assert set(lines_of(tmp_path / "a.geojson")) == {1}
 
@@ -248,16 +246,14 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
     few = [replace(k, fix=k.fix if node in (0, 1, *range(40, 45)) else None) for node, k in enumerate(data.keyframes)]
     few = [replace(k, fix=k.fix and replace(k.fix, covariance=np.eye(3) * 25.0)) for k in few]
     save_as(replace(data, keyframes=few, georeference=None), tmp_path / "few")
-    done = dpm2("map", "export", tmp_path / "few", tmp_path / "few.geojson")
-    assert done.returncode == 2
-    assert "2 fixes do not tell it: the way is too short or too straight, or half" in done.stderr
-    assert "; 5 fixes are of keyframes that" in done.stderr
+    error = refused("map", "export", tmp_path / "few", tmp_path / "few.geojson")
+    assert "2 fixes do not tell it: the way is too short or too straight, or half" in error
+    assert "; 5 fixes are of keyframes that" in error
 
 
 def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
-    done = dpm2("map", "export", map_file, tmp_path / "a.geojson")
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("the map has no georeference; see input.gnss_topic")
+    error = refused("map", "export", map_file, tmp_path / "a.geojson")
+    assert error.strip().endswith("the map has no georeference; see input.gnss_topic")
     assert not (tmp_path / "a.geojson").exists()
     assert "georeference" in dpm2("map", "info", map_file).stdout
 

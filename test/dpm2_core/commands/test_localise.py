@@ -17,7 +17,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, refused, succeeded
 
 pytestmark = [pytest.mark.slow, pytest.mark.weights]
 
@@ -31,8 +31,7 @@ def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map of its first 20 scans, with the session's weights noted."""
     folder = tmp_path_factory.mktemp("map")
     path = folder / "drive.dpm2map"
-    done = dpm2("run", recording, "--out", folder / "out", "--frames", f":{MAPPED}", "--map", path, *QUICK)
-    assert done.returncode == 0, done.stderr
+    succeeded("run", recording, "--out", folder / "out", "--frames", f":{MAPPED}", "--map", path, *QUICK)
     with MapStore.open(path) as store:
         assert load_map(store).sessions[0].weights.startswith("small ")
     return path
@@ -53,15 +52,13 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     before, map_ = hashlib.sha256(made.read_bytes()).hexdigest(), made
     if tiled:
         map_ = tmp_path / "tiles"
-        exported = dpm2("map", "export", made, map_, "--tiles", "10")
-        assert exported.returncode == 0, exported.stderr
+        succeeded("map", "export", made, map_, "--tiles", "10")
         assert len(list(map_.glob("*.dpm2map"))) > 1
     hints = [] if hint is None else ["--hint", hint]
     out = tmp_path / "out"
     out.mkdir()
     (out / "metrics.json").write_text("{}")  # of a run that made a map
-    done = dpm2("run", recording, "--out", out, "--frames", "8:24", "--localise", map_, *hints, *QUICK)
-    assert done.returncode == 0, done.stderr
+    done = succeeded("run", recording, "--out", out, "--frames", "8:24", "--localise", map_, *hints, *QUICK)
     assert hashlib.sha256(made.read_bytes()).hexdigest() == before
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]
     report = json.loads((out / "localisation.json").read_text())
@@ -89,10 +86,9 @@ def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tm
 
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
     """Nothing is there; then it looks everywhere, after a second although it has hardly moved."""
-    done = dpm2(
+    succeeded(
         "run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0", *QUICK
     )
-    assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert report["frames_until_found"] == 6  # the next keyframe, 5 m on
     assert report["frames_by_state"]["relocalising"] == 6
@@ -108,8 +104,7 @@ def test_kidnapping_is_noticed_and_answered(recording: Path, made: Path, tmp_pat
         target = recording / "sequences" / "00" / "velodyne" / f"{frame:06d}.bin"
         (sequence / "velodyne" / f"{n:06d}.bin").symlink_to(target)
     (sequence / "times.txt").write_text("".join(f"{0.1 * n:.1f}\n" for n in range(len(order))))
-    done = dpm2("run", sequence, "--out", tmp_path / "o", "--localise", made, *QUICK)
-    assert done.returncode == 0, done.stderr
+    succeeded("run", sequence, "--out", tmp_path / "o", "--localise", made, *QUICK)
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert [event["event"] for event in report["events"]].count("found") + report["kidnappings"] == 2
     estimate = read_trajectory(tmp_path / "o" / "trajectory.tum")
@@ -123,11 +118,9 @@ def test_kidnapping_is_noticed_and_answered(recording: Path, made: Path, tmp_pat
 def test_another_drive_extends_the_map_as_a_session_tied_by_loops(recording: Path, made: Path, tmp_path: Path) -> None:
     path = tmp_path / "grown.dpm2map"
     path.write_bytes(made.read_bytes())
-    rejected = dpm2("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
-    assert rejected.returncode == 2
-    assert "--resume" in rejected.stderr
-    done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path, "--extend", *QUICK)
-    assert done.returncode == 0, done.stderr
+    error = refused("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path)
+    assert "--resume" in error
+    done = succeeded("run", recording, "--out", tmp_path / "o", "--frames", "4:", "--map", path, "--extend", *QUICK)
     with MapStore.open(path) as store:
         data = load_map(store)
     assert {k.session for k in data.keyframes} == {1, 2}
@@ -157,8 +150,6 @@ def test_errors_of_use(recording: Path, made: Path, tmp_path: Path, arguments: l
     for name, weights in (("NONE", ""), ("OTHER", "other 0123")):
         with MapStore.create(files[name]) as store:
             store.begin_session("", weights)
-    done = dpm2("run", recording, "--out", tmp_path / "o", *[files.get(a, a) for a in arguments])
-    assert done.returncode == 2, done.stderr
-    assert words in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    error = refused("run", recording, "--out", tmp_path / "o", *[files.get(a, a) for a in arguments])
+    assert words in error
     assert not (tmp_path / "o").exists()

@@ -34,7 +34,7 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as, ways
 from dpm2_core.slam.store.map_store import Change, MapStore
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, refused, succeeded
 from ...helpers.fleets import fleet_maps
 from ...helpers.maps import ring
 
@@ -45,8 +45,7 @@ def loaded(path: Path) -> MapData:
 
 
 def test_info(map_file: Path) -> None:
-    done = dpm2("map", "info", map_file)
-    assert done.returncode == 0
+    done = succeeded("map", "info", map_file)
     info = " ".join(done.stdout.split())
     for words in (
         "12, 12 of them",
@@ -100,8 +99,7 @@ def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Pat
             clouds.append(pack_cloud(se3.transform(T_tilted_level, scene)))
         poses = T_tilted_level @ data.poses @ se3.inverse(T_tilted_level)
         save_as(replace(data, clouds=clouds, poses=poses), tmp_path / f"{name}.dpm2map")
-        done = dpm2("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
-        assert done.returncode == 0, done.stderr
+        done = succeeded("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
         assert ("the ground of the map is tilted by 2" in done.stderr) == (degrees > 0), done.stderr
         assert (tmp_path / f"{name}.pgm").is_file()
 
@@ -114,8 +112,7 @@ def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(tmp_
         poses[..., 2, 3] += slope * poses[..., 0, 3] + 2.8 * np.arange(laps)[:, None]
         both = data if laps == 1 else merge_maps(data, data, np.eye(4), [data.edges[0]])
         save_as(replace(both, poses=poses.reshape(-1, 4, 4)), tmp_path / f"{name}.dpm2map")
-        done = dpm2("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
-        assert done.returncode == 0, done.stderr
+        done = succeeded("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
         assert ("not to be used" in done.stderr, words in done.stderr) == (bool(words), True), done.stderr
         assert (tmp_path / f"{name}.pgm").is_file()
 
@@ -138,30 +135,24 @@ def test_maps_of_different_weights_are_not_merged(tmp_path: Path, map_file: Path
     with closing(sqlite3.connect(other)) as connection:
         connection.execute("UPDATE sessions SET weights = 'mine fedcba9876543210'")
         connection.commit()
-    done = dpm2("map", "merge", map_file, other, "--out", tmp_path / "both.dpm2map", "--transform", "9 0 0 0")
-    assert done.returncode == 2
-    assert "mine fedcba9876543210, small 0123456789" in done.stderr
+    error = refused("map", "merge", map_file, other, "--out", tmp_path / "both.dpm2map", "--transform", "9 0 0 0")
+    assert "mine fedcba9876543210, small 0123456789" in error
     assert not (tmp_path / "both.dpm2map").exists()
 
 
 def test_what_cannot_be_exported(tmp_path: Path, map_file: Path) -> None:
-    done = dpm2("map", "export", map_file, tmp_path / "a.jpg")
-    assert done.returncode == 2
-    assert "choose --format from ply, pcd" in done.stderr
+    assert "choose --format from ply, pcd" in refused("map", "export", map_file, tmp_path / "a.jpg")
     with MapStore.create(tmp_path / "empty.dpm2map") as store:
         store.begin_session()
-    done = dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "a.ply")
-    assert done.returncode == 2
-    assert "no keyframe" in done.stderr
+    assert "no keyframe" in refused("map", "export", tmp_path / "empty.dpm2map", tmp_path / "a.ply")
     assert dpm2("map", "info", tmp_path / "empty.dpm2map").returncode == 0
 
 
 def test_an_empty_map_makes_no_tiles(tmp_path: Path) -> None:
     with MapStore.create(tmp_path / "empty.dpm2map") as store:
         store.begin_session()
-    done = dpm2("map", "export", tmp_path / "empty.dpm2map", tmp_path / "tiles", "--tiles", 50)
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("empty.dpm2map: no keyframe in it yet")
+    error = refused("map", "export", tmp_path / "empty.dpm2map", tmp_path / "tiles", "--tiles", 50)
+    assert error.strip().endswith("empty.dpm2map: no keyframe in it yet")
     assert not (tmp_path / "tiles").exists()
 
 
@@ -198,8 +189,7 @@ def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
         (tmp_path / "link").symlink_to(tmp_path / name)
         with MapStore.open(tmp_path / name, read_only=False) as store:
             store.begin_session()  # from now on there is a file beside it
-            info = dpm2("map", "info", tmp_path / "link", "--json", tmp_path / f"{name}.json")
-            assert info.returncode == 0
+            succeeded("map", "info", tmp_path / "link", "--json", tmp_path / f"{name}.json")
             size = sum(path.stat().st_size for path in (tmp_path / name, tmp_path / f"{name}-wal"))
         figures = json.loads((tmp_path / f"{name}.json").read_text())
         assert figures["length_m"] == pytest.approx(2 * 110.0)
@@ -227,12 +217,9 @@ def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
     T = se3.make([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [10, 0, 0])
     np.testing.assert_allclose(both.poses[12:], T @ both.poses[:12], atol=1e-9)
     for words in (["--transform", "1 2 3"], 2 * ["--transform", "0 0 0 0"], ["--transform", "a b c d"]):
-        done = dpm2("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words)
-        assert done.returncode == 2
-        assert len(done.stderr.splitlines()) == 1
-    done = dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0")
-    assert done.returncode == 2
-    assert "a file already" in done.stderr
+        refused("map", "merge", map_file, map_file, "--out", tmp_path / "no", *words)
+    error = refused("map", "merge", map_file, map_file, "--out", out, "--transform", "0 0 0 0")
+    assert "a file already" in error
 
 
 def test_a_drive_that_both_maps_hold_is_said_to_be_there_twice(tmp_path: Path) -> None:
@@ -243,8 +230,7 @@ def test_a_drive_that_both_maps_hold_is_said_to_be_there_twice(tmp_path: Path) -
     save_as(replace(one, keyframes=moved), tmp_path / "other")
     for second, said in (("one", True), ("other", False)):
         both = tmp_path / f"with {second}"
-        done = dpm2("map", "merge", tmp_path / "one", tmp_path / second, "--out", both, "--transform", "10 0 0 90")
-        assert done.returncode == 0
+        done = succeeded("map", "merge", tmp_path / "one", tmp_path / second, "--out", both, "--transform", "10 0 0 90")
         assert ("12 of its 12 keyframes are in a map before it, too" in done.stderr) is said
         assert len(loaded(both)) == 24
 
@@ -255,8 +241,7 @@ def test_the_trajectory_of_several_drives_begins_with_the_earliest(tmp_path: Pat
     save_as(late, tmp_path / "late")
     save_as(early, tmp_path / "early")
     both = tmp_path / "both"
-    done = dpm2("map", "merge", tmp_path / "late", tmp_path / "early", "--out", both, "--transform", "9 0 0 0")
-    assert done.returncode == 0
+    succeeded("map", "merge", tmp_path / "late", tmp_path / "early", "--out", both, "--transform", "9 0 0 0")
     assert dpm2("map", "export", both, tmp_path / "a.tum").returncode == 0
     keys = list(read_trajectory(tmp_path / "a.tum").keys)
     assert keys == sorted(k.stamp for k in (*early.keyframes, *late.keyframes))
@@ -287,8 +272,7 @@ def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, 
         store.write(Change(georeference=Georeference(np.array([49.0, 8.4, 110.0]), se3.exp([0, 0, 1.0, 2, 3, 4]))))
     for words, said in (("500 0 0 0", "500 m from where the fixes of both maps have it"), ("1 0 0 0", "")):
         out = tmp_path / f"{words}.dpm2map"
-        done = dpm2("map", "merge", map_file, map_file, "--out", out, "--transform", words)
-        assert done.returncode == 0
+        done = succeeded("map", "merge", map_file, map_file, "--out", out, "--transform", words)
         assert (said in done.stderr, "fixes" in done.stderr) == (True, bool(said))
 
 
@@ -313,8 +297,7 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
     drive = "session 1 of blue" if robots[1] else "session 2"
     for name in ("a.ply", "a.pcd", "a.html", "a.pgm", "a.tum"):
         for path in ("apart", "alone"):
-            done = dpm2("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
-            assert done.returncode == 0
+            done = succeeded("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
             assert (f"without 12 of the 12 keyframes of {drive}: no loop ties" in done.stderr) == (path == "apart")
         if name != "a.html":  # it has a title
             assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
@@ -324,9 +307,8 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
 def test_maps_that_are_joined_by_a_known_transform_stay_together(tmp_path: Path) -> None:
     """Though no loop ties them: their clouds are both there, and the graph keeps the transform."""
     save_as(ring(12), tmp_path / "one")
-    done = dpm2("map", "merge", tmp_path / "one", tmp_path / "one", "--out", tmp_path / "both",
+    succeeded("map", "merge", tmp_path / "one", tmp_path / "one", "--out", tmp_path / "both",
                 "--transform", "600 0 0 0")  # fmt: skip
-    assert done.returncode == 0
     done = dpm2("map", "export", tmp_path / "both", tmp_path / "both.ply")
     assert "without" not in done.stderr
     points = points_of(tmp_path / "both.ply")
@@ -337,8 +319,7 @@ def test_maps_that_are_joined_by_a_known_transform_stay_together(tmp_path: Path)
 
 
 def test_check_and_recover(tmp_path: Path, map_file: Path) -> None:
-    done = dpm2("map", "check", map_file)
-    assert done.returncode == 0
+    done = succeeded("map", "check", map_file)
     assert "sound" in done.stdout
     content = bytearray(map_file.read_bytes())
     content[-3000:-100] = bytes(2900)
@@ -376,11 +357,9 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     assert dpm2("run", recording, "--out", tmp_path / "a", "--map", whole, *RUN).returncode == 0
     assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--frames", "0:35", *RUN).returncode == 0
     before = len(loaded(parts))
-    rejected = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN)
-    assert rejected.returncode == 2
-    assert "--resume goes on with it" in rejected.stderr
-    done = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN)
-    assert done.returncode == 0
+    error = refused("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN)
+    assert "--resume goes on with it" in error
+    done = succeeded("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN)
     first = loaded(parts).keyframes[before - 1].index
     assert f"before_{first}: the results so far; those of this run begin at frame {first}" in done.stderr
     assert len(read_trajectory(tmp_path / "b" / f"before_{first}" / "trajectory.tum")) == 35
@@ -416,8 +395,7 @@ def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Pa
     finally:
         child.kill()
         child.wait()
-    done = dpm2("map", "check", path)
-    assert done.returncode == 0
+    done = succeeded("map", "check", path)
     assert "keyframes, sound" in done.stdout
     assert _rejected(path)
 
@@ -433,9 +411,8 @@ def _rejected(path: Path) -> int:
 
 @pytest.mark.slow
 def test_a_map_of_another_drive_is_not_gone_on_with(tmp_path: Path, recording: Path, map_file: Path) -> None:
-    done = dpm2("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN)
-    assert done.returncode == 2
-    assert "is not in" in done.stderr
+    error = refused("run", recording, "--out", tmp_path / "a", "--map", map_file, "--resume", *RUN)
+    assert "is not in" in error
 
 
 def test_reading_commands_leave_the_file_as_it_is(tmp_path: Path, map_file: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, refused, succeeded
 
 SENSOR = "network.image={beams: [[2, -14, 16]], first: 0, rows: 16, columns: 64, scale: 120}"
 SMALL = [SENSOR, "network.channels=4", "network.latent=8", "window=3", "every=1", "batch=1", "slam_loss.points=200"]
@@ -49,17 +49,12 @@ def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[
     assert [row["step"] for row in log if "slam_loss" in row] == [4, 5]
 
     weights, image = out / "weights.safetensors", tmp_path / "scan.png"
-    done = dpm2("eval-task", name, weights, pairs, "--json", "-", "--picture", image, "--frame", "2")
-    assert done.returncode == 0, done.stderr
+    done = succeeded("eval-task", name, weights, pairs, "--json", "-", "--picture", image, "--frame", "2")
     printed = json.loads(done.stdout)
     assert printed["scans"] == 6
     assert figures <= printed.keys()
     assert image.stat().st_size > 1000
 
-    rejected = dpm2("eval-task", name, weights, pairs, "--slam")
-    assert rejected.returncode == 2
-    assert "no poses0.txt beside the pairs" in rejected.stderr
+    assert "no poses0.txt beside the pairs" in refused("eval-task", name, weights, pairs, "--slam")
     other = "ae_lidar" if name == "dslr" else "dslr"
-    rejected = dpm2("eval-task", other, weights, pairs)
-    assert rejected.returncode == 2
-    assert f"weights of {name}, not of {other}" in rejected.stderr
+    assert f"weights of {name}, not of {other}" in refused("eval-task", other, weights, pairs)

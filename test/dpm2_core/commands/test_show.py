@@ -14,7 +14,7 @@ import torch
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
 
-from ...helpers.command import dpm2
+from ...helpers.command import refused, succeeded
 from ...helpers.networks import tiny
 from ...helpers.scenes import boxes
 
@@ -35,8 +35,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_draws_an_image(sequence: Path, tmp_path: Path) -> None:
     weights = str(sequence / "tiny.safetensors")
-    done = dpm2("show", sequence, "0", "1", "--out", str(tmp_path / "m.png"), "--weights", weights)
-    assert done.returncode == 0, done.stderr
+    succeeded("show", sequence, "0", "1", "--out", str(tmp_path / "m.png"), "--weights", weights)
     assert (tmp_path / "m.png").read_bytes()[1:4] == b"PNG"
 
 
@@ -54,8 +53,7 @@ def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
     sizes = []
     for name in ("tiny", "camera"):
         out, weights = tmp_path / f"{name}.png", str(folder / f"{name}.safetensors")
-        done = dpm2("show", folder, "0", "1", "--out", str(out), "--weights", weights)
-        assert done.returncode == 0, done.stderr
+        succeeded("show", folder, "0", "1", "--out", str(out), "--weights", weights)
         sizes.append(cv2.imread(str(out)).shape)
     assert sizes[1][0] > 1.5 * sizes[0][0]
     assert sizes[1][1] == sizes[0][1]
@@ -70,8 +68,7 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
     for name, arguments in (
         ("one", weights[:2]), ("two", weights), ("half", [*weights[:2], "--corrupt", "obstruction=1,seed=1"])
     ):  # fmt: skip
-        done = dpm2("show", sequence, "0", "1", "--out", tmp_path / f"{name}.png", *arguments)
-        assert done.returncode == 0, done.stderr
+        done = succeeded("show", sequence, "0", "1", "--out", tmp_path / f"{name}.png", *arguments)
         pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
         shapes.append(pictures[-1].shape)
     assert shapes[1] == (2 * shapes[0][0], shapes[0][1], 3)
@@ -101,7 +98,4 @@ def test_one_of_several_sequences_is_shown(sequence: Path, tmp_path: Path) -> No
     ],
 )
 def test_errors_of_use(sequence: Path, arguments: list[str], words: str) -> None:
-    done = dpm2("show", sequence, *arguments)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    assert words in refused("show", sequence, *arguments)

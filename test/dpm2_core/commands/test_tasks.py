@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ...helpers.command import Done, dpm2
+from ...helpers.command import Done, dpm2, refused, succeeded
 
 SMALL = ["network.cells=32", "network.cell=2", "network.channels=4", "window=3", "every=1", "slam_loss.points=300"]
 SLAM = ["--set", "slam.gamma=0.5"]
@@ -58,8 +58,7 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     assert len((out / "log.jsonl").read_text().splitlines()) == len(log)
 
     weights, image = out / "weights.safetensors", tmp_path / "ground.png"
-    done = dpm2("eval-task", "gndnet", weights, recording, "--json", "-", "--picture", image)
-    assert done.returncode == 0, done.stderr
+    done = succeeded("eval-task", "gndnet", weights, recording, "--json", "-", "--picture", image)
     printed = json.loads(done.stdout)
     assert printed["scans"] == 4
     assert {"mse", "miou", "precision", "recall"} <= printed.keys()
@@ -76,27 +75,20 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
 def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
     """Exit code 2 and one line that names what is wrong."""
     out = tmp_path / "out"
-
-    def error(*arguments: object) -> str:
-        done = dpm2(*arguments)
-        assert done.returncode == 2
-        assert done.stderr.startswith("dpm2: ")
-        assert done.stderr.count("\n") == 1
-        return done.stderr
-
-    assert "nowhere: no such folder" in error("train", "gndnet", tmp_path / "nowhere", "--out", out)
-    assert "unknown key network.cellz" in error("train", "gndnet", recording, "--out", out, "--set", "network.cellz=3")
-    assert "no checkpoint.pt to resume" in error("train", "gndnet", recording, "--out", out, "--resume")
-    assert "no sequence has the 9 scans" in error("train", "gndnet", recording, "--out", out)  # 5 of every second
-    assert "slam.gamma=-1" in error("train", "gndnet", recording, "--out", out, "--set", "slam.gamma=-1")
+    assert "nowhere: no such folder" in refused("train", "gndnet", tmp_path / "nowhere", "--out", out)
+    unknown = ("--set", "network.cellz=3")
+    assert "unknown key network.cellz" in refused("train", "gndnet", recording, "--out", out, *unknown)
+    assert "no checkpoint.pt to resume" in refused("train", "gndnet", recording, "--out", out, "--resume")
+    assert "no sequence has the 9 scans" in refused("train", "gndnet", recording, "--out", out)  # 5 of every second
+    assert "slam.gamma=-1" in refused("train", "gndnet", recording, "--out", out, "--set", "slam.gamma=-1")
     assert not (out / "checkpoint.pt").exists()
-    assert "no such weights" in error("eval-task", "gndnet", tmp_path / "none.safetensors", recording)
-    assert "nonsense: no such task" in error("eval-task", "nonsense", tmp_path / "none.safetensors", recording)
+    assert "no such weights" in refused("eval-task", "gndnet", tmp_path / "none.safetensors", recording)
+    assert "nonsense: no such task" in refused("eval-task", "nonsense", tmp_path / "none.safetensors", recording)
     label = recording / "sequences" / "00" / "labels" / "000001.label"
     label.write_bytes(label.read_bytes()[:-4])
-    assert "000001.label: 899 labels for 900 points" in error("train", "gndnet", recording, "--out", out)
+    assert "000001.label: 899 labels for 900 points" in refused("train", "gndnet", recording, "--out", out)
     label.unlink()
-    assert "000001.label: No such file" in error("train", "gndnet", recording, "--out", out)
+    assert "000001.label: No such file" in refused("train", "gndnet", recording, "--out", out)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.geometry import se3
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, succeeded
 from ...helpers.networks import TINY
 from ..tasks.conftest import labelled_drive, write_pairs
 
@@ -46,8 +46,7 @@ def test_sequences_that_a_task_is_measured_on_and_learns_from_are_named(tmp_path
 
     def said(number: int, *more: object) -> list[str]:
         out = tmp_path / f"out{number}"
-        done = dpm2("train", "gndnet", data, "--out", out, *sets(*QUICK, *GROUND), *more)
-        assert done.returncode == 0, done.stderr
+        done = succeeded("train", "gndnet", data, "--out", out, *sets(*QUICK, *GROUND), *more)
         return notes(done.stderr)
 
     assert said(0, "--val", data, "--val-sequences", "02") == [f"note: --val {data} is what the task learns from"]
@@ -87,8 +86,7 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
     for number, (weight, validation, said) in enumerate(cases):
         drives = json.dumps({str(packed): weight, **({} if weight else {str(elsewhere): 1})})
         call = ("train", "phase1", "--config", tmp_path / "asked.yaml", "--out", tmp_path / f"out{number}")
-        done = dpm2(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
-        assert done.returncode == 0, done.stderr
+        done = succeeded(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
         assert notes(done.stderr) == [f"note: validation {validation} is what the network learns from"] * said
 
 

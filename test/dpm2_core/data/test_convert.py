@@ -27,7 +27,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Camera, Fix, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
-from ...helpers.command import dpm2
+from ...helpers.command import dpm2, succeeded
 from ...helpers.full_disk import largest_file
 
 MakeFolder = Callable[..., Path]
@@ -228,8 +228,7 @@ def test_a_place_that_cannot_be_written_is_named(kitti_folder: MakeFolder, tmp_p
 
 def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
     folder, out = kitti_folder(), tmp_path / "bag"
-    done = dpm2("convert", folder, out, "--frames", "1:4", "--set", "input.images=false", "--zstd")
-    assert done.returncode == 0, done.stderr
+    succeeded("convert", folder, out, "--frames", "1:4", "--set", "input.images=false", "--zstd")
     assert len(BagSource(out)) == 3
     assert dpm2("convert", folder, out).returncode == 2
     assert dpm2("convert", folder, out, "--overwrite").returncode == 0
@@ -316,8 +315,7 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
     (tmp_path / "clouds").mkdir()
     for n in range(3):
         write_ply(tmp_path / "clouds" / f"{n}.ply", np.full((5, 4), n, np.float32))
-    done = dpm2("convert", tmp_path / "clouds", tmp_path / "bag", "--frames", "1:")
-    assert done.returncode == 0, done.stderr
+    succeeded("convert", tmp_path / "clouds", tmp_path / "bag", "--frames", "1:")
     source = BagSource(tmp_path / "bag")
     assert [(frame.stamp - EPOCH_NS, frame.points[0, 0]) for frame in source.frames()] == [(10**8, 1), (2 * 10**8, 2)]
     assert set(open_bag(tmp_path / "bag").types) == {"/points"}
