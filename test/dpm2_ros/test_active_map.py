@@ -45,11 +45,17 @@ def keyframes(count: int) -> list[Keyframe]:
     return out
 
 
-def drive(directory: Path, count: int = 3, robot: str = "", **ros: Any) -> None:
-    """From the start of a node to its end."""
-    active = ActiveMap(config(map_directory=str(directory), **ros), robot, LOG)
+def driven(count: int, robot: str = "", **ros: Any) -> ActiveMap:
+    """The map of so many keyframes, which goes on."""
+    active = ActiveMap(config(**ros), robot, LOG)
     for keyframe in keyframes(count):
         active.add(keyframe)
+    return active
+
+
+def drive(directory: Path, count: int = 3, robot: str = "", **ros: Any) -> None:
+    """From the start of a node to its end."""
+    active = driven(count, robot, map_directory=str(directory), **ros)
     if count:
         active.save()
     active.close()
@@ -113,9 +119,7 @@ def test_a_second_save_of_one_drive_replaces_the_first(tmp_path: Path) -> None:
 
 def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
     """A whole copy, which does not grow; the same drive replaces it, another drive gets a name with a number."""
-    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
-    for keyframe in keyframes(2):
-        active.add(keyframe)
+    active = driven(2, map_directory=str(tmp_path))
     assert str(tmp_path / "town.dpm2map") in active.save("town")
     active.add(Keyframe(**vars(keyframes(3)[2])))
     assert check_map(tmp_path / "town.dpm2map").keyframes == 2
@@ -125,8 +129,7 @@ def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
         result = check_map(tmp_path / f"{name}.dpm2map")
         assert (result.problems, result.keyframes) == ([], 3)
     before = contents(tmp_path)
-    other = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
-    other.add(keyframes(1)[0])
+    other = driven(1, map_directory=str(tmp_path))
     other.save("town.dpm2map")
     other.close()
     after = contents(tmp_path)
@@ -148,8 +151,7 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     """Neither folder nor file, also where the other is given; a drive without a keyframe leaves nothing either."""
     monkeypatch.chdir(tmp_path)
     for ros in ({"map_directory": ""}, {"map_directory": "", "map_file": ""}):
-        active = ActiveMap(config(**ros), "", LOG)
-        active.add(keyframes(1)[0])
+        active = driven(1, **ros)
         with pytest.raises(UsageError, match=r"no map is saved: ros.map_directory is empty"):
             active.save()
         assert active.keep() == ""
@@ -157,8 +159,7 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
         active.close()
     drive(tmp_path / "maps", count=0)
     assert list(tmp_path.iterdir()) == []
-    active = ActiveMap(config(map_directory="", map_file="town.dpm2map"), "", LOG)
-    active.add(keyframes(1)[0])
+    active = driven(1, map_directory="", map_file="town.dpm2map")
     active.close()
     assert list(tmp_path.iterdir()) == [tmp_path / "town.dpm2map"]
 
@@ -178,9 +179,7 @@ def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) 
 
 
 def test_what_a_reset_ends_is_kept(tmp_path: Path) -> None:
-    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
-    for keyframe in keyframes(3):
-        active.add(keyframe)
+    active = driven(3, map_directory=str(tmp_path))
     assert "map of 3 keyframes saved" in active.keep()
     active.reset()
     assert len(active.mapper.keyframes) == 0
@@ -191,9 +190,7 @@ def test_what_a_reset_ends_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
-    active = ActiveMap(config(map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "a.dpm2map")), "", LOG)
-    for keyframe in keyframes(2):
-        active.add(keyframe)
+    active = driven(2, map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "a.dpm2map"))
     (tmp_path / "maps").write_text("in the way")
     before = active.T_map_odom("")
     with pytest.raises(Dpm2Error, match=r"maps.*no map saved"):
@@ -208,8 +205,7 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
 def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another program writes to the file, which is as a full disk: the folder is made, no copy; then all is saved."""
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
-    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
-    active.add(keyframes(1)[0])
+    active = driven(1, map_directory=str(tmp_path))
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         active.add(keyframes(2)[1])
@@ -225,8 +221,7 @@ def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize("name", ["", "town"])
 def test_a_map_whose_file_was_moved_since_the_last_keyframe_is_not_saved(tmp_path: Path, name: str) -> None:
     """It said that the map is saved in a file that was not there; back in its place, it is saved."""
-    active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
-    active.add(keyframes(1)[0])
+    active = driven(1, map_directory=str(tmp_path))
     path, elsewhere = tmp_path / "drive.dpm2map", tmp_path / "elsewhere"
     path.rename(elsewhere)
     with pytest.raises(Dpm2Error, match=f"but its file is incomplete: {path}: removed or moved"):

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nav_msgs.msg import Odometry
 
 from dpm2_ros import feed
 from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
-from dpm2_ros.tf_message import TFMessage
 
-from ..helpers.mapping import OTHER, S, core, keyframes, mapped, send_all
+from ..helpers.mapping import OTHER, S, core, keyframes, mapped, placed, send_all
 
 
 @pytest.fixture
@@ -56,18 +54,17 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
 
 def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
     """The robot was killed: until all of that drive is there, nobody knows where its odometry of now is in the map."""
-    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
-    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    move, heard = placed(mapper)
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
     send_all(mapper, 2, 3, session=f"{S}{EARLIER}")
     mapper.wait(lambda: keyframes(mapper) == 4, "the rest of it")
     for stamp in range(5):
-        odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base"))
+        move(stamp)
     time.sleep(1.0)
     send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
     mapped(mapper, 6)
-    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 77, "odom", "base"))
+    move(77)
     time.sleep(1.0)
     assert not heard  # it is not placed yet, either
     assert [k.robot for k in core(mapper).keyframes] == [""] * 6
@@ -77,20 +74,19 @@ def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any)
 
 def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper: Any) -> None:
     """Its odometry begins at zero; until the place of its new drive is decided, nobody knows where that is."""
-    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
-    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    move, heard = placed(mapper)
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
-    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 5, "odom", "base"))
+    move(5)
     mapper.wait(lambda: len(heard) == 1, "/tf")
     mapper.wires.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name("", 0, OTHER)))
     time.sleep(0.5)
-    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 6, "odom", "base"))
+    move(6)
     time.sleep(1.0)
     assert len(heard) == 1
     send_all(mapper, 2)  # the drive before goes on: it was another robot's
     time.sleep(0.5)
-    odometry.publish(edge_to_msg(np.eye(4), np.eye(6), 7, "odom", "base"))
+    move(7)
     mapper.wait(lambda: len(heard) == 2, "/tf again")
 
 

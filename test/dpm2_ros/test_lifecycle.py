@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
@@ -33,6 +32,7 @@ from dpm2_ros.conversions import keyframe_name
 from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.slam_node import SlamNode
 
+from ..helpers.diagnostics import having
 from ..helpers.lifecycle import Manager
 from ..helpers.mapping import Wires, points
 
@@ -93,11 +93,6 @@ class Robot:
             self._wires.send(keyframe, keyframe_name("", id))
 
 
-def counts(message: DiagnosticArray) -> dict[str, str]:
-    """Figures of the odometry."""
-    return {value.key: value.value for value in message.status[0].values}
-
-
 def held() -> tuple[int, int]:
     """Threads of Python and open files of this process."""
     gc.collect()
@@ -139,7 +134,7 @@ def test_rounds_keep_every_map_and_leave_nothing(
 def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
     """And goes on where it was."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
-    lidar, diagnostics = Lidar(m.harness, drive), m.harness.hear(DiagnosticArray, "/diagnostics")
+    lidar = Lidar(m.harness, drive)
     assert m.state == "unconfigured"
     assert not m.change(ACTIVATE)
     assert m.change(CONFIGURE)
@@ -154,8 +149,7 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
     assert m.change(ACTIVATE)
     lidar.send(*range(4, 10))
     m.harness.wait(lambda: m.keyframes > keyframes, "a keyframe more")
-    names = ("received", "processed")
-    m.harness.wait(lambda: diagnostics and [counts(diagnostics[-1])[n] for n in names] == ["6", "6"], "their number")
+    m.harness.status("slam_node: odometry", having(received=6, processed=6))
     last = lidar.odom[-1].pose.pose.position.x
     assert last == pytest.approx(drive.pose(9)[0, 3], abs=0.1)
     assert m.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)

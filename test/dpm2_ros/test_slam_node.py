@@ -48,10 +48,8 @@ def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliabl
         clock.publish(Clock(clock=stamp_to_msg(drive.stamp(n))))
         r.send_and_wait(n)
     assert r.stamps() == [drive.stamp(n) for n in range(drive.frames)]
-    for n, message in enumerate(r.odom):
-        T = transform_matrix(message.pose.pose)
-        assert np.linalg.norm(T[:3, 3] - drive.pose(n)[:3, 3]) < ACCURATE
-        assert (message.header.frame_id, message.child_frame_id) == ("odom", "lidar")
+    assert r.off(drive.pose) < ACCURATE
+    assert {(message.header.frame_id, message.child_frame_id) for message in r.odom} == {("odom", "lidar")}
     covariance = np.array(r.odom[-1].pose.covariance).reshape(6, 6)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
     assert np.trace(covariance) > np.trace(np.array(r.odom[5].pose.covariance).reshape(6, 6))  # uncertainty accumulates
@@ -282,28 +280,18 @@ def test_clouds_are_processed_while_a_map_is_saved(
 
 
 def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
-    """The disk is full as far as the file system goes: the map's folder is a file."""
-    r = rig(f"ros.map_directory:={tmp_path / 'map'}", f"ros.map_file:={tmp_path / 'a.dpm2map'}")
-    r.send_and_wait(0)
-    r.mapped(1)
-    (tmp_path / "map").write_text("in the way")
-    result = r.harness.call(Trigger, "/slam_node/save_map")
-    assert not result.success
-    assert str(tmp_path / "map") in result.message
-    (tmp_path / "map").unlink()  # so that the end of the node can save
-
-
-def test_a_reset_that_cannot_save_the_map_changes_nothing(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
-    """Neither the odometry nor the robot's place; the response says why."""
+    """The disk is full as far as the file system goes: the map's folder is a file. A reset that cannot save the map
+    changes nothing, neither the odometry nor the robot's place; the response says why."""
     r = rig(f"ros.map_directory:={tmp_path / 'map'}", f"ros.map_file:={tmp_path / 'a.dpm2map'}")
     tf = r.harness.hear(TFMessage, "/tf")
     r.send_and_wait(*range(6))
     r.mapped(1)
     (tmp_path / "map").write_text("in the way")
-    result = r.harness.call(Trigger, "/slam_node/reset")
-    assert not result.success
-    assert "no reset: " in result.message
-    assert str(tmp_path / "map") in result.message
+    for service, says in (("save_map", ""), ("reset", "no reset: ")):
+        result = r.harness.call(Trigger, f"/slam_node/{service}")
+        assert not result.success
+        assert says in result.message
+        assert str(tmp_path / "map") in result.message
     placed = lambda: [t for m in tf for t in m.transforms if t.child_frame_id == "odom"]  # noqa: E731
     before = len(placed())
     r.send_and_wait(6)

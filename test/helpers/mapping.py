@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import payload_to_msgs
 from dpm2_ros.mapping import KEEP_ALL
+from dpm2_ros.tf_message import TFMessage
 
 from .diagnostics import having
 
@@ -60,6 +62,13 @@ def mapped(mapper: Any, count: int) -> None:
 
 def points(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * np.float32([20, 20, 5, 1])
+
+
+def placed(mapper: Any) -> tuple[Callable[[int], None], list[TFMessage]]:
+    """What publishes an odometry at its origin, of a stamp (ns), and the transforms that come of it."""
+    odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    return lambda stamp: odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base")), heard
 
 
 def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:

@@ -6,12 +6,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.topics import IMAGE, KITTI, POINTS
+from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.frame import Array
 from dpm2_ros.conversions import transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.stamps import stamp_to_msg
@@ -72,6 +75,11 @@ class Rig:
     def keyframes(self) -> int:
         """In the map of the node."""
         return len(self.node.slam.mapper.keyframes)
+
+    def off(self, pose: Callable[[int], Array]) -> float:
+        """How far the poses that came out are from where they should be, (4, 4) by their number, m at most."""
+        poses = [transform_matrix(message.pose.pose) for message in self.odom]
+        return max(float(np.linalg.norm((T - pose(n))[:3, 3])) for n, T in enumerate(poses))
 
     def stamps(self) -> list[int]:
         return [stamp_ns(message.header) for message in self.odom]

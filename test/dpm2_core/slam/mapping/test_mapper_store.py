@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,14 @@ def make(store: MapStore | None = None, **settings: object) -> Mapper:
     return Mapper(MapSettings.model_validate(settings), PoseGraph(RobustSettings()), KnownLoops(), store)
 
 
+@contextmanager
+def begun(path: Path, **settings: object) -> Iterator[Mapper]:
+    """One that writes a session of its own into a file, which is made if it is not there."""
+    with MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path) as store:
+        store.begin_session()
+        yield make(store, **settings)
+
+
 def laps(count: int, seed: int = 0) -> list[Keyframe]:
     rng = np.random.default_rng(seed)
     out: list[Keyframe] = []
@@ -68,9 +77,7 @@ def laps(count: int, seed: int = 0) -> list[Keyframe]:
 
 def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
     path = tmp_path / "a.dpm2map"
-    with MapStore.create(path) as store:
-        store.begin_session()
-        mapper = make(store)
+    with begun(path) as mapper:
         for keyframe in laps(2):
             mapper.add(keyframe)
             assert mapper.store_problem == ""
@@ -129,9 +136,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     sizes = []
     for count in (1, 4):
         path = tmp_path / f"{count}.dpm2map"
-        with MapStore.create(path) as store:
-            store.begin_session()
-            mapper = make(store)
+        with begun(path) as mapper:
             for keyframe in laps(count):
                 mapper.add(keyframe)
             own = sum(mapper.clouds.loan(node) is None for node in range(len(mapper.keyframes)))
@@ -162,10 +167,7 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
 def test_a_second_session_counts_on(tmp_path: Path) -> None:
     path, drive = tmp_path / "a.dpm2map", laps(1)
     for part in (drive[:8], drive[8:]):
-        store = MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path)
-        with store:
-            store.begin_session()
-            mapper = make(store)
+        with begun(path) as mapper:
             if mapper.keyframes:
                 T_map_odom = mapper.poses[-1] @ se3.inverse(drive[7].T_odom_kf)
                 mapper.start_session(T_map_odom, SIGMA, 7)
@@ -183,14 +185,10 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
 def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(tmp_path: Path) -> None:
     """However the odometry begins: level where an IMU has told what is up, so that a tilted LiDAR was tilted twice."""
     path, drive = tmp_path / "a.dpm2map", laps(1)
-    with MapStore.create(path) as store:
-        store.begin_session()
-        mapper = make(store)
+    with begun(path) as mapper:
         for keyframe in drive[:8]:
             mapper.add(keyframe)
-    with MapStore.open(path, read_only=False) as store:
-        store.begin_session()
-        mapper = make(store)
+    with begun(path) as mapper:
         mapper.start_session(None, SIGMA, 7)
         assert mapper.T_map_odom is None
         T_odom_first = se3.exp([0, 0.1, 0, 0, 0, 0])
@@ -203,9 +201,7 @@ def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(
 def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> None:
     """All said that the map was saved in a file that was not there."""
     path, elsewhere = tmp_path / "town.dpm2map", tmp_path / "elsewhere.dpm2map"
-    with MapStore.create(path) as store:
-        store.begin_session()
-        mapper = make(store)
+    with begun(path) as mapper:
         mapper.add(laps(1)[0])
         mapper.finish()
         assert mapper.store_problem == ""
@@ -273,9 +269,8 @@ def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None
     """Clouds of 8 kB per keyframe packed, 2 MB in all: what stays in memory without descriptors is far less."""
     import tracemalloc
 
-    with MapStore.create(tmp_path / "a.dpm2map") as store:
-        store.begin_session()
-        mapper, drive = make(store, moving_window=0), laps(3)
+    drive = laps(3)
+    with begun(tmp_path / "a.dpm2map", moving_window=0) as mapper:
         for keyframe in drive[:LAP]:
             mapper.add(keyframe)
         tracemalloc.start()
