@@ -244,5 +244,6 @@ def _sequence_folder(path: Path, sequence: str) -> Path:
     root = path / "sequences" if (path / "sequences").is_dir() else path
     found = sorted(folder.name for folder in root.iterdir() if (folder / "velodyne").is_dir())
     if not found:
-        raise UsageError(f"{path}: no KITTI sequence (no velodyne folder in it or below sequences/) and no bag")
+        what = "no KITTI sequence (no velodyne folder in it or below sequences/)"
+        raise UsageError(f"{path}: {what}, no bag, no scans: docs/recordings.md")
     return root / chosen(path, sequence, found)

@@ -50,7 +50,9 @@ def open_session(path: Path | str, settings: SlamSettings, config: str, resume: 
     """
     path, weights = Path(path), settings.weights_id()
     if path.exists() and not resume:
-        raise UsageError(f"--map {path}: there is a file already; --resume goes on with it")
+        raise UsageError(
+            f"--map {path}: there is a file already; --resume goes on with its drive, --extend adds another"
+        )
     # Not whether it exists now: another node may have made one of that name since.
     there = resume and path.exists()
     store = MapStore.open(path, read_only=False) if there else MapStore.create(path)

@@ -358,7 +358,7 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     assert dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--frames", "0:35", *RUN).returncode == 0
     before = len(loaded(parts))
     error = refused("run", recording, "--out", tmp_path / "b", "--map", parts, *RUN)
-    assert "--resume goes on with it" in error
+    assert "--resume goes on with its drive, --extend adds another" in error
     done = succeeded("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN)
     first = loaded(parts).keyframes[before - 1].index
     assert f"before_{first}: the results so far; those of this run begin at frame {first}" in done.stderr
