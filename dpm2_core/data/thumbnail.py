@@ -15,7 +15,7 @@ from dpm2_core.data.image_messages import DISTORTIONS
 from dpm2_core.frame import Array, Camera, Image
 
 PLACE_WIDTH = 320
-"""Of a picture by which a place is found, pixels: 6 kB."""
+"""Of a picture by which a place is found, pixels: 6 to 10 kB."""
 _START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
 _QUALITY = 80
 _KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
