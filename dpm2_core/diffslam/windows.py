@@ -30,8 +30,9 @@ class ContiguousWindows(Sampler[list[int]]):
             raise UsageError(f"windows: {window} scans, every {every}; want at least 2, every 1")
         reach = (window - 1) * every + 1
         if not any(length >= reach for length in lengths):
+            longest = max(lengths, default=0)
             raise UsageError(
-                f"windows: no sequence has the {reach} scans of a window; the longest {max(lengths, default=0)}"
+                f"window {window}, every {every}: no sequence has the {reach} scans of it, {longest} at most"
             )
         self._seed, self._epoch, self.windows = seed, 0, list[list[int]]()
         begin = 0
