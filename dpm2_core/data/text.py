@@ -30,13 +30,13 @@ def read_numbers(path: Path, columns: int) -> Array:
     return np.array(rows).reshape(-1, columns)
 
 
-def read_lines(path: Path) -> list[str]:
-    """Lines of a text file; none if there is no such file."""
+def read_lines(path: Path, missing_ok: bool = True) -> list[str]:
+    """Lines of a text file; none if there is no such file, or that is an error."""
     try:
         return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return []
     except (OSError, UnicodeDecodeError) as error:
+        if missing_ok and isinstance(error, FileNotFoundError):
+            return []
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
 
 

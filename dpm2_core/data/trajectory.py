@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.data.text import read_lines
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
@@ -80,12 +81,7 @@ def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
     Raises:
         UsageError: no such file, or a line that is no pose; it names file and line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UsageError(f"{path}: {reason}") from None
-    lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, line.split()) for number, line in enumerate(read_lines(Path(path), missing_ok=False), 1)]
     lines = [(number, fields) for number, fields in lines if fields and not fields[0].startswith("#")]
     if not lines and allow_empty:
         return Trajectory(np.zeros((0, 4, 4)), np.zeros(0, np.int64), "tum")
