@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from dpm2_core.sim.world import build_world
 from dpm2_core.slam.settings import SlamSettings
 
 from ...helpers.command import dpm2
+from ...helpers.drives import InMemory
 from ...helpers.networks import tiny
 
 
@@ -144,21 +144,6 @@ def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have
     assert np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1).max() < 0.02
 
 
-class Listed:
-    """A recording of these frames."""
-
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self.name, self.notes, self.truth, self.T_cam_lidar = "listed", list[str](), "", None
-        self.poses: Array | None = None
-        self._frames = frames
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        yield from self._frames[start:stop]
-
-
 def carried(frame: Frame) -> Frame:
     """After eight frames the recording goes on 20 s later in another place: the mirror image."""
     if frame.index < 8:
@@ -170,7 +155,7 @@ def carried(frame: Frame) -> Frame:
 def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording: Path) -> None:
     """Where the second part is to the first is a guess, which was learned from and measured against like all else. The
     last scan before the pause is left out: the motion to the next one, by which its sweep is straightened, is none."""
-    referenced = refer(Listed([*map(carried, open_source(recording).frames())]), SlamSettings(threads=1))
+    referenced = refer(InMemory([*map(carried, open_source(recording).frames())]), SlamSettings(threads=1))
     poses, truth = referenced.poses, _truth(recording)
     there = np.flatnonzero(np.isfinite(poses).all((1, 2)))
     before, after = there[there < 8], there[there >= 8]
@@ -197,7 +182,7 @@ def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() ->
         points = frame.points.copy()
         points[:, :3] = np.einsum("nij,nj->ni", T[:, :3, :3], points[:, :3]) + T[:, :3, 3]
         frames.append(replace(frame, points=points))
-    referenced = refer(Listed(frames), SlamSettings(threads=1))
+    referenced = refer(InMemory(frames), SlamSettings(threads=1))
     assert all(frame.time_offset is None for frame in referenced.frames())
     assert referenced.notes == ["the times of the points are not used, the motion contradicts them"]
 

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from typer.testing import CliRunner
 from dpm2_core.cli import app
 from dpm2_core.config import load_settings
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
+from dpm2_core.data.source import IndexedSource
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
@@ -29,90 +29,62 @@ from dpm2_core.learning.generate import GenerateSettings, generate, pack
 
 from ...helpers import rooms
 from ...helpers.command import dpm2
+from ...helpers.drives import InMemory
 from ...helpers.networks import tiny
 from ...helpers.scenes import boxes, make_image
 
 
-class Sweeps:
+class Sweeps(IndexedSource):
     """Six sweeps of a street at 10 m/s in a bend, each point seen from where the LiDAR was at its time."""
 
-    name, T_cam_lidar = "sweeps", None
-
     def __init__(self, world: np.ndarray, images: bool = True) -> None:
-        self.notes: list[str] = []
+        super().__init__("sweeps", 6)
         self.world, self.images = world, images
-        self.poses: Array | None = np.stack([self.at(0.1 * n) for n in range(6)])
+        self.poses = np.stack([self.at(0.1 * n) for n in range(6)])
         self.poses[2] = np.nan
 
     @staticmethod
     def at(seconds: float) -> Array:
         return se3.exp(np.array([0, 0, 0.3, 10, 0, 0]) * seconds)
 
-    def __len__(self) -> int:
-        return 6
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        for n in range(6)[start:stop]:
-            offsets = np.linspace(-0.05, 0.05, len(self.world)).astype(np.float32)
-            T = np.stack([se3.inverse(self.at(0.1 * n + t)) for t in offsets])
-            seen = np.einsum("nij,nj->ni", T[:, :3, :3], self.world) + T[:, :3, 3]
-            images = (make_image(np.random.default_rng(n)),) if self.images or n == 3 else ()
-            points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
-            yield Frame(n * 10**8, points, offsets, images, index=n)
-
-
-class Walk:
-    """Five scans of a walk in a room."""
-
-    name, T_cam_lidar = "walk", None
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-        self.poses: Array | None = rooms.walk(5)
-
-    def __len__(self) -> int:
-        return 5
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        assert self.poses is not None
-        yield from rooms.frames(self.poses)[start:stop]
+    def frame(self, position: int) -> Frame:
+        offsets = np.linspace(-0.05, 0.05, len(self.world)).astype(np.float32)
+        T = np.stack([se3.inverse(self.at(0.1 * position + t)) for t in offsets])
+        seen = np.einsum("nij,nj->ni", T[:, :3, :3], self.world) + T[:, :3, 3]
+        images = (make_image(np.random.default_rng(position)),) if self.images or position == 3 else ()
+        points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
+        return Frame(position * 10**8, points, offsets, images, index=position)
 
 
 def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
     """Enlarged, way and all."""
-    source = Walk()
+    poses = rooms.walk(5)
+    source = InMemory(rooms.frames(poses))
+    source.poses = poses
     pack(source, tmp_path / "d", tiny())
     drive = PackedDrive(tmp_path / "d")
     assert drive.about["scale"] == ROOM_SCALE
-    assert source.poses is not None
     for n, frame in enumerate(source.frames()):
-        np.testing.assert_allclose(drive[n].pose[:3, 3], ROOM_SCALE * source.poses[n, :3, 3])
-        np.testing.assert_array_equal(drive[n].pose[:3, :3], source.poses[n, :3, :3])
+        np.testing.assert_allclose(drive[n].pose[:3, 3], ROOM_SCALE * poses[n, :3, 3])
+        np.testing.assert_array_equal(drive[n].pose[:3, :3], poses[n, :3, :3])
         reach = np.abs(frame.points[:, :3]).max(0)
         np.testing.assert_allclose(np.abs(drive[n].cloud).max(0), ROOM_SCALE * reach, rtol=0.1)
 
 
-class Leaning:
+class Leaning(IndexedSource):
     """Two scans of a street by a sensor that leans forward by 20 degrees, with images."""
 
-    name, T_cam_lidar = "leaning", None
-
     def __init__(self) -> None:
-        self.notes: list[str] = []
-        self.T_level_lidar = se3.exp([0, np.radians(20), 0, 0, 0, 0])
+        super().__init__("leaning", 2)
         level = np.stack([np.eye(4), se3.exp([0, 0, 0.1, 1, 0, 0])])
-        self.poses: Array | None = level @ self.T_level_lidar
+        self.poses = level @ se3.exp([0, np.radians(20), 0, 0, 0, 0])
         world = boxes(np.random.default_rng(0), 20_000)
         self.world = world[world[:, 2] >= -1.7]  # nothing beneath the ground
 
-    def __len__(self) -> int:
-        return 2
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        assert self.poses is not None
-        for n, pose in enumerate(self.poses[start:stop], start):
-            seen = np.c_[se3.transform(se3.inverse(pose), self.world), np.ones(len(self.world))].astype(np.float32)
-            yield Frame(n * 10**8, seen, None, (make_image(np.random.default_rng(n)),), index=n)
+    def frame(self, position: int) -> Frame:
+        seen = se3.transform(se3.inverse(self.poses[position]), self.world)
+        points = np.c_[seen, np.ones(len(seen))].astype(np.float32)
+        return Frame(position * 10**8, points, None, (make_image(np.random.default_rng(position)),), index=position)
 
 
 def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -> None:
@@ -126,7 +98,6 @@ def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -
         there = se3.transform(sample.pose, sample.cloud.astype(np.float64))
         gap = cKDTree(source.world).query(there)[0]
         assert gap.max() < 0.01  # 2 mm of packing
-        assert source.poses is not None
         of_camera = source.poses[n] @ frame.images[0].camera.T_lidar_cam
         np.testing.assert_allclose(sample.pose @ sample.images[0].camera.T_lidar_cam, of_camera, atol=1e-6)
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -22,24 +21,10 @@ from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.settings import Config, SlamSettings
 
 from ...helpers import corridor
+from ...helpers.drives import InMemory
 from ...helpers.scenes import make_image
 
 GEOMETRIC = SlamSettings.model_validate({"registration": "geometric", "threads": 1, "loops": {"descriptors": False}})
-
-
-class Frames:
-    """A recording that is in memory already."""
-
-    name, notes, truth, poses, T_cam_lidar = "frames", (), "", None, None
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = frames
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        yield from self._frames[start:stop]
 
 
 @pytest.mark.slow
@@ -88,7 +73,7 @@ def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], reg
     numbers = iter(range(len(suburb_drive[0])))
     config = Config(slam=GEOMETRIC.model_copy(update={"registration": registration}))
     try:
-        with OfflineRun(Frames(suburb_drive[0][:12]), config) as drive:
+        with OfflineRun(InMemory(suburb_drive[0][:12]), config) as drive:
             drive.run(lambda result: between(next(numbers)))
     finally:
         sys.setprofile(None)
