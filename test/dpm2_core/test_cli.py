@@ -26,7 +26,7 @@ from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import exit_code
 from dpm2_core.geometry import se3
 
-from ..helpers.command import dpm2, dpm2_process, refused, succeeded
+from ..helpers.command import dpm2, dpm2_process, refused, started, succeeded
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -158,14 +158,8 @@ def test_completion(words: str, offered: list[str]) -> None:
 @pytest.mark.slow
 def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -> None:
     """500 frames would take a minute."""
-    program = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from dpm2_core.cli import main; main(['sim', sys.argv[1], '--frames', '500', '--no-images'])"
-    )
-    command = [sys.executable, "-c", program, str(tmp_path / "drive")]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        while process.poll() is None and not list(tmp_path.rglob("*.bin")):
-            time.sleep(0.05)
+    drive = ("sim", tmp_path / "drive", "--frames", 500, "--no-images")
+    with started(*drive, until=lambda: list(tmp_path.rglob("*.bin"))) as process:
         process.send_signal(signal.SIGINT)
         began = time.monotonic()
         _, errors = process.communicate(timeout=60)

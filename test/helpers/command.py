@@ -3,9 +3,13 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from functools import partial
 from io import StringIO
 from typing import NamedTuple
 
@@ -47,5 +51,23 @@ def refused(*arguments: object) -> str:
 
 def dpm2_process(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
     """The command in its own process, as a shell starts it."""
-    command = [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
+    return subprocess.run(_command(arguments), capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload]
+
+
+@contextmanager
+def started(*arguments: object, until: Callable[[], object] = lambda: True) -> Iterator[subprocess.Popen[str]]:
+    """The same, when it has come so far, to be interrupted; it ends with this."""
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may have it ignored
+    with subprocess.Popen(_command(arguments), stderr=subprocess.PIPE, text=True, preexec_fn=listen) as process:
+        try:
+            while not until():
+                assert process.poll() is None
+                time.sleep(0.05)
+            assert process.poll() is None
+            yield process
+        finally:
+            process.kill()
+
+
+def _command(arguments: tuple[object, ...]) -> list[str]:
+    return [sys.executable, "-m", "dpm2_core.cli", *map(str, arguments)]

@@ -6,9 +6,6 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-import subprocess
-import sys
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +31,7 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as, ways
 from dpm2_core.slam.store.map_store import Change, MapStore
 
-from ...helpers.command import dpm2, refused, succeeded
+from ...helpers.command import dpm2, refused, started, succeeded
 from ...helpers.fleets import fleet_maps
 from ...helpers.maps import ring
 
@@ -386,15 +383,9 @@ def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Pa
     """kill -9 of a real drive, after the network has tried loops and had them rejected."""
     path = tmp_path / "a.dpm2map"
     rejecting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_overlap=1", "--set", "slam.loops.radius=0")
-    command = ["run", str(recording), "--out", str(tmp_path / "out"), "--map", str(path), *rejecting]
-    child = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *command], stderr=subprocess.DEVNULL)
-    try:
-        while child.poll() is None and not _rejected(path):
-            time.sleep(0.1)
-        assert child.poll() is None
-    finally:
-        child.kill()
-        child.wait()
+    run = ("run", recording, "--out", tmp_path / "out", "--map", path, *rejecting)
+    with started(*run, until=lambda: _rejected(path)):
+        pass  # and kill -9
     done = succeeded("map", "check", path)
     assert "keyframes, sound" in done.stdout
     assert _rejected(path)

@@ -6,10 +6,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +21,7 @@ from dpm2_core.sim.settings import ImuConfig
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-from ...helpers.command import dpm2, dpm2_process, refused, succeeded
+from ...helpers.command import dpm2, dpm2_process, refused, started, succeeded
 from ...helpers.drives import first_scans
 from ...helpers.full_disk import largest_file
 
@@ -221,13 +217,9 @@ def test_a_run_that_is_killed_leaves_results_and_settings_of_the_one_before(sequ
     _stand_still(sequence)
     assert dpm2("run", sequence, "--out", out, "--frames", ":3", *QUICK).returncode == 0
     before = {file.name: file.read_bytes() for file in out.iterdir()}
-    run = ("run", str(sequence), "--out", str(out), "--map", str(path), *QUICK, "--set", "slam.map.voxel=0.7")
-    process = subprocess.Popen([sys.executable, "-m", "dpm2_core.cli", *run], stderr=subprocess.DEVNULL)
-    while not _keyframes(path):
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
+    run = ("run", sequence, "--out", out, "--map", path, *QUICK, "--set", "slam.map.voxel=0.7")
+    with started(*run, until=lambda: _keyframes(path)):
+        pass  # and kill -9
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
@@ -244,18 +236,13 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, an
     """All, or all but the map file, which is said, where another program has begun to write to that meanwhile."""
     _stand_still(sequence)
     out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
-    run = ("run", str(sequence), "--out", str(out), "--map", str(path), *QUICK)
-    command = [sys.executable, "-m", "dpm2_core.cli", *run]
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may have it ignored
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
-    while not _keyframes(path):
-        assert process.poll() is None
-        time.sleep(0.05)
-    if another:
-        with MapStore.open(path, read_only=False) as store:
-            store.begin_session("", "")
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+    run = ("run", sequence, "--out", out, "--map", path, *QUICK)
+    with started(*run, until=lambda: _keyframes(path)) as process:
+        if another:
+            with MapStore.open(path, read_only=False) as store:
+                store.begin_session("", "")
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
     assert process.returncode == another, stderr
     assert (f"map file incomplete: {path}: another program has begun to write to it" in stderr) == another
     assert "interrupted after" in stderr
@@ -265,15 +252,10 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, an
 def test_an_interrupt_after_the_last_frame_costs_nothing(sequence: Path, tmp_path: Path) -> None:
     """While the results are being written."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "dpm2_core.cli", "run", str(sequence), "--out", str(out), *QUICK]
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
-    assert process.stderr is not None
-    for line in process.stderr:
-        if f"{FRAMES}/{FRAMES}" in line:
-            break
-    process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=60)[1]
+    with started("run", sequence, "--out", out, *QUICK) as process:
+        next(line for line in process.stderr if f"{FRAMES}/{FRAMES}" in line)
+        process.send_signal(signal.SIGINT)
+        rest = process.communicate(timeout=60)[1]
     assert process.returncode == 0, rest
     assert {file.name for file in out.iterdir()} == RESULTS
 
