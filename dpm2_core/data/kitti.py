@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.cloud_folder import name_times
-from dpm2_core.data.scan_file import chosen
+from dpm2_core.data.scan_file import KITTI, chosen, drives_below
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.time_order import out_of_order
@@ -242,8 +242,7 @@ def _sequence_folder(path: Path, sequence: str) -> Path:
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
     root = path / "sequences" if (path / "sequences").is_dir() else path
-    found = sorted(folder.name for folder in root.iterdir() if (folder / "velodyne").is_dir())
-    if not found:
+    if not drives_below(root, KITTI):
         what = "no KITTI sequence (no velodyne folder in it or below sequences/)"
         raise UsageError(f"{path}: {what}, no bag, no scans: docs/recordings.md")
-    return root / chosen(path, sequence, found)
+    return root / chosen(root, sequence, KITTI)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.scan_file import chosen
+from dpm2_core.data.scan_file import KITTI_360, chosen
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import date_ns, parse_row, read_lines, read_numbers
 from dpm2_core.data.velodyne import VelodyneDrive
@@ -147,17 +147,4 @@ def _find(path: Path, sequence: str) -> tuple[Path, str]:
     if (path / "velodyne_points").is_dir():
         drive = path.absolute()
         return drive.parents[1], drive.name
-    found = sorted(p.name for p in (path / "data_3d_raw").glob("*") if (p / "velodyne_points").is_dir())
-    if not found:
-        raise UsageError(f"{path}: no drive (data_3d_raw/*/velodyne_points) below it")
-    return path, chosen_drive(path, sequence, found)
-
-
-def chosen_drive(path: Path, sequence: str, found: list[str]) -> str:
-    """Of the drives below a folder the one that is meant, also by its four digits (0009).
-
-    Raises:
-        UsageError: none or several.
-    """
-    matching = [name for name in found if sequence in ("", name, name.removesuffix("_sync")[-4:])]
-    return chosen(path, sequence, found, matching)
+    return path, chosen(path, sequence, KITTI_360)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.ply import read_ply
-from dpm2_core.data.scan_file import chosen, image_size, images_of
+from dpm2_core.data.scan_file import KITTI_CARLA, chosen, image_size, images_of
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource
 from dpm2_core.data.text import read_numbers
@@ -110,7 +110,4 @@ def _find(path: Path, sequence: str) -> Path:
     for folder in (path, path / "generated"):
         if (folder / "frames").is_dir():
             return folder
-    found = sorted(p.parent.parent.name for p in path.glob("*/generated/frames"))
-    if not found:
-        raise UsageError(f"{path}: no town (generated/frames) in or below it")
-    return path / chosen(path, sequence, found) / "generated"
+    return path / chosen(path, sequence, KITTI_CARLA) / "generated"

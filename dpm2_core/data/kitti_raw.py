@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kitti import ROUNDED, left_color_camera
-from dpm2_core.data.kitti360 import chosen_drive, read_keyed, read_timestamps, required
+from dpm2_core.data.kitti360 import read_keyed, read_timestamps, required
+from dpm2_core.data.scan_file import KITTI_RAW, chosen
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import read_numbers
 from dpm2_core.data.velodyne import VelodyneDrive
@@ -102,5 +103,4 @@ def _rigid(path: Path) -> Array:
 def _find(path: Path, sequence: str) -> Path:
     if (path / "velodyne_points").is_dir():
         return path
-    found = sorted(folder.parent.name for folder in path.glob("*_drive_*/velodyne_points"))
-    return path / chosen_drive(path, sequence, found)
+    return path / chosen(path, sequence, KITTI_RAW)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dpm2_core.data.rosbag2_folder import PACKED, STORAGES
+from dpm2_core.data.scan_file import KITTI, KITTI_360, KITTI_CARLA, KITTI_RAW, drives_below
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
@@ -22,17 +23,13 @@ def sequences_below(path: Path | str) -> list[str]:
     path = Path(path)
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder")
-    found = (
-        [p.parent.name for p in path.glob("data_3d_raw/*/velodyne_points")]
-        or [p.parent.name for p in path.glob("*_drive_*/velodyne_points")]
-        or [p.parent.parent.name for p in path.glob("*/generated/frames")]
-        or [p.parent.name for p in (path / "sequences" if (path / "sequences").is_dir() else path).glob("*/velodyne")]
-    )
-    if not found:
+    layouts = (KITTI_360, KITTI_RAW, KITTI_CARLA, f"sequences/{KITTI}", KITTI)
+    found = next(filter(None, (drives_below(path, layout) for layout in layouts)), None)
+    if found is None:
         raise UsageError(
             f"{path}: no drives below it (sequences/NN, DATE_drive_NNNN_sync, data_3d_raw/DRIVE or TOWN/generated)"
         )
-    return sorted(found)
+    return found
 
 
 def is_drive(path: Path) -> bool:
@@ -50,7 +47,7 @@ def _is_kitti_raw(path: Path) -> bool:
     """A drive, or the folder of a date; KITTI-360 has the same in data_3d_raw."""
     if (path / "velodyne_points").is_dir():
         return path.parent.name != "data_3d_raw"
-    return path.name != "data_3d_raw" and any(path.glob("*_drive_*/velodyne_points"))
+    return path.name != "data_3d_raw" and bool(drives_below(path, KITTI_RAW))
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
@@ -85,7 +82,7 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kitti360 import Kitti360Source
 
         return Kitti360Source(path, settings)
-    if (path / "frames").is_dir() or (path / "generated").is_dir() or any(path.glob("*/generated/frames")):
+    if (path / "frames").is_dir() or (path / "generated").is_dir() or drives_below(path, KITTI_CARLA):
         from dpm2_core.data.kitti_carla import KittiCarlaSource
 
         return KittiCarlaSource(path, settings)
@@ -93,7 +90,7 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.cloud_folder import CloudFolder
 
         return CloudFolder(path, settings)
-    if not is_kitti and any(path.glob("*.bag")) and not any(path.glob("*/velodyne")):
+    if not is_kitti and any(path.glob("*.bag")) and not drives_below(path, KITTI):
         from dpm2_core.data.bags import BagSource
 
         return BagSource(path, settings)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Image, Points
+
+KITTI, KITTI_RAW = "*/velodyne", "*_drive_*/velodyne_points"
+KITTI_360, KITTI_CARLA = "data_3d_raw/*/velodyne_points", "*/generated/frames"
+"""Layouts of several drives in one folder: what each has below it, whose name stands for the first *."""
 
 
 def numbered_scans(folder: Path) -> list[Path]:
@@ -87,17 +91,23 @@ def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tup
     return ()
 
 
-def chosen(path: Path, sequence: str, found: Sequence[str], matching: Sequence[str] | None = None) -> str:
-    """The sequence that is meant: the one asked for, or the only one.
+def drives_below(path: Path, layout: str) -> list[str]:
+    """The names of those that lie so, in order."""
+    place = layout.partition("*")[0].count("/")
+    return sorted(found.relative_to(path).parts[place] for found in path.glob(layout) if found.is_dir())
 
-    Args:
-        found: those below `path`. matching: those of them that `sequence` may mean; None: those of that very name.
+
+def chosen(path: Path, sequence: str, layout: str) -> str:
+    """The name of the drive below a folder that is meant: the one asked for, also by its four digits (0009), or the
+    only one.
 
     Raises:
         UsageError: none or several.
     """
-    matching = [name for name in found if sequence in ("", name)] if matching is None else matching
-    if len(matching) == 1:
-        return matching[0]
+    if not (found := drives_below(path, layout)):
+        raise UsageError(f"{path}: no drive ({layout}) in or below it")
+    matching = [name for name in found if sequence in ("", name, name.removesuffix("_sync")[-4:])]
+    if sequence in found or len(matching) == 1:
+        return sequence if sequence in found else matching[0]
     asked = f"no sequence {sequence}" if sequence else "several sequences"
     raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
