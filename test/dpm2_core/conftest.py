@@ -15,9 +15,9 @@ from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.geometry import se3, se3_torch
-from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_store import Change, MapStore
 
+from ..helpers.maps import change
 from ..helpers.scenes import boxes, make_image
 
 
@@ -42,10 +42,9 @@ def map_file(tmp_path: Path, keyframes: list[Keyframe]) -> Path:
     with MapStore.create(path) as store:
         store.begin_session("slam: {}", "small 0123456789abcdef")
         for node, keyframe in enumerate(keyframes):
-            change = Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf})
+            store.write(change(node, keyframe))
             if (result := keyframe.edge) is not None:
-                change.edges.append(Edge("odometry", node - 1, node, result))
-            store.write(change)
+                store.write(Change(edges=[Edge("odometry", node - 1, node, result)]))
         T = se3.inverse(keyframes[2].T_odom_kf) @ keyframes[11].T_odom_kf
         accepted = Edge("loop", 2, 11, Registration(T, np.eye(6) * 1e-4, method="test"))
         rejected = Edge("loop", 0, 11, Registration(np.eye(4), np.eye(6), 0.1, np.inf, "test", False, "too far"))

@@ -26,17 +26,12 @@ from dpm2_core.network.weights import load_model
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.rows import array_bytes, with_crc
 
+from ..helpers.maps import execute as sql
+
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x, '', '', '', '' FROM n"
 BOMB = zlib.compress(bytes(300_000_000), 1)
 I4 = array_bytes(np.eye(4))
 NAN = array_bytes(np.full((4, 4), np.nan))
-
-
-def sql(path: Path, *statements: str | tuple[str, tuple[object, ...]]) -> None:
-    """Execute statements on a map file, which is closed."""
-    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
-        for statement in statements:
-            connection.execute(*([statement] if isinstance(statement, str) else statement))
 
 
 def keyframe(node: int, id: object = 0, robot: object = "", T: bytes = I4, lender: object = None) -> tuple[object, ...]:

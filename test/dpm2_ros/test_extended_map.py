@@ -19,6 +19,7 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.active_map import ActiveMap
 
+from ..helpers.maps import execute
 from .test_active_map import LOG, described, keyframes, street
 
 
@@ -83,8 +84,7 @@ def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
 
     The log had the reason only with a change of the state: never, where the robot had not been found yet.
     """
-    with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
-        other.execute("UPDATE payloads SET cloud = x'00'")
+    execute(tmp_path / "drive.dpm2map", "UPDATE payloads SET cloud = x'00'")
     states = []
     for n in (13, 14, 15):
         found.add(street(n))

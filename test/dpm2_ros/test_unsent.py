@@ -22,6 +22,7 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
 from ..helpers.full_disk import largest_file
+from ..helpers.maps import execute
 
 WRITER = """
 import resource, signal, sys
@@ -180,11 +181,7 @@ def test_what_is_no_such_file_is_an_error(tmp_path: Path, damage: str) -> None:
     for _ in range(3):
         file.append([b"a", b"b", b"c"])
     file.close(keep=True)
-    with sqlite3.connect(path) as connection:
-        connection.execute(damage)
-        if damage.startswith("DROP"):
-            connection.execute("CREATE TABLE other (id INTEGER)")
-    connection.close()
+    execute(path, damage, *["CREATE TABLE other (id INTEGER)"] * damage.startswith("DROP"))
     with pytest.raises(sqlite3.DatabaseError, match="malformed"):
         KeyframeFile(path)
     path.write_bytes(b"no database " * 1000)
@@ -197,9 +194,7 @@ def test_text_in_place_of_a_message_is_an_error_when_it_is_read(tmp_path: Path) 
     file = KeyframeFile(path)
     file.append([b"a", b"b", b"c"])
     file.close(keep=True)
-    with sqlite3.connect(path) as connection:
-        connection.execute("UPDATE keyframe SET cloud = 'text'")
-    connection.close()
+    execute(path, "UPDATE keyframe SET cloud = 'text'")
     file = KeyframeFile(path)
     with pytest.raises(sqlite3.DatabaseError, match="keyframe 0 is damaged"):
         file.read(0)

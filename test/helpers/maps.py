@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of a ring road, made without a drive: for what shows or writes maps."""
+"""A map of a ring road, made without a drive: for what shows or writes maps; what is written into map files."""
 
 from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +16,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData
+from dpm2_core.slam.store.map_store import Change
 from dpm2_core.slam.store.rows import Session
 
 SPACING = 5.0
@@ -39,6 +44,18 @@ def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -
     session = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
     pictures = [None if image is None else _noise(rng, image) for _ in range(3)]
     return MapData(keyframes, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3])
+
+
+def change(node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> Change:
+    """A keyframe that is where it was driven."""
+    return Change([(node, keyframe, pack_cloud(keyframe.cloud), thumbnail)], poses={node: keyframe.T_odom_kf})
+
+
+def execute(path: Path, *statements: str | tuple[str, tuple[object, ...]]) -> None:
+    """SQL on a file that is closed."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        for statement in statements:
+            connection.execute(*([statement] if isinstance(statement, str) else statement))
 
 
 def _pose(radius: float, angle: float) -> np.ndarray:

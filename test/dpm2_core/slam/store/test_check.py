@@ -30,14 +30,8 @@ from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import with_crc
 from test.helpers.full_disk import largest_file
-from test.helpers.maps import ring
+from test.helpers.maps import execute, ring
 from test.helpers.scenes import make_image
-
-
-def execute(path: Path, *statements: tuple[str, tuple[object, ...]]) -> None:
-    with closing(sqlite3.connect(path)) as sql, sql:
-        for statement, values in statements:
-            sql.execute(statement, values)
 
 
 def recovered(path: Path) -> MapData:
@@ -201,7 +195,7 @@ def save_drives(path: Path, robots: Sequence[str], begins: int = 0) -> None:
 def test_two_drives_of_a_robot_in_one_session_stay_apart(tmp_path: Path, damage: str) -> None:
     """Where the second is relative to the first is not known; holes within the two are bridged."""
     save_drives(tmp_path / "map", ["red"] * 12, begins=6)
-    execute(tmp_path / "map", (damage, ()))
+    execute(tmp_path / "map", damage)
     data = recovered(tmp_path / "map")
     second = [keyframe.id >= 6 for keyframe in data.keyframes].index(True)
     steps = set(range(1, len(data))) - {second}
@@ -210,7 +204,7 @@ def test_two_drives_of_a_robot_in_one_session_stay_apart(tmp_path: Path, damage:
 
 def test_a_lost_keyframe_among_those_of_two_robots_is_bridged(tmp_path: Path) -> None:
     save_drives(tmp_path / "map", ["red", "blue"] * 4)
-    execute(tmp_path / "map", ("DELETE FROM keyframes WHERE node = 4", ()))
+    execute(tmp_path / "map", "DELETE FROM keyframes WHERE node = 4")
     ties = {(edge.from_node, edge.to_node) for edge in recovered(tmp_path / "map").edges}
     assert ties == {(0, 2), (2, 5), (1, 3), (3, 4), (4, 6)}
 

@@ -20,12 +20,11 @@ from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.prune import prune
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import append_map, load_map, save_as, trajectory
-from dpm2_core.slam.store.map_store import Change, MapStore
+from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.full_disk import CHECKPOINT, largest_file
-from test.helpers.maps import ring
+from test.helpers.maps import change, ring
 
 
 def test_a_copy_that_does_not_fit_on_the_disk_is_an_error(tmp_path: Path, noise: np.random.Generator) -> None:
@@ -119,14 +118,14 @@ def test_a_copy_replaces_a_map_whose_writer_was_killed(tmp_path: Path, keyframes
     with MapStore.create(tmp_path / "killed") as store:
         store.begin_session()
         for node, keyframe in enumerate(keyframes):
-            store.write(Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf}))
+            store.write(change(node, keyframe))
         for suffix in ("", "-wal"):  # as `kill -9` leaves them
             shutil.copyfile(tmp_path / f"killed{suffix}", f"{target}{suffix}")
     assert Path(f"{target}-wal").stat().st_size > 0
     with MapStore.create(path) as store:
         store.begin_session()
         for node, keyframe in enumerate(keyframes[:2]):
-            store.write(Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: keyframe.T_odom_kf}))
+            store.write(change(node, keyframe))
         store.copy_to(target)
     assert not Path(f"{target}-wal").exists()
     with MapStore.open(target) as store:

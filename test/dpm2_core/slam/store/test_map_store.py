@@ -24,12 +24,11 @@ from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.session import open_session
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_data import append_map, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 from test.helpers.full_disk import largest_file
-from test.helpers.maps import ring
+from test.helpers.maps import change, execute, ring
 
 WRITER = """
 import sys
@@ -97,7 +96,7 @@ def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyfra
     with MapStore.open(map_file, read_only=False) as store:
         store.begin_session()
         store.write(Change([(12, keyframes[0], Loan(3, T), None)], poses={12: np.eye(4)}))
-        store.write(Change([(13, keyframes[1], pack_cloud(keyframes[1].cloud), b"jpeg")], poses={13: np.eye(4)}))
+        store.write(change(13, keyframes[1], b"jpeg"))
     with MapStore.open(map_file) as store:
         data = load_map(store)
         assert [k.session for k in data.keyframes[-2:]] == [2, 2]
@@ -216,12 +215,8 @@ os._exit(0)
 def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) -> None:
     text, other, later = tmp_path / "a.txt", tmp_path / "other.db", map_file
     text.write_text("no map at all, but long enough to look like something")
-    with sqlite3.connect(other) as sql:
-        sql.execute("CREATE TABLE t (x)")
-    sql.close()
-    with sqlite3.connect(later) as sql:
-        sql.execute("PRAGMA user_version = 99")
-    sql.close()
+    execute(other, "CREATE TABLE t (x)")
+    execute(later, "PRAGMA user_version = 99")
     for path, words in ((text, "not a dpm2 map"), (other, "no dpm2 map"), (later, "later dpm2"), (tmp_path, "no such")):
         for read_only in (True, False):
             with pytest.raises(UsageError, match=words) as caught:
@@ -243,20 +238,16 @@ def test_of_two_programs_that_go_on_with_a_map_only_the_later_one_writes(
     map_file: Path, keyframes: list[Keyframe]
 ) -> None:
     """Both count on from its 12 keyframes: the one would replace what the other has written."""
-    cloud = pack_cloud(keyframes[0].cloud)
-
-    def change(robot: str, node: int) -> Change:
-        return Change([(node, replace(keyframes[0], robot=robot), cloud, None)], poses={node: np.eye(4)})
-
+    mine, others = (replace(keyframes[0], robot=robot) for robot in ("one", "two"))
     with MapStore.open(map_file, read_only=False) as one, MapStore.open(map_file, read_only=False) as two:
         one.begin_session()
-        one.write(change("one", 12))
+        one.write(change(12, mine))
         two.begin_session()
-        two.write(change("two", 13))
+        two.write(change(13, others))
         with pytest.raises(Dpm2Error, match="another program has begun to write to it") as caught:
-            one.write(change("one", 13))
+            one.write(change(13, mine))
         assert str(map_file) in str(caught.value)
-        two.write(change("two", 14))
+        two.write(change(14, others))
     with MapStore.open(map_file) as store:
         data = load_map(store)
     assert [keyframe.robot for keyframe in data.keyframes[12:]] == ["one", "two", "two"]
@@ -269,7 +260,7 @@ def test_a_program_that_takes_over_other_maps_goes_on_with_its_own_session(
     with MapStore.create(tmp_path / "map") as store:
         store.begin_session()
         append_map(store, ring(3))
-        store.write(Change([(3, keyframes[0], pack_cloud(keyframes[0].cloud), None)], poses={3: np.eye(4)}))
+        store.write(change(3, keyframes[0]))
     with MapStore.open(tmp_path / "map") as store:
         assert [k.session for k in load_map(store).keyframes] == [2, 2, 2, 1]
 
@@ -305,7 +296,7 @@ def test_a_link_to_a_map_that_is_being_written_shows_all_of_it(
     link.symlink_to(map_file)
     with MapStore.open(map_file, read_only=False) as writer:
         writer.begin_session()
-        writer.write(Change([(12, keyframes[0], pack_cloud(keyframes[0].cloud), None)], poses={12: np.eye(4)}))
+        writer.write(change(12, keyframes[0]))
         with MapStore.open(link, read_only=read_only) as store:
             assert store.path == link
             assert len(load_map(store)) == 13
@@ -318,12 +309,11 @@ def test_what_is_written_together_is_there_together_or_not_at_all(tmp_path: Path
     with MapStore.create(tmp_path / "map") as store:
         store.begin_session()
         for node, keyframe in enumerate(keyframes[:3]):
-            change = Change([(node, keyframe, pack_cloud(keyframe.cloud), None)], poses={node: np.eye(4)})
             with suppress(ZeroDivisionError), store.together():
-                store.write(change)
+                store.write(change(node, keyframe))
                 assert store.size == node + 1
                 raise ZeroDivisionError
             assert store.size == node
-            store.write(change)
+            store.write(change(node, keyframe))
     with MapStore.open(tmp_path / "map") as store:
         assert len(load_map(store)) == 3

@@ -17,11 +17,10 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.check import check_map
-from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
-from dpm2_core.slam.store.rows import pack_descriptors, unpack_descriptors
-from test.helpers.maps import FIX, GEOREFERENCE
+from dpm2_core.slam.store.rows import pack_descriptors, unpack_descriptors, with_crc
+from test.helpers.maps import FIX, GEOREFERENCE, change, execute
 
 
 def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.random.Generator) -> None:
@@ -81,9 +80,7 @@ def test_fixes_and_georeference_come_back(tmp_path: Path, keyframes: list[Keyfra
     with MapStore.create(path) as store:
         store.begin_session()
         for node, keyframe in enumerate(keyframes):
-            keyframe = replace(keyframe, fix=FIX if node % 2 else None)
-            cloud = pack_cloud(keyframe.cloud)
-            store.write(Change([(node, keyframe, cloud, None)], poses={node: keyframe.T_odom_kf}))
+            store.write(change(node, replace(keyframe, fix=FIX if node % 2 else None)))
         store.write(Change(georeference=GEOREFERENCE))
     with MapStore.open(path) as store:
         save_as(load_map(store), copy)
@@ -115,10 +112,8 @@ def test_fixes_and_georeference_come_back(tmp_path: Path, keyframes: list[Keyfra
     ],
 )
 def test_hostile_fixes_are_found_and_left_out(map_file: Path, tmp_path: Path, table: str, row: tuple) -> None:
-    with sqlite3.connect(map_file) as sql:
-        marks = ",".join("?" * (len(row) + 1))
-        sql.execute(f"INSERT INTO {table} VALUES ({marks})", (*row, schema.row_crc(*row)))
-    sql.close()
+    marks = ",".join("?" * (len(row) + 1))
+    execute(map_file, (f"INSERT INTO {table} VALUES ({marks})", with_crc(*row)))
     with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="see dpm2 map check"):
         load_map(store)
     findings = check_map(map_file, tmp_path / "good.dpm2map")
@@ -142,7 +137,7 @@ def test_numbers_after_which_none_comes_are_found_and_left_out(map_file: Path, c
         row |= {"T_kf_lender": np.eye(4).tobytes()} | {column: number}
         db.execute("DELETE FROM keyframes WHERE node = 3")
         marks = ",".join("?" * (len(row) + 1))
-        db.execute(f"INSERT INTO keyframes VALUES ({marks})", (*row.values(), schema.row_crc(*row.values())))
+        db.execute(f"INSERT INTO keyframes VALUES ({marks})", with_crc(*row.values()))
     with MapStore.open(map_file) as store, pytest.raises(Dpm2Error, match="see dpm2 map check"):
         load_map(store)
     assert any(
@@ -152,9 +147,7 @@ def test_numbers_after_which_none_comes_are_found_and_left_out(map_file: Path, c
 
 
 def test_rows_before_the_first_are_found(map_file: Path) -> None:
-    with closing(sqlite3.connect(map_file)) as db, db:
-        (mask,) = (np.zeros(3, np.uint8).tobytes(),)
-        db.execute("INSERT INTO moving VALUES (?, ?, ?)", (-7, mask, schema.row_crc(-7, mask)))
+    execute(map_file, ("INSERT INTO moving VALUES (?, ?, ?)", with_crc(-7, bytes(3))))
     assert check_map(map_file).problems == ["moving: rows before 0, from -7"]
 
 
