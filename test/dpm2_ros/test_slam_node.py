@@ -168,9 +168,9 @@ def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], m
     r.harness.node.destroy_subscription(late)
 
 
-def mapped_elsewhere(rig: Callable[..., Rig]) -> tuple[Rig, Any, list[Odometry]]:
+def mapped_elsewhere(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Any, list[Odometry]]:
     """A node without a mapper of its own; what acknowledges its keyframes, and their poses as they come."""
-    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5")
+    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", *parameters)
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
     r.wait(received.get_subscription_count, "the node")
     poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
@@ -192,9 +192,7 @@ def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Ri
 
 def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..., Rig], tmp_path: Path) -> None:
     """A recorder or RViz receives them, and no mapper."""
-    r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", f"ros.map_directory:={tmp_path}")
-    poses = r.harness.hear(Odometry, "/dpm2/keyframe_odom")
-    r.wait(lambda: r.node.count_subscribers("/dpm2/keyframe_odom"), "the subscription")
+    r, _, poses = mapped_elsewhere(rig, f"ros.map_directory:={tmp_path}")
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
     r.harness.remove(r.node)

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.gaps import evaluated, gaps, summary
 from dpm2_core.data.open import open_source
-from dpm2_core.estimates import State
+from dpm2_core.estimates import OdometryResult, State
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lidar import Lidar
@@ -182,28 +182,28 @@ def test_a_pause_after_which_the_frames_of_it_come_in_a_burst_is_none(world: Wor
     assert tracked[-1].breaks == 0
 
 
+def of_kitti(root: object, kept: list[int]) -> tuple[list[OdometryResult], Array]:
+    """The odometry of these frames of the excerpt of KITTI 00 alone, and their true poses."""
+    source = open_source(f"{root}/sequences/00")
+    assert source.poses is not None
+    frames = list(source.frames(kept[0], kept[-1] + 1))
+    return run([frames[i - kept[0]] for i in kept]), source.poses[kept]
+
+
 def test_real_gaps(kitti_root: object) -> None:
     """Frames 30 to 49 of the excerpt of KITTI 00 missing: it used to be 19 m wrong and `tracking`."""
-    source = open_source(f"{kitti_root}/sequences/00")
-    assert source.poses is not None
-    kept = [*range(15, 30), *range(50, 55)]
-    frames = list(source.frames(kept[0], kept[-1] + 1))
-    tracked = run([frames[i - kept[0]] for i in kept])
+    tracked, poses = of_kitti(kitti_root, [*range(15, 30), *range(50, 55)])
     assert [t.state for t in tracked[15:17]] == [State.DEGRADED] * 2
     assert tracked[-1].state == State.TRACKING
     # the ground truth itself has an error of 1 % over such distances, here 20 m
-    assert off(tracked[14:], source.poses[kept[14:]]).max() < 0.5
+    assert off(tracked[14:], poses[14:]).max() < 0.5
 
 
 @pytest.mark.weights
 def test_a_place_that_looks_alike_is_not_one_that_the_robot_can_have_reached(kitti_root: object) -> None:
     """Five seconds of KITTI 00 missing: to the network the scans after them look like a place 37 m back."""
-    source = open_source(f"{kitti_root}/sequences/00")
-    assert source.poses is not None
-    kept = [*range(23, 37), *range(85, 99)]
-    frames = list(source.frames(kept[0], kept[-1] + 1))
-    tracked = run([frames[i - kept[0]] for i in kept])
-    wrong = off(tracked[13:], source.poses[kept[13:]]) > 0.5
+    tracked, poses = of_kitti(kitti_root, [*range(23, 37), *range(85, 99)])
+    wrong = off(tracked[13:], poses[13:]) > 0.5
     assert wrong.any()
     assert not [t.state for t, far in zip(tracked[13:], wrong, strict=True) if far and t.state == State.TRACKING]
 
