@@ -272,7 +272,7 @@ def _keyframes(path: Path) -> int:
 def test_config_dump_shows_every_key() -> None:
     done = succeeded("config", "dump", "--set", "slam.threads=1")
     assert "threads: 1" in done.stdout
-    assert "# Spacing of the points that enter the local map, m." in done.stdout
+    assert "# Spacing of the points that are registered, m; at least `map_voxel`." in done.stdout
     assert dpm2("config", "dump", "--set", "nonsense=1").returncode == 2
 
 
