@@ -36,7 +36,8 @@ class FusedScanRegistration:
     motion leads are registered anew from a network's pose that they agree with. Where little is known of the motion, it
     starts there at once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is
     tried again from the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned,
-    less sure than it claims. `reason` says which of the two disagreed, and why.
+    less sure than it claims, and drawn to where the motion leads if that is known and elsewhere. `reason` says which of
+    the two disagreed, and why.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class FusedScanRegistration:
         if not neural.ok:
             return points.because(f"neural: {neural.reason}")
         if not points.ok:
-            return self._led(scan, neural)
+            return self._led(scan, neural, prediction)
         return self._weighed(scan, prediction, points, neural)
 
     def _weighed(self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration) -> Registration:
@@ -107,7 +108,8 @@ class FusedScanRegistration:
             points = likelier if likelier.ok and not agreed else points
         if not agreed:
             if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
-                return self._led(scan, neural)  # where points fit anywhere, they fit best where nothing has moved
+                # Where points fit anywhere, they fit best where nothing has moved.
+                return self._led(scan, neural, prediction)
             return _outvoting(points, neural, prediction)
         if prediction.strays(points):  # the motion that held them has changed
             led = self._points_from(scan, neural)
@@ -116,12 +118,12 @@ class FusedScanRegistration:
             return points  # all that they needed was the start
         return _confirmed(points)
 
-    def _led(self, scan: Scan, neural: Registration) -> Registration:
+    def _led(self, scan: Scan, neural: Registration, prediction: Prediction) -> Registration:
         """The points from the pose of the network, when the motion so far did not lead them to a result."""
         points = self._points_from(scan, neural)
         if not points.ok:
-            covariance = neural.covariance + _UNCONFIRMED
-            return replace(neural, covariance=covariance, reason=f"not refined: {points.reason}")
+            unsure = replace(neural, covariance=neural.covariance + _UNCONFIRMED)
+            return _drawn_to(prediction, unsure).because(f"not refined: {points.reason}")
         if agree(points, neural):
             return _confirmed(points)
         return _instead(neural, points)
@@ -146,6 +148,17 @@ def _confirmed(points: Registration) -> Registration:
     0.06 m; along a tunnel or a highway, where all that a scan shows looks alike, it is sure of standing still.
     """
     return replace(points, method="refined")
+
+
+def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
+    """A network pose that no points confirm, between it and where the motion leads, by what both are worth, if it is
+    beside that: in a fast turn, seen by a LiDAR 70 degrees wide, such a pose was 0.5 m off, and the motion 0.03 m."""
+    T, T_predicted, of_motion = neural.T_target_source, prediction.starts[0], prediction.information
+    if of_motion is None or not prediction.known or near(T_predicted, T):
+        return neural
+    between = neural.covariance + np.linalg.inv(of_motion)
+    xi = neural.covariance @ np.linalg.solve(between, se3.log(se3.inverse(T) @ T_predicted))
+    return replace(neural, T_target_source=se3.orthonormalized(T @ se3.exp(xi)))
 
 
 def _also_from(neural: Registration, prediction: Prediction) -> Prediction:

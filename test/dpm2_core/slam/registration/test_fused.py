@@ -146,6 +146,20 @@ def test_network_alone_where_the_points_fit_nothing(case: Case) -> None:
     assert result.worst_sigma > 0.2  # whatever the network claims
 
 
+def test_a_network_that_no_points_confirm_is_drawn_to_where_the_motion_leads_elsewhere(case: Case) -> None:
+    """It knows its pose to 0.3 m at best, wheels or a steady motion theirs to 0.1 m. Where the motion is not known,
+    nothing speaks against it."""
+    elsewhere = np.random.default_rng(3).uniform(-40, 40, (8000, 4)).astype(np.float32)
+    case.scan = case.registration.prepare(Frame(0, elsewhere), np.zeros(6))
+    result, error = case.register([0, 0, 0, 0.5, 0, 0])
+    assert (result.ok, result.method) == (True, "neural")
+    assert 0.05 < error < 0.1  # the motion is 0.05 m off
+    assert result.worst_sigma > 0.2
+    case.prediction = replace(case.prediction, information=0.5 * np.eye(6))
+    result, error = case.register([0, 0, 0, 0.5, 0, 0])
+    assert error == pytest.approx(0.5)
+
+
 def test_a_network_that_is_wrong_and_sure_of_it_is_outvoted(case: Case) -> None:
     result, error = case.register([0, 0, 0, 0.6, 0.2, 0])
     assert (result.ok, result.method) == (True, "geometric")
