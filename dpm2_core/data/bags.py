@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import islice
@@ -36,6 +37,7 @@ from dpm2_core.geometry.tilt import up_of
 
 Stamps = NDArray[np.int64]
 _NO_BASE = ("map", "odom")  # frames that a base moves in
+_LOOKED_AT = 10  # clouds, for the ground
 _LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a tilt of more is said; the ground agrees with it to so much
 
 _CLOCKS = 0.15
@@ -207,7 +209,7 @@ class BagSource:
     def _mounted(self, first: Any) -> Array | None:
         """T_base_lidar (4, 4), the base as for slam_node the root above the LiDAR in /tf_static.
 
-        None without one, and where the first cloud shows that the root is none, as the frame of a camera.
+        None without one, and where the first clouds show that the root is none, as the frame of a camera.
         """
         base = self.transforms.root(self.lidar_frame, _NO_BASE)
         if first is None or base == self.lidar_frame.lstrip("/"):
@@ -218,20 +220,22 @@ class BagSource:
             return T_base_lidar
         angle = float(np.degrees(np.arccos(max(up[2], -1.0))))
         tilted = f"{topics.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
-        seen = self._ground(first)
+        seen = self._ground()
         if seen is not None and seen @ up < _LIKE:
             note_once(self.notes, tilted, "which is no base: the ground is not level in it")
             return None
         note_once(self.notes, tilted, "and the map is level by that")
         return T_base_lidar
 
-    def _ground(self, cloud: Any) -> Points | None:
-        """Which way (3,) is up by the ground that a cloud shows; rooms have ceilings, which look alike."""
-        try:
-            points, _ = decode_points(cloud)
-        except MessageError:
-            return None
-        return up_of(points) if is_room(points) is False else None
+    def _ground(self) -> Points | None:
+        """Which way (3,) is up by the ground that the first cloud with some shows: drivers begin with empty ones, or in
+        mid-sweep. Rooms have ceilings, which look alike."""
+        for cloud in islice(self._bag.decoded(self.points_topic), _LOOKED_AT):
+            with suppress(MessageError):
+                points, _ = decode_points(cloud)
+                if is_room(points) is False and (up := up_of(points)) is not None:
+                    return up
+        return None
 
     def _recorded_correction(self) -> float | None:
         topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"

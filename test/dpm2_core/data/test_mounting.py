@@ -27,12 +27,15 @@ def rotation(turn: Roll) -> NDArray[np.float64]:
     return Rotation.from_euler("xy", turn, degrees=True).as_matrix()
 
 
-def read(bags: Any, folder: Path, links: Sequence[tuple[str, str, Roll]], turn: Roll = (0, 0)) -> BagSource:
-    """A bag of two clouds of a street, of a LiDAR that is mounted with a turn."""
+def read(
+    bags: Any, folder: Path, links: Sequence[tuple[str, str, Roll]], turn: Roll = (0, 0), first: Sequence[Any] = ()
+) -> BagSource:
+    """A bag of two clouds of a street, of a LiDAR that is mounted with a turn; `first`: messages of clouds before."""
     hull, things = np.array([[-60, -12, 0], [60, 12, 30.0]]), boxes((-40, -8), (40, 8), 20, np.array([4.0, 2.0, 2.0]))
     points = scan(se3.make(np.eye(3), [0, 0, 1.7]), hull, things, 0)
     columns = point_columns(se3.transform(se3.make(rotation(turn).T, np.zeros(3)), points))
-    clouds = [(t, "/points", bags.cloud_of(t, columns)) for t in (1.0, 1.1)]
+    clouds = [*((0.9, "/points", cloud) for cloud in first)]
+    clouds += [(t, "/points", bags.cloud_of(t, columns)) for t in (1.0, 1.1)]
     placed = [bags.transform(parent, child, (0.5, 0, 1.7), rotation(roll)) for parent, child, roll in links]
     return BagSource(bags.write(folder / "b", [*((0.5, "/tf_static", message) for message in placed), *clouds]))
 
@@ -72,6 +75,13 @@ def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path:
     assert ups(source).tolist() == [[0, 0, 1]] * 2
     (note,) = said(source)
     assert note.startswith("/tf_static has the LiDAR tilted by 90 degrees in camera_optical (which is no base")
+
+
+def test_a_driver_that_begins_with_an_empty_cloud_says_nothing_of_the_ground(bags: Any, tmp_path: Path) -> None:
+    """The next one does."""
+    source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))], first=[bags.cloud(0.9, count=0)])
+    assert ups(source).tolist() == [[0, 0, 1]] * 3
+    assert "which is no base" in said(source)[0]
 
 
 def test_a_converted_bag_has_the_mount(bags: Any, tmp_path: Path) -> None:
