@@ -199,8 +199,8 @@ def test_two_drives_of_a_session_are_two_ways(tmp_path: Path) -> None:
     both = side_by_side({"one": ring(12), "two": ring(12)}, [])
     poses = both.poses.copy()
     poses[12:, 0, 3] += 1000
-    again = [replace(k, id=node, robot="") for node, k in enumerate(both.keyframes)]
-    save_as(replace(both, keyframes=again, session=[1] * 24, poses=poses), tmp_path / "map")
+    again = [replace(k, id=node, robot="", session=1) for node, k in enumerate(both.keyframes)]
+    save_as(replace(both, keyframes=again, poses=poses), tmp_path / "map")
     assert dpm2("map", "info", tmp_path / "map", "--json", tmp_path / "info.json").returncode == 0
     one = np.linalg.norm(np.diff(ring(12).poses[:, :3, 3], axis=0), axis=1).sum()
     assert json.loads((tmp_path / "info.json").read_text())["length_m"] == pytest.approx(2 * one)
