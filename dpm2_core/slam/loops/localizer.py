@@ -18,6 +18,7 @@ from dpm2_core.slam.loops.verification import looks_elsewhere
 LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
 """(6, 6) [rad, m] covariance of an uninformative prior."""
 _PATIENCE = 1_000_000_000  # ns
+_MOVED = 1.0  # m: nearer to each other, scans show the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,8 @@ class Localizer:
         self._failures = 0
         self._distrust = 0.0  # m, path since the map last confirmed the odometry
         self._T_last: Array | None = None
-        self._far: Array | None = None  # T_map_odom by the last result that was far off, while tracking
+        self._far: tuple[Array, Array] | None = None  # T_map_odom and T_odom_kf of a result that must be found again
+        self._alike = False  # places have fitted alike since the last one that was known
         self._stamp: int | None = None
         self._last = -1  # id of the last keyframe
         self.found: int | None = None
@@ -89,13 +91,14 @@ class Localizer:
 
     def hint(self, T_map_lidar: Array) -> None:
         """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
-        self._hint, self._state = T_map_lidar, State.RELOCALIZING
+        self._hint, self._state, self._alike = T_map_lidar, State.RELOCALIZING, False
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:
         """Find a keyframe, which has its cloud, in the map."""
         broken = self._last < self._broken <= keyframe.id
         if broken or (keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN):
             self._state = State.LOST if self._state.located else self._state  # its odometry may have been
+            self._far = None
         self._stamp, self._last = keyframe.stamp, keyframe.id
         if self._T_last is not None:
             self._distrust += float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_last[:3, 3]))
@@ -120,24 +123,35 @@ class Localizer:
         return self._find(keyframe, result)
 
     def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
-        """Look in the whole map, or around the hint; while tracking, a far-off result must be repeated."""
+        """Look in the whole map, or around the hint. What is far off while tracking must be found again, and what is
+        found where places look alike."""
         result = self._relocalizer.find(keyframe, self._hint)
         self._hint = None
         tracking = self._state.located
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         if result.ok:
-            near = self._says_same(T_predicted, result)
-            repeated = self._far is not None and self._says_same(self._far @ keyframe.T_odom_kf, result)
-            if not tracking or near or (repeated and self._failures >= self._max_failures):
-                return self._located(keyframe, result, State.TRACKING if tracking and near else State.RELOCALIZED)
-            self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf)
+            near = tracking and self._says_same(T_predicted, result)
+            if near or not (tracking or self._alike) or self._found_again(keyframe, result):
+                return self._located(keyframe, result, State.TRACKING if near else State.RELOCALIZED)
             meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
-            result = result.rejected(f"found {meters:.1f} m, {degrees:.0f} deg away, not confirmed yet")
-        elif tracking:
-            result = rejected
+            where = f"{meters:.1f} m, {degrees:.0f} deg away" if tracking else "where places look alike"
+            result = result.rejected(f"found {where}, not confirmed yet")
+        else:
+            self._alike = self._alike or result.confidence > 0
+            result = rejected if tracking else result
         self._doubt()
         covariance = LOST if self._state is not State.DEGRADED else np.eye(6) * (0.1 + 0.01 * self._distrust) ** 2
         return LocalizationResult(T_predicted, covariance, self._state, result)
+
+    def _found_again(self, keyframe: Keyframe, result: Registration) -> bool:
+        """Whether a result is where another one has been: while tracking, once the map has denied often enough where
+        the odometry leads; else some way on, as sooner or later a scan fits the wrong one of places that look alike."""
+        T_map_odom, T_odom_other = self._far or (None, keyframe.T_odom_kf)
+        again = T_map_odom is not None and self._says_same(T_map_odom @ keyframe.T_odom_kf, result)
+        moved = float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - T_odom_other[:3, 3])) >= _MOVED
+        if not again or moved:
+            self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf), keyframe.T_odom_kf
+        return again and (self._failures >= self._max_failures if self._state.located else moved)
 
     def _says_same(self, T_map_lidar: Array, result: Registration) -> bool:
         """Whether a result is no farther from a pose (4, 4) than the odometry may drift since the map confirmed it."""
@@ -152,5 +166,5 @@ class Localizer:
     def _located(self, keyframe: Keyframe, result: Registration, state: State) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))
         self._state = state
-        self._failures, self._distrust, self._far, self.found = 0, 0.0, None, keyframe.id
+        self._failures, self._distrust, self._far, self._alike, self.found = 0, 0.0, None, False, keyframe.id
         return LocalizationResult(result.T_target_source, result.covariance, state, result)

@@ -175,19 +175,20 @@ class Relocalizer:
 
 
 def _unique(places: Sequence[Registration]) -> Registration:
-    """The best of several verified places, if no other one fits nearly as well; else why not."""
+    """The best of several verified places, if no other one fits nearly as well; else why not, and how well it fits."""
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
         return nowhere("; ".join(place.reason for place in places))
     others = [place for place in places if _is_elsewhere(place, best)]
     objection = objection_of_others(best, others)
     if objection:
-        return nowhere(objection)
+        return replace(nowhere(objection), confidence=best.confidence)
     for other in others:  # which of two equal storeys fits better depends on where the keyframes were taken
         beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
         storey = beside <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
         if storey and other.ok and not objection_of_others(other, []):
-            return nowhere(f"{other.confidence:.0%} of the points fit on another storey, too")
+            alike = nowhere(f"{other.confidence:.0%} of the points fit on another storey, too")
+            return replace(alike, confidence=best.confidence)
     return best
 
 
