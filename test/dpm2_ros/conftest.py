@@ -275,7 +275,15 @@ class Harness:
         reader = self.node.create_subscription(DiagnosticArray, "/diagnostics", add, 10)
         self._executor.wake()
         self.wait(lambda: any(one.startswith(f"{name}: ") for one in told), f"the diagnostics of {name}")
-        self.node.destroy_subscription(reader)
+        self.destroy(reader)
+
+    def destroy(self, entity: Any) -> None:
+        """A publisher or subscription of the tester, between two waits of the thread that spins: rclpy raises in that
+        thread where it is about to wait for one that another thread destroys."""
+        is_publisher = entity in list(self.node.publishers)
+        destroy = self.node.destroy_publisher if is_publisher else self.node.destroy_subscription
+        task = self._executor.create_task(destroy, entity)
+        self.wait(task.done, "the end of a publisher or subscription")
 
     @staticmethod
     def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:

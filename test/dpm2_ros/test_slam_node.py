@@ -123,7 +123,7 @@ def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], dri
     latched: list[OccupancyGrid] = []
     late = r.harness.node.create_subscription(OccupancyGrid, "/dpm2/grid", latched.append, LATCHED)
     r.wait(lambda: latched, "the latched grid")
-    r.harness.node.destroy_subscription(late)
+    r.harness.destroy(late)
     grid = latched[0]
     assert grid.header == grids[-1].header
     assert grid.header.frame_id == "map"
@@ -165,7 +165,7 @@ def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], m
     late = r.harness.node.create_subscription(String, "/dpm2/state", states.append, LATCHED)
     r.wait(lambda: len(states) >= 5, "the state, for who comes late")
     assert [s.data for s in states] == ["initialising", "tracking", "silent", "tracking", "tracking"]
-    r.harness.node.destroy_subscription(late)
+    r.harness.destroy(late)
 
 
 def mapped_elsewhere(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Any, list[Odometry]]:

@@ -107,7 +107,7 @@ def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None
     other = r.harness.publisher(PointCloud2, POINTS)
     said = r.status("odometry", saying(f"2 publishers on {POINTS}: a drive has one LiDAR"))
     assert said.level == DiagnosticStatus.WARN
-    r.harness.node.destroy_publisher(other)
+    r.harness.destroy(other)
     r.status("odometry", lambda s: "publishers" not in s.message)
 
 
@@ -232,7 +232,7 @@ def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: C
 def test_a_lidar_that_comes_back_less_reliable_than_asked_for_is_reported(rig: Callable[..., Rig]) -> None:
     r = rig("ros.reliability:=reliable")
     r.send_and_wait(0)
-    r.harness.node.destroy_publisher(r.lidar)
+    r.harness.destroy(r.lidar)
     r.harness.publisher(PointCloud2, POINTS, reliable=False)
     assert r.status("odometry", saying(f"{POINTS} is best effort")).level == DiagnosticStatus.ERROR
 
