@@ -253,9 +253,8 @@ class Odometry:
             return result
         motion.covariance = bridge.covariance(motion.T) + own.covariance
         if bridge.tries >= self._settings.restart_after and motion.twist is not None:
-            self._keyframes.add_uncertainty(motion.covariance)
-            self._bridge, self._failures, self._breaks = None, 0, self._breaks + 1
-            self._broken = self.next_keyframe
+            self._bridge, self._failures = None, 0
+            self._break()
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T
@@ -263,14 +262,17 @@ class Odometry:
 
     def _step_out(self, scan: Scan, registration: Registration) -> Registration:
         """Out of what enclosed the LiDAR: a break, and a map of what is seen there begins."""
-        motion = self._motion
-        motion.carry()
-        self._keyframes.add_uncertainty(motion.covariance)
+        self._motion.carry()
+        self._break()
         self._keyframes.request()
-        self._breaks, self._broken = self._breaks + 1, self.next_keyframe
         self._registration = self._registration.fresh()
-        self._registration.update(scan, motion.T)
+        self._registration.update(scan, self._motion.T)
         return registration.because(_CARRIED)
+
+    def _break(self) -> None:
+        """The way from the keyframes so far to those that follow is known no better than the pose is now."""
+        self._keyframes.add_uncertainty(self._motion.covariance)
+        self._breaks, self._broken = self._breaks + 1, self.next_keyframe
 
     def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Match, float]:
         """A prepared frame, predicted at T_predicted (4, 4), in the map; and how long the period was, s: as stamped or,
