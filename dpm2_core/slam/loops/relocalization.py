@@ -115,7 +115,7 @@ class Relocalizer:
         if place is None:
             return found
         if not place.ok:
-            return nowhere(f"{found.reason}; {place.reason}")
+            return nowhere(f"{found.reason}; {place.reason}", found.confidence)
         return self._verified(cloud, place.T_target_source, partial(self._pictures.along, texture, _REACH))
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
@@ -175,20 +175,19 @@ class Relocalizer:
 
 
 def _unique(places: Sequence[Registration]) -> Registration:
-    """The best of several verified places, if no other one fits nearly as well; else why not, and how well it fits."""
+    """The best of several verified places, if no other one fits nearly as well; else why not."""
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
         return nowhere("; ".join(place.reason for place in places))
     others = [place for place in places if _is_elsewhere(place, best)]
     objection = objection_of_others(best, others)
     if objection:
-        return replace(nowhere(objection), confidence=best.confidence)
+        return nowhere(objection, best.confidence)
     for other in others:  # which of two equal storeys fits better depends on where the keyframes were taken
         beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
         storey = beside <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
         if storey and other.ok and not objection_of_others(other, []):
-            alike = nowhere(f"{other.confidence:.0%} of the points fit on another storey, too")
-            return replace(alike, confidence=best.confidence)
+            return nowhere(f"{other.confidence:.0%} of the points fit on another storey, too", best.confidence)
     return best
 
 
@@ -202,6 +201,6 @@ def _distance(poses: Array, pose: Array) -> Array:
     return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, HEIGHT], axis=-1)
 
 
-def nowhere(reason: str) -> Registration:
-    """No pose, and why."""
-    return Registration.failed("relocalisation", reason)
+def nowhere(reason: str, confidence: float = 0.0) -> Registration:
+    """No pose, and why; `confidence`: of the best of places that fit alike, 0 where none fits."""
+    return replace(Registration.failed("relocalisation", reason), confidence=confidence)
