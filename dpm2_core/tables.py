@@ -114,7 +114,7 @@ class _Figures(Formatter):
 
 def cells_of(record: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
     """Figures of a nested record as text, by columns such as "{loops[accepted]} of {loops[tried]}" or "{ape_m:.3f}";
-    "-" for one that is None or not there."""
+    "-" for one that is missing or null."""
     return [_Figures().vformat(column, (), record) for column in columns]
 
 
