@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder and decoder as one model, and what can be asked of it: descriptors, and poses with their overlap."""
+"""Encoder and decoder as one model, and what can be asked of it: descriptors, poses, overlap."""
 
 from __future__ import annotations
 
@@ -89,6 +89,10 @@ class DeepPointMap2(nn.Module):
             else 0.0
             for target in targets
         ]
+
+    def overlap(self, sources: Sequence[Descriptors], targets: Sequence[Descriptors]) -> list[float]:
+        """Probability 0..1 that each pair was seen from within 20 m; NaN while the overlap head is untrained."""
+        return [result.overlap for result in self.register_many(list(sources), list(targets))]
 
     @torch.inference_mode()
     def matches(self, source: Descriptors, target: Descriptors) -> tuple[Array, Array, Array]:

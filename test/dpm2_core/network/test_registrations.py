@@ -28,6 +28,7 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
     part = replace(frames[2], **{name: getattr(frames[2], name)[:30] for name in ("xyz", "features", "step")})
     sources, targets = [*frames[:2], part], [merge([d.moved(T)] * n) for d, n in zip(frames, (1, 3, 1), strict=True)]
     together = model.register_many(sources, targets)
+    np.testing.assert_array_equal(model.overlap(sources, targets), [result.overlap for result in together])
     for source, target, result in zip(sources, targets, together, strict=True):
         assert result.T_target_source.shape == (4, 4)
         assert np.linalg.eigvalsh(result.covariance).min() > 0
