@@ -122,6 +122,8 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
     again, which sent the identity until then."""
     move, heard = placed(mapper)
     move(33)
+    move(34, frame="no name")
+    mapper.wait(lambda: mapper.mapper.rejections, "the rejection: the odometry before it has been taken in")
     mapper.send(0, np.eye(4), points(0).astype(np.float32))
     mapped(mapper, 1)
     move(77)

@@ -64,11 +64,15 @@ def points(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, (500, 4)).astype(np.float32) * np.float32([20, 20, 5, 1])
 
 
-def placed(mapper: Any) -> tuple[Callable[[int], None], list[TFMessage]]:
-    """What publishes an odometry at its origin, of a stamp (ns), and the transforms that come of it."""
+def placed(mapper: Any) -> tuple[Callable[..., None], list[TFMessage]]:
+    """What publishes an odometry at its origin, of a stamp (ns) and in a frame, and the transforms that come of it."""
     odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
     mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
-    return lambda stamp: odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, "odom", "base")), heard
+
+    def move(stamp: int, frame: str = "odom") -> None:
+        odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, frame, "base"))
+
+    return move, heard
 
 
 def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:
