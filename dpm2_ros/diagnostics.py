@@ -6,11 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
 
 from dpm2_ros.guard import GuardedNode, excerpt
 from dpm2_ros.mapping import BEHIND, MapperThread
-from dpm2_ros.subscriptions import STEADY
 
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 PERIOD = 1.0
@@ -19,7 +17,7 @@ _RECENT = 10.0  # s
 _LONGEST = 1000  # characters of a text, some of which quote messages
 
 
-def publish_diagnostics(node: Node, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
+def publish_diagnostics(node: GuardedNode, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
     """Ask for the statuses every `PERIOD` from now on, and send them."""
     publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -28,17 +26,17 @@ def publish_diagnostics(node: Node, statuses: Callable[[], list[DiagnosticStatus
         message.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(message)
 
-    node.create_timer(PERIOD, publish, clock=STEADY)
+    node.create_timer(PERIOD, publish)
 
 
-def status(node: Node, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
+def status(node: GuardedNode, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
     """Of a part of a node."""
     values = [KeyValue(key=key, value=excerpt(str(value), _LONGEST)) for key, value in figures.items()]
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
     return DiagnosticStatus(level=level, name=name, message=excerpt(text, _LONGEST), hardware_id="", values=values)
 
 
-def mapper_status(node: Node, mapper: MapperThread) -> DiagnosticStatus:
+def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
     """A map that grows: how large it is, and what is wrong with its file or its poses."""
     core = mapper.active.mapper
     loops = [loop.ok for loop in core.loops]

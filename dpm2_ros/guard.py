@@ -13,11 +13,14 @@ from concurrent.futures import Future
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from dpm2_core.errors import Dpm2Error, printable
 from dpm2_core.slam.mapping.admission import RejectedError
 
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _QUIET = 5.0  # s between two lines about the same reason
 _MOST_KINDS = 200  # of topic and reason; more are counted together
 _LENGTH = 300  # characters of a line, whatever is in the message
@@ -45,9 +48,9 @@ class GuardedNode(Node):
         """As of `Node`; an exception in the callback rejects the message."""
         return super().create_subscription(msg_type, topic, self._guarded(callback, topic), *args, **kw)
 
-    def create_timer(self, period: float, callback: Callable[..., Any], *args: Any, **kw: Any) -> Any:
-        """As of `Node`; an exception in the callback is counted, and the timer goes on."""
-        return super().create_timer(period, self._guarded(callback, "timer"), *args, **kw)
+    def create_timer(self, period: float, callback: Callable[[], None]) -> Any:
+        """It goes on when /clock stops, as at the end of a bag; an exception in the callback is counted."""
+        return super().create_timer(period, self._guarded(callback, "timer"), clock=_STEADY)
 
     @property
     def rejections(self) -> dict[str, int]:

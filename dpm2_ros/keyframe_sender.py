@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
@@ -29,10 +28,9 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.deliveries import Delivery
-from dpm2_ros.guard import take_waiting
+from dpm2_ros.guard import GuardedNode, take_waiting
 from dpm2_ros.keyframe_messages import WIRE, of_earlier_drive, payload_to_msgs
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
 _MOST_ACKED = 1001  # numbers in an acknowledgment
@@ -46,7 +44,7 @@ class KeyframeSender:
     Drives are sent one after the other: what an earlier one still has to deliver comes before the next one's.
     """
 
-    def __init__(self, node: Node, robot: str, ros: RosSettings, weights: str = "") -> None:
+    def __init__(self, node: GuardedNode, robot: str, ros: RosSettings, weights: str = "") -> None:
         """`weights`: see `weights_identity`. With the mapper in the same process each keyframe is sent once."""
         self._robot, self._odom_frame, self._weights = robot, ros.own_frame, weights
         self._keep, self._log = not ros.embed_mapper, node.get_logger()
@@ -61,7 +59,7 @@ class KeyframeSender:
             self._received = node.create_subscription(
                 UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10
             )
-            node.create_timer(_TICK, self._repeat, clock=STEADY)
+            node.create_timer(_TICK, self._repeat)
 
     @property
     def arrived(self) -> tuple[int, int]:

@@ -18,7 +18,6 @@ from dpm2_ros.guard import slow_service
 from dpm2_ros.keyframe_sender import weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.mapping import MapperThread
-from dpm2_ros.subscriptions import STEADY
 
 _MOST_ROBOTS = 64
 PATIENCE = 10.0
@@ -52,8 +51,8 @@ class MapperNode(ManagedNode):
             feed.open()
         back.callback(self._pause)
         self._discover()
-        self.create_timer(0.5, self._discover, clock=STEADY)
-        self.create_timer(0.5, self._tick, clock=STEADY)
+        self.create_timer(0.5, self._discover)
+        self.create_timer(0.5, self._tick)
 
     @property
     def slam(self) -> Slam:

@@ -29,7 +29,7 @@ from dpm2_ros.display import Display, grid_to_msg, loop_to_msg, path_to_msg, pos
 from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.runtime import lower_priority
 from dpm2_ros.settings import NodeConfig
-from dpm2_ros.subscriptions import LAST_ONE, STEADY
+from dpm2_ros.subscriptions import LAST_ONE
 from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -79,7 +79,7 @@ class MapperThread:
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
         self._of_no_use = ""  # why it is, in words
-        node.create_timer(0.1, self._show, clock=STEADY)
+        node.create_timer(0.1, self._show)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
     @property

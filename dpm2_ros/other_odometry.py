@@ -25,7 +25,6 @@ from dpm2_ros.conversions import check_frame, covariance_from_ros
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
-from dpm2_ros.subscriptions import STEADY
 from dpm2_ros.tf_message import TFMessage
 from dpm2_ros.transform_history import TransformHistory
 
@@ -66,7 +65,7 @@ class OtherOdometry:
         self._subscription: MatchedSubscription | None = None
         if ros.odom_source == "topic":
             self._subscription = MatchedSubscription(node, Odometry, ros.odom_topic, self._on_odometry, ros)
-            node.create_timer(0.5, self._subscription.refresh, clock=STEADY)
+            node.create_timer(0.5, self._subscription.refresh)
         elif TFMessage is None:
             raise UsageError("ros.odom_source: tf needs tf2_msgs; `python -m dpm2_ros.build_tf2_msgs` builds it")
         else:

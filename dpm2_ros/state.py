@@ -6,12 +6,11 @@ from __future__ import annotations
 import threading
 import time
 
-from rclpy.node import Node
 from std_msgs.msg import String
 
 from dpm2_core.estimates import OdometryResult, State
-from dpm2_ros.guard import excerpt
-from dpm2_ros.subscriptions import LAST_ONE, STEADY
+from dpm2_ros.guard import GuardedNode, excerpt
+from dpm2_ros.subscriptions import LAST_ONE
 
 SILENT = 2.0
 """Seconds without a message after which a sensor counts as silent, and without a pose the whole."""
@@ -22,13 +21,13 @@ _QUIET = 10.0  # s between two messages of the log
 class StatePublisher:
     """`dpm2/state`: a `State`, or silent while no pose follows the last one. Any thread may call."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: GuardedNode) -> None:
         self._publisher = node.create_publisher(String, "dpm2/state", LAST_ONE)
         self._lock, self._said = threading.Lock(), ""
         self._log, self._breaks = node.get_logger(), 0
         self._last: float | None = None  # when a pose was published
         self._say(str(State.INITIALIZING))
-        node.create_timer(0.25, self._listen, clock=STEADY)
+        node.create_timer(0.25, self._listen)
 
     def send(self, tracked: OdometryResult) -> None:
         """That of a pose which is published now; what is lost with it is logged, too."""

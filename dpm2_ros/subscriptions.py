@@ -11,8 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, NavSatFix, PointCloud2
@@ -30,6 +28,7 @@ from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
+from dpm2_ros.guard import GuardedNode
 from dpm2_ros.losses import Losses
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
@@ -38,8 +37,6 @@ from dpm2_ros.tf_message import TFMessage
 
 OTHER_FRAME = 2.0
 """s without a cloud after which one in another frame begins another drive."""
-STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""For timers that must go on when /clock stops at the end of a bag."""
 
 LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -55,7 +52,9 @@ class Inputs:
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
-    def __init__(self, node: Node, settings: InputSettings, ros: RosSettings, known: Calibration | None = None) -> None:
+    def __init__(
+        self, node: GuardedNode, settings: InputSettings, ros: RosSettings, known: Calibration | None = None
+    ) -> None:
         """`known`: what an earlier one has learned.
 
         Raises:
@@ -85,7 +84,7 @@ class Inputs:
         node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         # The last to be announced: who waits for it has found the others.
         self.subscriptions = [self._subscribed(PointCloud2, given.points_topic, self._on_cloud), *others]
-        node.create_timer(0.1, self._refresh, clock=STEADY)
+        node.create_timer(0.1, self._refresh)
 
     def _others(self, given: InputSettings) -> list[MatchedSubscription]:
         """The subscriptions to all but the clouds, of the topics that are given, before remapping."""
