@@ -40,7 +40,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
 
     def __init__(self, name: str) -> None:
         GuardedNode.__init__(self, name, automatically_declare_parameters_from_overrides=True)
-        self._config, self._robot = load_parameters(self, NodeConfig), self.get_namespace().strip("/")
+        self._config, self._robot = load_parameters(self), self.get_namespace().strip("/")
         self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what was there before each, and its way back
         follow_changes(self, self._config, self._apply)
 

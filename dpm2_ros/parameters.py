@@ -15,25 +15,34 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import annotated_types
 from pydantic.fields import FieldInfo
 
-from dpm2_core.config import Settings, flat_fields, load_settings, put, read_settings, settings_from
+from dpm2_core.config import flat_fields, load_settings, put, read_settings, settings_from
 from dpm2_core.errors import UsageError
-from dpm2_ros.settings import CHANGEABLE
+from dpm2_ros.settings import CHANGEABLE, NodeConfig
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor
     from rclpy.node import Node
 
-T = TypeVar("T", bound=Settings)
 CONFIG_FILE = "config_file"
 _OF_RCLPY = ("use_sim_time", "start_type_description_service")
+_HEAD = """# Parameters
+
+<!-- Written by `make parameters` from the settings themselves; a test keeps it up to date. -->
+
+One list for everything: `slam_node` and `mapper_node` take each value as a ROS parameter of this name
+(`--ros-args -p slam.registration:=geometric`), `dpm2 run` as `--set slam.registration=geometric` (all but
+`ros.*`), and both from a YAML file (`-p config_file:=FILE`, `--config FILE`; `dpm2 config dump` writes one).
+Defaults are overridden by the file, the file by single values. An unknown name or a value that is not
+allowed ends the program with exit code 2 and one line that says what is. They are read once, at the start;
+those that are *changeable* can also be set while a node runs (`ros2 param set`)."""
 
 
-def load_parameters(node: Node, kind: type[T]) -> T:
+def load_parameters(node: Node) -> NodeConfig:
     """The node's configuration; afterwards every value is declared, described and read-only.
 
     Args:
@@ -43,7 +52,7 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     Raises:
         UsageError: an unknown parameter or a value that is not allowed.
     """
-    fields = dict(flat_fields(kind))
+    fields = dict(flat_fields(NodeConfig))
     declared = {
         name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items() if name not in _OF_RCLPY
     }
@@ -58,10 +67,10 @@ def load_parameters(node: Node, kind: type[T]) -> T:
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
     path = Path(os.path.expanduser(file)) if file else None
-    load_settings(kind, path)  # its mistakes are its own
+    load_settings(NodeConfig, path)  # its mistakes are its own
     # Only what is given: a preset may change the rest.
-    tree = _with(kind, {} if path is None else read_settings(kind, path), given)
-    config = settings_from(kind, tree, dict.fromkeys(given, "ROS parameter"))
+    tree = _with({} if path is None else read_settings(NodeConfig, path), given)
+    config = settings_from(NodeConfig, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)
     _declare(node, CONFIG_FILE, file, "YAML file with settings, as for `dpm2 run --config`.", None)
@@ -80,7 +89,7 @@ def _check_topic(node: Node, name: str, topic: str) -> None:
         raise UsageError(f"{name}: {str(error).partition(', at /')[0]}, got {topic!r}") from None
 
 
-def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
+def follow_changes(node: Node, config: NodeConfig, apply: Callable[[NodeConfig], None]) -> None:
     """Hand new settings on whenever one of `CHANGEABLE` is set; a value that is not allowed is refused, with why."""
     from rcl_interfaces.msg import SetParametersResult
 
@@ -90,8 +99,8 @@ def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
         nonlocal current
         given = {parameter.name: parameter.value for parameter in parameters if parameter.name in CHANGEABLE}
         try:
-            tree = _with(type(config), current.model_dump(), given)
-            current = settings_from(type(config), tree, dict.fromkeys(given, "ROS parameter"))
+            tree = _with(current.model_dump(), given)
+            current = settings_from(NodeConfig, tree, dict.fromkeys(given, "ROS parameter"))
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if given:
@@ -101,10 +110,10 @@ def follow_changes(node: Node, config: T, apply: Callable[[T], None]) -> None:
     node.add_on_set_parameters_callback(on_set)
 
 
-def _with(kind: type[Settings], tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def _with(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """The same tree, with parameters put in; those that are lists come as arrays."""
     for name, value in given.items():
-        put(kind, tree, name.split("."), value.tolist() if hasattr(value, "tolist") else value)
+        put(NodeConfig, tree, name.split("."), value.tolist() if hasattr(value, "tolist") else value)
     return tree
 
 
@@ -180,29 +189,14 @@ def _type_name(annotation: Any) -> str:
     return {str: "text", Path: "path"}.get(annotation, getattr(annotation, "__name__", str(annotation)))
 
 
-def page(kind: type[Settings]) -> str:
+def page() -> str:
     """The Markdown page of all parameters."""
-    return "\n".join([*_head(), *_sections(kind)]) + "\n"
+    return "\n".join([_HEAD, *_sections()]) + "\n"
 
 
-def _head() -> list[str]:
-    return [
-        "# Parameters",
-        "",
-        "<!-- Written by `make parameters` from the settings themselves; a test keeps it up to date. -->",
-        "",
-        "One list for everything: `slam_node` and `mapper_node` take each value as a ROS parameter of this name",
-        "(`--ros-args -p slam.registration:=geometric`), `dpm2 run` as `--set slam.registration=geometric` (all but",
-        "`ros.*`), and both from a YAML file (`-p config_file:=FILE`, `--config FILE`; `dpm2 config dump` writes one).",
-        "Defaults are overridden by the file, the file by single values. An unknown name or a value that is not",
-        "allowed ends the program with exit code 2 and one line that says what is. They are read once, at the start;",
-        "those that are *changeable* can also be set while a node runs (`ros2 param set`).",
-    ]
-
-
-def _sections(kind: type[Settings]) -> Iterator[str]:
+def _sections() -> Iterator[str]:
     section = None
-    for name, info in flat_fields(kind):
+    for name, info in flat_fields(NodeConfig):
         prefix = name.rpartition(".")[0]
         if prefix != section:
             section = prefix
@@ -220,6 +214,4 @@ def _sections(kind: type[Settings]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    from dpm2_ros.settings import NodeConfig
-
-    print(page(NodeConfig), end="")
+    print(page(), end="")

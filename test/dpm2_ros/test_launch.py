@@ -112,7 +112,7 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
     ros_context(["--ros-args", "--params-file", str(file)], domain)
     node = rclpy.create_node("any", automatically_declare_parameters_from_overrides=True)
     try:
-        config = load_parameters(node, NodeConfig)
+        config = load_parameters(node)
         assert node.get_parameter("use_sim_time").value is True  # by the bag
     finally:
         end_ros(node)
@@ -139,7 +139,7 @@ def test_an_argument_overrides_the_parameter_file_whatever_sections_that_has(
     ros_context(words, domain)
     node = rclpy.create_node("slam_node", automatically_declare_parameters_from_overrides=True)
     try:
-        config = load_parameters(node, NodeConfig)
+        config = load_parameters(node)
     finally:
         end_ros(node)
     assert (config.input.points_topic, config.input.image_topic) == ("/argument", "/of_the_file")

@@ -39,7 +39,7 @@ def load(domain: int) -> Iterator[Load]:
         nodes.clear()
         ros_context(arguments, domain)
         nodes.append(rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True))
-        return load_parameters(nodes[-1], NodeConfig), nodes[-1]
+        return load_parameters(nodes[-1]), nodes[-1]
 
     yield make
     end_ros(*nodes)
@@ -206,7 +206,7 @@ def test_malformed_ros_arguments_are_an_error_of_use(arguments: tuple[str, ...],
 
 
 def test_the_page_of_parameters_is_up_to_date() -> None:
-    assert DOCS.read_text() == page(NodeConfig), "run `make parameters`"
+    assert DOCS.read_text() == page(), "run `make parameters`"
 
 
 def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(load: Load, tmp_path: Path) -> None:
