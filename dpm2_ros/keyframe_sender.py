@@ -47,15 +47,15 @@ class KeyframeSender:
     def __init__(self, node: GuardedNode, robot: str, ros: RosSettings, weights: str = "") -> None:
         """`weights`: see `weights_identity`. With the mapper in the same process each keyframe is sent once."""
         self._robot, self._odom_frame, self._weights = robot, ros.own_frame, weights
-        self._keep, self._log = not ros.embed_mapper, node.get_logger()
-        self._folder = Path(ros.map_directory) if ros.map_directory and self._keep else None
-        self._lock = threading.Lock()
+        self._log, self._lock = node.get_logger(), threading.Lock()
+        self._folder = Path(ros.map_directory) if ros.map_directory else None
         self._descriptors = node.create_publisher(PointCloud2, "dpm2/keyframe", WIRE)
         self._cloud = node.create_publisher(UInt8MultiArray, "dpm2/keyframe_cloud", WIRE)
         self._pose = node.create_publisher(Odometry, "dpm2/keyframe_odom", WIRE)
-        self._drives = list(self._left_behind())  # those that are over and not delivered, then the one that goes on
-        self.restart()
-        if self._keep:
+        self._drives: list[Delivery] = []  # those that are over and not delivered, then the one that goes on
+        if not ros.embed_mapper:
+            self._drives += self._left_behind()
+            self.restart()
             self._received = node.create_subscription(
                 UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10
             )
@@ -95,12 +95,12 @@ class KeyframeSender:
 
     def send(self, keyframe: Keyframe) -> None:
         """A new one, in the frame whose pose is published."""
-        drive = self._drives[-1]
+        drive = self._drives[-1] if self._drives else None
         covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
-        name = keyframe_name(self._robot, keyframe.id, drive.session if self._keep else "")
+        name = keyframe_name(self._robot, keyframe.id, drive.session if drive else "")
         pose = edge_to_msg(keyframe.T_odom_kf, covariance, keyframe.stamp, self._odom_frame, name)
         parts = [bytes(serialize_message(part)) for part in (pose, *payload_to_msgs(keyframe, name, self._weights))]
-        if self._keep:
+        if drive is not None:
             with self._lock:
                 first, before = drive is self._drives[0], drive.file.problem
                 drive.append(parts, time.monotonic() if first else None)
@@ -116,7 +116,7 @@ class KeyframeSender:
         What it does not have stays on the disk, for the next start.
         """
         end = time.monotonic() + _FAREWELL
-        while self._keep and any(map(self._late, self._drives)) and self._received.get_publisher_count():
+        while any(map(self._late, self._drives)) and self._received.get_publisher_count():
             if time.monotonic() > end:
                 break
             time.sleep(_TICK)

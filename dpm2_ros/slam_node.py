@@ -73,7 +73,7 @@ class SlamNode(ManagedNode):
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._state = StatePublisher(self)
         self._projection = Projection(self, second=bool(self._config.input.second_image_topic))
-        # Idle with the mapper, which has its own.
+        # Without a thread as long as the mapper takes the keyframes into its own.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=lower_priority)
         back.callback(self._line.shutdown)
         beside = ros.invert_odom_tf if ros.embed_mapper else ros.publish_tf_map  # a leaf, or a half of map -> odom
@@ -160,9 +160,10 @@ class SlamNode(ManagedNode):
         A mapper elsewhere is told before it hears the next odometry.
         """
         self._begin()
-        wait([self._line.submit(self._sender.restart)])
         if self._mapper is not None:
             of_map(self._mapper)
+        else:
+            wait([self._line.submit(self._sender.restart)])
 
     def _begin_again(self, why: str) -> None:
         """Another drive in the same map, if there has been one."""
