@@ -147,7 +147,7 @@ class Feed:
         self._take_part("cloud", message.layout.dim[0].label, lambda id: _checked_payload(message, id))
 
     def _on_seen(self, message: PointCloud2) -> None:
-        self._take_part("seen", message.header.frame_id, lambda id: (self._usable(message, id),))
+        self._take_part("seen", message.header.frame_id, lambda id: self._usable(message, id))
 
     def _take_part(self, part: str, name: str, checked: Callable[[int], Any]) -> None:
         """One of the messages of a keyframe, by its name; the stream takes note of one that is rejected."""
@@ -238,12 +238,10 @@ class Feed:
 
     def _add(self, stream: Stream, id: int, parts: Parts) -> None:
         assert stream.robot is not None
-        assert parts.cloud is not None
-        assert parts.seen is not None
-        keyframe = keyframe_from(parts.pose, stream.robot, id, stream.last, *parts.seen)
-        stream.last, stream.odom_frame = replace(keyframe, descriptors=None), parts.pose.header.frame_id
+        pose, (packed, fix, thumbnail) = parts["pose"], parts["cloud"]
+        keyframe = keyframe_from(pose, stream.robot, id, stream.last, parts["seen"])
+        stream.last, stream.odom_frame = replace(keyframe, descriptors=None), pose.header.frame_id
         stream.taken += 1
-        packed, fix, thumbnail = parts.cloud
         keyframe = replace(keyframe, origin=origin_of(packed), fix=fix, thumbnail=thumbnail)
         stream.given(id, self._mapper.add(lambda: replace(keyframe, cloud=unpack_cloud(packed))))
 

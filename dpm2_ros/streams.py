@@ -5,12 +5,9 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Container
-from dataclasses import dataclass
 from typing import Any
 
-from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe
-from dpm2_ros.keyframe_messages import Payload
 
 AHEAD = 64
 """Keyframes that may wait for one before them; those beyond are sent again."""
@@ -18,34 +15,16 @@ _MOST_WAITING = 1000  # of which a robot is told at once
 _HALVES = 64  # keyframes of which some messages are missing; also sent again
 _STUCK = 6.0  # s in which a robot sends a keyframe four times
 _TIMES = 3
-
-
-@dataclass(eq=False)
-class Parts:
-    """What has come of a keyframe, each part checked: its pose, its payload, and its descriptors, if it has some."""
-
-    pose: Any = None
-    cloud: Payload | None = None
-    seen: tuple[Descriptors | None] | None = None
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is missing."""
-        return self.pose is not None and self.cloud is not None and self.seen is not None
-
-    @property
-    def nbytes(self) -> int:
-        """Roughly."""
-        payload, (descriptors,) = self.cloud, self.seen or (None,)
-        size = 2000 if payload is None else 2000 + len(payload.cloud) + len(payload.thumbnail or b"")
-        return size if descriptors is None else size + descriptors.nbytes
+Parts = dict[str, Any]
+"""What has come of a keyframe, each part checked: `pose`, `cloud` (a `Payload`), `seen` (its descriptors, or None)."""
+_WHOLE = 3
 
 
 class Stream:
     """One drive, known by its session; without a session nothing is sent again, and order is arrival.
 
     Attributes:
-        next: all ids below have gone on to the mapper, or were given up.
+        next: all ids below have gone on to the mapper, or were given up; without a session, so many have.
         heard: when the last message came, s. since: when the first one came, since another drive took its place.
         robot: what the map calls it; None while that is not decided.
         last: its keyframe that went on last, without the cloud.
@@ -63,9 +42,8 @@ class Stream:
         self.last: Keyframe | None = None
         self.odom_frame = ""
         self._parts: OrderedDict[int, Parts] = OrderedDict()
-        self._above: dict[int, Parts] = {}
+        self._above: dict[int, tuple[int, Parts]] = {}  # whole keyframes with their ids, by id, or in turn from `next`
         self._given: deque[tuple[int, int]] = deque()  # ids that have gone on, and the mapper's numbers for them
-        self._queue: deque[tuple[int, Parts]] = deque(maxlen=AHEAD)  # without a session
         self._bad: tuple[float, int] | None = None  # since when, and how often, messages of the next one were rejected
 
     def arrived(self, written: int, missing: Container[int] = ()) -> tuple[int, list[int]]:
@@ -82,43 +60,39 @@ class Stream:
     @property
     def holds(self) -> int:
         """Bytes."""
-        queued = (parts for _, parts in self._queue)
-        return sum(parts.nbytes for held in (self._parts.values(), self._above.values(), queued) for parts in held)
+        return sum(map(_size, [*self._parts.values(), *(parts for _, parts in self._above.values())]))
 
     @property
     def ready(self) -> bool:
         """Whether the next keyframe is there."""
-        return self.next in self._above if self.session else bool(self._queue)
+        return self.next in self._above
 
     def wants(self, id: int, part: str) -> bool:
         """Whether a message would add anything: pose, cloud, or seen."""
         if self.session and (not self.next <= id < self.next + AHEAD or id in self._above):
             return False
-        return getattr(self._parts.get(id, Parts()), part) is None
+        return part not in self._parts.get(id, ())
 
     def put(self, id: int, part: str, value: Any) -> bool:
         """A part that is sound; whether its keyframe is complete now."""
-        parts = self._parts.setdefault(id, Parts())
-        setattr(parts, part, value)
-        if not parts.complete:
+        parts = self._parts.setdefault(id, {})
+        parts[part] = value
+        if len(parts) < _WHOLE:
             while len(self._parts) > _HALVES:
                 self._parts.popitem(last=False)
             return False
         del self._parts[id]
-        if self.session:
-            self._above[id] = parts
-        else:
-            self._queue.append((id, parts))
+        self._above[id if self.session else self.next + len(self._above)] = id, parts
+        if len(self._above) > AHEAD:  # only without a session
+            self.take()
         return True
 
     def take(self) -> tuple[int, Parts] | None:
         """The next keyframe, if it is there."""
         if not self.ready:
             return None
-        if not self.session:
-            return self._queue.popleft()
-        id, self.next, self._bad = self.next, self.next + 1, None
-        return id, self._above.pop(id)
+        self.next, self._bad = self.next + 1, None
+        return self._above.pop(self.next - 1)
 
     def given(self, id: int, number: int) -> None:
         """The mapper has been handed a keyframe, and calls it by that number."""
@@ -127,7 +101,7 @@ class Stream:
 
     def reject(self, id: int, now: float) -> None:
         """A message of a keyframe was not sound."""
-        if id == self.next:
+        if self.session and id == self.next:
             since, times = self._bad or (now, 0)
             self._bad = since, times + 1
 
@@ -143,7 +117,6 @@ class Stream:
         """Forget what waits: it is sent again."""
         self._parts.clear()
         self._above.clear()
-        self._queue.clear()
 
     def replaced(self) -> None:
         """Another drive has taken its place; should it be heard again, its place is decided anew."""
@@ -153,3 +126,10 @@ class Stream:
     def hear(self, now: float, live: bool = True) -> None:
         """A message came; `live`: the robot still drives it."""
         self.heard, self.since, self.live = now, min(self.since, now), live
+
+
+def _size(parts: Parts) -> int:
+    """Bytes, roughly."""
+    payload, descriptors = parts.get("cloud"), parts.get("seen")
+    size = 2000 if payload is None else 2000 + len(payload.cloud) + len(payload.thumbnail or b"")
+    return size if descriptors is None else size + int(descriptors.nbytes)

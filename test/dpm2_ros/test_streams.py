@@ -17,7 +17,7 @@ def put(stream: Stream, id: int) -> None:
     if stream.wants(id, "pose"):
         stream.put(id, "pose", object())
         stream.put(id, "cloud", CLOUD)
-        stream.put(id, "seen", (None,))
+        stream.put(id, "seen", None)
 
 
 def taken(stream: Stream) -> list[int]:
