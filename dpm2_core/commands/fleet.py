@@ -17,8 +17,8 @@ from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import parts_of, read_drives
-from dpm2_core.fleet.part import Part
-from dpm2_core.fleet.run import SUMMARY, Outcome, carry_out, summary_table
+from dpm2_core.fleet.part import Outcome, Part
+from dpm2_core.fleet.run import SUMMARY, carry_out, summary_table
 from dpm2_core.fleet.view import TerminalView
 from dpm2_core.slam.settings import Config
 from dpm2_core.tables import FigureTable

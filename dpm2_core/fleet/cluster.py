@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray: functions in processes of their own, here or on a cluster, each tried again when its worker dies.
+"""Ray: parts in processes of their own, here or on a cluster, each tried again when its worker dies.
 
 Ray is imported here alone, and only when it is used. It sends no usage statistics; a cluster that was started here ends
 with this process, whatever ends that.
@@ -16,7 +16,6 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,41 +23,20 @@ from dpm2_core._version import __version__
 from dpm2_core.errors import Dpm2Error, UsageError, one_line
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.extras import needs
+from dpm2_core.fleet.part import Outcome, Part, do_part
 
 ATTEMPTS = 3
-"""Workers that may die over one job."""
-_POLL = 0.5  # s between two looks at what goes on, and between two reports of a job
+"""Workers that may die over one part."""
+MEMORY = 2 * 10**9
+"""Bytes that a part declares; 1.2 GB were measured of a drive with the network, the rest is room."""
+_POLL = 0.5  # s between two looks at what goes on, and between two reports of a part
 _PATIENCE = 5.0  # s for an address to answer
-_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: jobs hand over little
+_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: parts hand over little
 _LONGEST = 25  # characters of the folder for temporary files, in which Ray makes sockets, whose names have 107
 
 
-@dataclass(frozen=True)
-class Job:
-    """A call in another process.
-
-    Attributes:
-        key: its name. function: of a module, called with `arguments`, and with `advance` to be told of the progress.
-        cores, memory: processors and bytes that it takes at most.
-    """
-
-    key: str
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    cores: int = 1
-    memory: int = 0
-
-
-class Ended(NamedTuple):
-    """A job that ended: what its function returned, or the reason why it has nothing."""
-
-    key: str
-    value: Any
-    reason: str = ""
-
-
 class Status(NamedTuple):
-    """Of a job that runs or has run: attempts, frames done, frames in all, and where: HOST:PROCESS."""
+    """Of a part that runs or has run: attempts, frames done, frames in all, and where: HOST:PROCESS."""
 
     attempts: int
     done: int = 0
@@ -70,7 +48,7 @@ Watch = Callable[[Mapping[str, Status]], None]
 
 
 class Cluster:
-    """The connection to Ray. A context manager: leaving it ends the jobs, and the cluster if it was started here.
+    """The connection to Ray. A context manager: leaving it ends the parts, and the cluster if it was started here.
 
     In a program that is connected to Ray already that connection serves, and stays.
     """
@@ -80,8 +58,8 @@ class Cluster:
 
         Args:
             address: of a cluster, as `ray.init` takes it; None starts one on this machine.
-            workers: at most so many jobs at a time; None: as many as there are processors for.
-            cores: of a job, for a cluster that is started here.
+            workers: at most so many parts at a time; None: as many as there are processors for.
+            cores: of a part, for a cluster that is started here.
         """
         self._address, self._workers, self._cores = address, workers, cores
         self._folder: Path | None = None
@@ -93,7 +71,7 @@ class Cluster:
         return self
 
     def start(self) -> None:
-        """Connect to Ray, or start it; `run` does so with the first job.
+        """Connect to Ray, or start it; `run` does so with the first part.
 
         Raises:
             UsageError: it is not installed, does not start, or nobody answers at that address.
@@ -140,13 +118,13 @@ class Cluster:
             self._folder = None
         self._ray = None
 
-    def run(self, jobs: Iterable[Job], watch: Watch = lambda status: None) -> Iterator[Ended]:
-        """Do the jobs, each as it ends; those that fail end with the reason, and the rest goes on.
+    def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
+        """Do the parts, each as it ends; those that fail end with the reason, and the rest goes on.
 
         Args:
-            watch: told twice a second of the jobs that have begun.
+            out: the folder of the whole, absolute. watch: told twice a second of the parts that have begun.
         """
-        waiting = deque(jobs)
+        waiting = deque(parts)
         if not waiting:
             return
         self.start()
@@ -155,29 +133,29 @@ class Cluster:
         running: dict[Any, str] = {}
         while waiting or running:
             while waiting and len(running) < (self._workers or most["window"]):
-                job = waiting.popleft()
-                running[self._submit(ray, job, most)] = job.key
+                part = waiting.popleft()
+                running[self._submit(ray, part, out, most)] = part.name
             ended, _ = ray.wait(list(running), timeout=_POLL)
             for reference in ended:
                 yield _ended(ray, running.pop(reference), reference)
             watch(self._status(ray))
 
     def _limits(self, ray: Any) -> dict[str, float]:
-        """What the largest node has: a job that declares more would wait for ever; and how many jobs to hand over."""
+        """What the largest node has: a part that declares more would wait for ever; and how many to hand over."""
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = [node.get("CPU", 0) for node in nodes]
         if max(cpus, default=0) < 1:
             raise UsageError(f"--ray {self._address}: no node of that cluster has a processor to work with")
         return {"CPU": max(cpus), "memory": max(node.get("memory", 0) for node in nodes), "window": 4 * sum(cpus)}
 
-    def _submit(self, ray: Any, job: Job, most: Mapping[str, float]) -> Any:
+    def _submit(self, ray: Any, part: Part, out: Path, most: Mapping[str, float]) -> Any:
         remote = ray.remote(_attempt).options(
-            num_cpus=min(job.cores, most["CPU"]),
-            memory=min(job.memory, most["memory"]),
+            num_cpus=min(part.cores, most["CPU"]),
+            memory=min(MEMORY, most["memory"]),
             max_retries=ATTEMPTS - 1,
-            name=job.key,
+            name=part.name,
         )
-        return remote.remote(job, self._board, __version__)
+        return remote.remote(part, out, self._board, __version__)
 
     def _status(self, ray: Any) -> Mapping[str, Status]:
         try:
@@ -223,52 +201,53 @@ def _check_address(address: str) -> None:
 
 
 class _Board:
-    """Where jobs say how far they are: an actor of Ray, which lives in a process of its own."""
+    """Where parts say how far they are: an actor of Ray, which lives in a process of its own."""
 
     def __init__(self) -> None:
         self._status: dict[str, Status] = {}
 
-    def begin(self, key: str, where: str) -> None:
-        before = self._status.get(key, Status(0))
-        self._status[key] = Status(before.attempts + 1, where=where)
+    def begin(self, name: str, where: str) -> None:
+        before = self._status.get(name, Status(0))
+        self._status[name] = Status(before.attempts + 1, where=where)
 
-    def tell(self, key: str, done: int, total: int) -> None:
-        self._status[key] = self._status.get(key, Status(1))._replace(done=done, total=total)
+    def tell(self, name: str, done: int, total: int) -> None:
+        self._status[name] = self._status.get(name, Status(1))._replace(done=done, total=total)
 
     def all(self) -> dict[str, Status]:
         return self._status
 
 
-def _attempt(job: Job, board: Any, version: str) -> Ended:
-    """In the worker: what a function raises is a result, and only a death is tried again."""
-    board.begin.remote(job.key, f"{socket.gethostname()}:{os.getpid()}")
+def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
+    """In the worker: what the work raises is a result, and only a death is tried again."""
+    board.begin.remote(part.name, f"{socket.gethostname()}:{os.getpid()}")
     told = 0.0
 
     def advance(done: int, total: int) -> None:
         nonlocal told
         if done == total or time.monotonic() - told >= _POLL:
             told = time.monotonic()
-            board.tell.remote(job.key, done, total)
+            board.tell.remote(part.name, done, total)
 
     try:
         if version != __version__:
             raise Dpm2Error(f"{socket.gethostname()} has dpm2 {__version__}, the caller {version}")
-        return Ended(job.key, job.function(*job.arguments, advance=advance))
+        return Outcome(part.name, "done", do_part(part, out, advance))
     except Dpm2Error as error:
-        return Ended(job.key, None, str(error))
-    except Exception as error:  # a bug ends its job, not the hours of the others
+        return Outcome(part.name, "failed", reason=str(error))
+    except Exception as error:  # a bug ends its part, not the hours of the others
         last = traceback.extract_tb(error.__traceback__)[-1]
-        return Ended(job.key, None, f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
+        why = f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
+        return Outcome(part.name, "failed", reason=why)
 
 
-def _ended(ray: Any, key: str, reference: Any) -> Ended:
+def _ended(ray: Any, name: str, reference: Any) -> Outcome:
     try:
-        ended: Ended = ray.get(reference)
+        ended: Outcome = ray.get(reference)
     except ray.exceptions.OutOfMemoryError:
-        return Ended(key, None, "its worker was ended: the machine was short of memory")
+        return Outcome(name, "failed", reason="its worker was ended: the machine was short of memory")
     except ray.exceptions.RayTaskError as error:
-        return Ended(key, None, f"not sent back: {error.cause}")
+        return Outcome(name, "failed", reason=f"not sent back: {error.cause}")
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        return Ended(key, None, f"{ATTEMPTS} workers died over it: {lines[0]}")
+        return Outcome(name, "failed", reason=f"{ATTEMPTS} workers died over it: {lines[0]}")
     return ended

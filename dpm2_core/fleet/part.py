@@ -18,7 +18,7 @@ from importlib import import_module
 from itertools import count
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from dpm2_core.config import Settings
 from dpm2_core.errors import Dpm2Error
@@ -64,6 +64,15 @@ class Part:
     fresh: bool = False
     cores: int = 1
     content: str = ""
+
+
+class Outcome(NamedTuple):
+    """What became of a part: done now, kept from before, failed with the reason, or not done when it was stopped."""
+
+    name: str
+    state: Literal["done", "kept", "failed", "stopped"]
+    figures: Figures | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True)

@@ -6,26 +6,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 from dpm2_core.files import make_folder, write_json
-from dpm2_core.fleet.cluster import Cluster, Job, Status
-from dpm2_core.fleet.part import Figures, Part, do_part, figures_of, remove_attempts
+from dpm2_core.fleet.cluster import Cluster, Status
+from dpm2_core.fleet.part import Outcome, Part, figures_of, remove_attempts
 from dpm2_core.tables import FigureTable, cells_of
 
 SUMMARY = "fleet.json"
 """In the folder of the results: what became of each drive."""
-MEMORY = 2 * 10**9
-"""Bytes that a drive declares; 1.2 GB were measured with the network, the rest is room."""
-
-
-class Outcome(NamedTuple):
-    """What became of a part: done now, kept from before, failed with the reason, or not done when it was stopped."""
-
-    name: str
-    state: Literal["done", "kept", "failed", "stopped"]
-    figures: Figures | None = None
-    reason: str = ""
 
 
 class View:
@@ -85,10 +73,9 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     missing = [part for part in parts if part.name not in kept]
     view.begun([part.name for part in missing])
     try:
-        jobs = [Job(part.name, do_part, (part, out), cores=part.cores, memory=MEMORY) for part in missing]
-        for name, figures, reason in cluster.run(jobs, view.running):
-            outcomes[name] = Outcome(name, "failed" if reason else "done", figures, reason)
-            view.ended(outcomes[name])
+        for outcome in cluster.run(missing, out, view.running):
+            outcomes[outcome.name] = outcome
+            view.ended(outcome)
     except KeyboardInterrupt:
         pass
     finally:

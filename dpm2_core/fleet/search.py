@@ -19,10 +19,10 @@ from dpm2_core.files import write_json
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, edge_from, join_part, stretches
-from dpm2_core.fleet.part import Figures, Part, is_whole
+from dpm2_core.fleet.part import Figures, Outcome, Part, is_whole
 from dpm2_core.fleet.places import FleetIndex, places_part, vectors_of
 from dpm2_core.fleet.regions import Join, first_nodes, owners
-from dpm2_core.fleet.run import Outcome, View, do_parts, not_done
+from dpm2_core.fleet.run import View, do_parts, not_done
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings

@@ -12,8 +12,7 @@ import numpy as np
 
 from dpm2_core.errors import UsageError
 from dpm2_core.fleet.drives import ManifestDrive, parts_of
-from dpm2_core.fleet.part import Part
-from dpm2_core.fleet.run import Outcome
+from dpm2_core.fleet.part import Outcome, Part
 from dpm2_core.tables import FigureTable
 
 _COMMA = re.compile(r",(?![^\[{]*[\]}])")  # not within a list or a mapping

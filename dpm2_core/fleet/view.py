@@ -13,7 +13,8 @@ from rich.text import Text
 
 from dpm2_core.console import Console
 from dpm2_core.fleet.cluster import Status
-from dpm2_core.fleet.run import Outcome, View
+from dpm2_core.fleet.part import Outcome
+from dpm2_core.fleet.run import View
 
 _ROWS = 30
 """Drives that are shown at once: those that run."""

@@ -10,15 +10,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dpm2_core.errors import UsageError
-from dpm2_core.fleet.cluster import Cluster, Job
+from dpm2_core.fleet import cluster as ray_cluster
+from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import MAP, ManifestDrive, parts_of, read_drives
+from dpm2_core.fleet.part import Part
 from dpm2_core.fleet.run import SUMMARY, carry_out
 from dpm2_core.fleet.sweep import sweep_parts, variants
 from dpm2_core.slam.store.check import check_map
@@ -52,12 +53,12 @@ def killed_once(folder, advance, **arguments):
             os.kill(os.getpid(), signal.SIGKILL)
     return drives.run_drive(folder, dying, **arguments)
 
-def divide(value, advance):
+def divide(folder, advance, value):
     if value < 0:
         os.kill(os.getpid(), signal.SIGKILL)
-    return 10 // value
+    return {"quotient": 10 // value}
 """
-"""A drive on a disk on which no file can grow beyond 50 kB; one whose first worker dies half-way; a function that kills
+"""A drive on a disk on which no file can grow beyond 50 kB; one whose first worker dies half-way; a work that kills
 its worker, has a bug, or neither."""
 
 
@@ -214,12 +215,14 @@ def test_faults_cost_only_what_they_hit(cluster: Cluster, drives: list[Path], al
 
 
 @pytest.mark.long
-def test_what_kills_every_worker_ends_with_a_reason(cluster: Cluster) -> None:
-    """And a bug is one line, with its place; the other jobs go on."""
-    divide = import_module("fleet_work").divide
-    jobs = [Job(str(value), divide, (value,), memory=10**15) for value in (-1, 0, 2)]  # bytes that no machine has
-    found = {ended.key: ended for ended in cluster.run(jobs)}
-    assert found["2"].value == 5
+def test_what_kills_every_worker_ends_with_a_reason(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a bug is one line, with its place; the other parts go on."""
+    monkeypatch.setattr(ray_cluster, "MEMORY", 10**15)  # bytes that no machine has
+    parts = [Part(str(value), "fleet_work:divide", {"value": value}) for value in (-1, 0, 2)]
+    found = {ended.name: ended for ended in cluster.run(parts, tmp_path)}
+    assert (found["2"].figures or {})["quotient"] == 5
     assert found["-1"].reason.startswith("3 workers died over it")
     assert found["0"].reason.startswith("ZeroDivisionError: ")
     assert "fleet_work.py:" in found["0"].reason

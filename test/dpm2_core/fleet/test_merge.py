@@ -16,11 +16,11 @@ import pytest
 from benchmarks.fleet_drives import poses_of, write_drive
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
-from dpm2_core.fleet.cluster import Cluster, Ended, Job, Watch
+from dpm2_core.fleet.cluster import Cluster, Watch
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.joins import ENOUGH, stretches
 from dpm2_core.fleet.merge import merge
-from dpm2_core.fleet.part import DONE, Advance, Figures, Part
+from dpm2_core.fleet.part import DONE, Advance, Figures, Outcome, Part, do_part
 from dpm2_core.fleet.places import WIDTH, FleetIndex
 from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.run import View, carry_out
@@ -204,11 +204,11 @@ def test_a_map_whose_record_is_damaged_is_not_replaced(tmp_path: Path, drives: s
 
 
 class Stopped(Cluster):
-    """One job ends, then Ctrl-C."""
+    """One part ends, then Ctrl-C."""
 
-    def run(self, jobs: Iterable[Job], watch: object = None) -> Iterator[Ended]:
+    def run(self, parts: Iterable[Part], out: Path, watch: object = None) -> Iterator[Outcome]:
         weights = SlamSettings().weights_id()
-        yield Ended(next(iter(jobs)).key, {"keyframes": 60, "weights": [weights]})
+        yield Outcome(next(iter(parts)).name, "done", {"keyframes": 60, "weights": [weights]})
         raise KeyboardInterrupt
 
 
@@ -224,14 +224,14 @@ def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
 
 
 class AtOnce(Cluster):
-    """Does its jobs here, until one is interrupted."""
+    """Does its parts here, until one is interrupted."""
 
-    def run(self, jobs: Iterable[Job], watch: Watch = lambda status: None) -> Iterator[Ended]:
-        for job in jobs:
+    def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
+        for part in parts:
             try:
-                yield Ended(job.key, job.function(*job.arguments, advance=lambda done, total: None))
+                yield Outcome(part.name, "done", do_part(part, out))
             except Dpm2Error as error:
-                yield Ended(job.key, None, str(error))
+                yield Outcome(part.name, "failed", reason=str(error))
 
 
 def leave_a_map(folder: Path, advance: Advance, voxel: float, end: str) -> Figures:

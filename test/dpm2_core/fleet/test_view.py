@@ -6,7 +6,7 @@ from __future__ import annotations
 import io
 
 from dpm2_core.console import Console
-from dpm2_core.fleet.run import Outcome
+from dpm2_core.fleet.part import Outcome
 from dpm2_core.fleet.view import TerminalView
 
 
