@@ -40,22 +40,22 @@ class Health:
             if tracked.registration.ok:
                 self._last_good = now
 
-    def figures(self) -> dict[str, str]:
-        """Name to value, as text with its unit in the name."""
+    def figures(self) -> dict[str, object]:
+        """Name, with its unit, to value."""
         now = time.monotonic()
         with self._lock:
-            out = {
-                "state": str(self.last.state) if self.last else "waiting",
-                "processed": str(self.processed),
-                "failed registrations": str(self.failed),
-                "internal errors": str(self.errors),
+            out: dict[str, object] = {
+                "state": self.last.state if self.last else "waiting",
+                "processed": self.processed,
+                "failed registrations": self.failed,
+                "internal errors": self.errors,
                 "rate (Hz)": f"{self._rate(now):.1f}",
             }
             if self.scale:
                 out["scale"] = self.scale
             if self.last is not None:
                 out["confidence"] = f"{self.last.registration.confidence:.2f}"
-                out["breaks"] = str(self.last.breaks)
+                out["breaks"] = self.last.breaks
             if self._last_good is not None:
                 out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
             latency, seconds = list(self._latency), {stage: list(s) for stage, s in self._seconds.items()}

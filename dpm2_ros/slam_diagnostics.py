@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -56,6 +56,7 @@ class Diagnostics:
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
         self._lost_before = self._dropped_before = 0
+        self._status = partial(status, node)
         publish_diagnostics(node, self._statuses)
 
     def _statuses(self) -> list[DiagnosticStatus]:
@@ -112,65 +113,59 @@ class Diagnostics:
             level, text = max(level for level, _ in found), "; ".join(text for _, text in found)
         return self._status("odometry", level, text, self._odometry_figures())
 
-    def _odometry_figures(self) -> dict[str, str]:
+    def _odometry_figures(self) -> dict[str, object]:
         synchronizer, counts = self._inputs.synchronizer, self._inputs.synchronizer.counts
         figures = self._health.figures() | {
-            "received": str(synchronizer.received),
-            "lost on the way": str(self._inputs.losses.count),
-            "dropped (queue full)": str(synchronizer.dropped),
-            "rejected (stamp repeated)": str(counts[StampCheck.REPEATED]),
-            "rejected (stamp out of order)": str(counts[StampCheck.OUT_OF_ORDER]),
-            "rejected (stray stamp)": str(counts[StampCheck.STRAY]),
-            "restarts": str(counts[StampCheck.RESTARTED]),
-            "waiting": str(len(synchronizer)),
+            "received": synchronizer.received,
+            "lost on the way": self._inputs.losses.count,
+            "dropped (queue full)": synchronizer.dropped,
+            "rejected (stamp repeated)": counts[StampCheck.REPEATED],
+            "rejected (stamp out of order)": counts[StampCheck.OUT_OF_ORDER],
+            "rejected (stray stamp)": counts[StampCheck.STRAY],
+            "restarts": counts[StampCheck.RESTARTED],
+            "waiting": len(synchronizer),
         }
         if times := self._inputs.times:
-            figures |= {
-                name: f"{ns * 1e-9:.3f}" for name, ns in zip(("cloud stamp (s)", "clock (s)"), times, strict=True)
-            }
+            stamp, clock = (f"{ns * 1e-9:.3f}" for ns in times)
+            figures |= {"cloud stamp (s)": stamp, "clock (s)": clock}
         return figures
 
     def _absence(self) -> tuple[bytes, str] | None:
         """Why no cloud comes, in words, and how bad that is; None where one has come lately."""
-        topic, silence = self._inputs.calibration.points_topic, _silence(self._inputs.synchronizer.last_arrival)
-        if silence is not None and silence <= SILENT:
+        topic, last = self._inputs.calibration.points_topic, self._inputs.synchronizer.last_arrival
+        if not (text := _silence("cloud", topic, last)):
             return None
         if problem := self._inputs.problem(topic):
             return ERROR, problem
-        if silence is not None:
-            return STALE, f"no cloud on {topic} for {silence:.0f} s"
-        found = self._inputs.candidates()
-        hint = f"; point clouds are published on {', '.join(found)}" if found else ""
-        return STALE, f"no cloud on {topic} yet{hint}"
+        if last is None and (found := self._inputs.candidates()):
+            text += f"; point clouds are published on {', '.join(found)}"
+        return STALE, text
 
     def _beside_tracking(self, last: OdometryResult) -> list[tuple[bytes, str]]:
         """What else is to be said of the last result and of the clouds since the last message, and how bad that is."""
-        topic, log, found = self._inputs.calibration.points_topic, self._node.get_logger(), list[tuple[bytes, str]]()
-        if last.breaks:
-            found.append((OK, f"the way across {last.breaks} pause(s) or lift(s) is not known"))
-        if self.frame_problem:
-            found.append((ERROR, self.frame_problem))
-        if self.tf_problem:
-            found.append((WARN, self.tf_problem))
-        if (count := self._node.count_publishers(topic)) > 1:
-            found.append((WARN, f"{count} publishers on {topic}: a drive has one LiDAR"))
-        if (dropped := self._inputs.synchronizer.dropped) > self._dropped_before:
-            found.append((WARN, f"cannot keep up, {dropped} clouds dropped"))
-        if problem := self._frames.time_problem:
-            log.warning(f"{topic}: {problem}", once=True)
-            found.append((OK, problem))
-        if last.camera:
-            found.append((OK, last.camera))
+        topic, log = self._inputs.calibration.points_topic, self._node.get_logger()
+        dropped, lost = self._inputs.synchronizer.dropped, self._inputs.losses.count
+        count, fields, clock = self._node.count_publishers(topic), self._frames.time_problem, self._clock_problem()
+        if fields:
+            log.warning(f"{topic}: {fields}", once=True)
         if last.times:
             log.warning(f"{topic}: {last.times}", once=True)
-            found.append((WARN, last.times))
-        if problem := self._clock_problem():
-            log.warning(problem, once=True)
-            found.append((WARN, problem))
-        if (lost := self._inputs.losses.count) > self._lost_before:
-            found.append((WARN, f"{lost} clouds lost on the way"))
+        if clock:
+            log.warning(clock, once=True)
+        found = (
+            (OK, f"the way across {last.breaks} pause(s) or lift(s) is not known" if last.breaks else ""),
+            (ERROR, self.frame_problem),
+            (WARN, self.tf_problem),
+            (WARN, f"{count} publishers on {topic}: a drive has one LiDAR" if count > 1 else ""),
+            (WARN, f"cannot keep up, {dropped} clouds dropped" if dropped > self._dropped_before else ""),
+            (OK, fields),
+            (OK, last.camera),
+            (WARN, last.times),
+            (WARN, clock),
+            (WARN, f"{lost} clouds lost on the way" if lost > self._lost_before else ""),
+        )
         self._dropped_before, self._lost_before = dropped, lost
-        return found
+        return [(level, text) for level, text in found if text]
 
     def _clock_problem(self) -> str:
         """How the clouds' clock is not that of the node, in words; empty where it is."""
@@ -236,13 +231,9 @@ class Diagnostics:
     def _fix_problem(self) -> str:
         """Why no fix comes, or none is of use, in words; else empty."""
         last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
-        if problem := self._inputs.problem(topic):
+        stamp, arrival = last or (0, None)
+        if problem := self._inputs.problem(topic) or _silence("fix", topic, arrival):
             return problem
-        if last is None:
-            return f"no fix on {topic} yet"
-        stamp, arrival = last
-        if (silence := time.monotonic() - arrival) > SILENT:
-            return f"no fix on {topic} for {silence:.0f} s"
         ahead = (stamp - clouds[0]) * 1e-9 if clouds else 0.0
         return f"stamps of another clock, {ahead:+.0f} s from the clouds'" if abs(ahead) > OTHER_CLOCK + SILENT else ""
 
@@ -250,13 +241,10 @@ class Diagnostics:
         """Of a sensor beside the LiDAR and its messages, in words, and their topic."""
         sensor = self._inputs.synchronizer.sensors[topic]
         figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
-        silence = _silence(sensor.last_arrival)
         if unheard := self._inputs.problem(topic):
             level, text = ERROR, unheard
-        elif silence is None:
-            level, text = WARN, f"no {what} on {topic} yet"
-        elif silence > SILENT:
-            level, text = WARN, f"no {what} on {topic} for {silence:.0f} s"
+        elif silence := _silence(what, topic, sensor.last_arrival):
+            level, text = WARN, silence
         elif problem := self._frames.problems.get(topic):
             level, text = ERROR, problem
         elif not sensor.awaited:
@@ -264,9 +252,6 @@ class Diagnostics:
         else:
             return self._status(part, OK, "in use", figures)
         return self._status(part, level, f"{text}; going on without", figures)
-
-    def _status(self, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
-        return status(self._node, part, level, text, figures)
 
 
 def _tracked(last: OdometryResult) -> tuple[bytes, str]:
@@ -283,5 +268,9 @@ def _date(stamp: int) -> str:
     return f"{stamp * 1e-9:.3f} s ({date:%Y-%m-%d %H:%M:%S} UTC)"
 
 
-def _silence(last_arrival: float | None) -> float | None:
-    return None if last_arrival is None else time.monotonic() - last_arrival
+def _silence(what: str, topic: str, last_arrival: float | None) -> str:
+    """That no message has come on a topic lately, in words; empty where one has. `what` it has, in one word."""
+    if last_arrival is None:
+        return f"no {what} on {topic} yet"
+    silence = time.monotonic() - last_arrival
+    return f"no {what} on {topic} for {silence:.0f} s" if silence > SILENT else ""
