@@ -44,18 +44,11 @@ CHOICES = {
     "rviz": ["true", "false"],
     "use_sim_time": ["auto", "true", "false"],
 }
+_OF_ROS = ("base_frame", "odom_frame", "odom_source", "embed_mapper", "map_directory", "map_file", "localization_mode")
 PARAMETERS = {
     "config_file": "config_file",
-    "points_topic": "input.points_topic",
-    "image_topic": "input.image_topic",
-    "imu_topic": "input.imu_topic",
-    "base_frame": "ros.base_frame",
-    "odom_frame": "ros.odom_frame",
-    "odom_source": "ros.odom_source",
-    "embed_mapper": "ros.embed_mapper",
-    "map_directory": "ros.map_directory",
-    "map_file": "ros.map_file",
-    "localization_mode": "ros.localization_mode",
+    **{name: f"input.{name}" for name in ("points_topic", "image_topic", "imu_topic")},
+    **{name: f"ros.{name}" for name in _OF_ROS},
 }
 SAVING = "120"
 """s after Ctrl-C until `launch` sends SIGTERM, and SIGKILL 5 s later; its own 5 s are not enough to save a map."""
