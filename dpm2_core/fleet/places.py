@@ -78,18 +78,16 @@ class FleetIndex:
         drives: name, version, and number of keyframes of each.
     """
 
+    drives: list[tuple[str, Sequence[int], int]]
+    _graph: Any
+
     def __init__(self, folder: Path) -> None:
         """With what is in the folder, if it is whole."""
         with needs("fleet", "the index of places"):
             import faiss
         self._faiss: Any = faiss
         self._folder = folder
-        self.drives: list[tuple[str, Sequence[int], int]] = []
-        self._mean = np.zeros(WIDTH, np.float32)
-        self._graph: Any = None
-        self._late: list[Vector] = []  # those after the ones in the graph
-        self._new: list[Vector] = []  # those that are not in the file yet
-        self._kept, self._relinked = 0, False  # places in the file; whether the graph differs from its file
+        self.clear()
         try:
             listed = json.loads((folder / _LISTED).read_text(encoding="utf-8"))
             drives: list[Any] = [(str(name), list(version), int(count)) for name, version, count in listed["drives"]]
@@ -103,11 +101,16 @@ class FleetIndex:
             graph = faiss.read_index(str(folder / _INDEX))
             if graph.ntotal <= total and graph.d == WIDTH:
                 self._graph = graph
-        self._late = [np.array(vectors[self._linked :])]
+        self._late = np.array(vectors[self._linked :])
 
     def clear(self) -> None:
-        """Forget all: a drive has changed."""
-        self.drives, self._graph, self._late, self._new, self._kept = [], None, [], [], 0
+        """Forget all, as where a drive has changed."""
+        self.drives = []
+        self._mean = np.zeros(WIDTH, np.float32)
+        self._graph = None
+        self._late = np.zeros((0, WIDTH), np.float32)  # places after those in the graph
+        self._new: list[Vector] = []  # places that are not in the file yet
+        self._kept, self._relinked = 0, False  # places in the file; whether the graph differs from its file
 
     @property
     def _linked(self) -> int:
@@ -119,7 +122,7 @@ class FleetIndex:
 
         A place is a number over all drives: the keyframes of the first, then those of the second.
         """
-        queries, begin = centered(vectors, self._mean), self._linked
+        queries = centered(vectors, self._mean)
         cosines = [np.full((len(vectors), count), -np.inf, np.float32)]
         places = [np.full((len(vectors), count), -1)]
         if self._graph is not None:
@@ -127,11 +130,10 @@ class FleetIndex:
             found = self._graph.search(queries, count)
             cosines.append(found[0])
             places.append(found[1])
-        for late in self._late:
-            found = self._faiss.knn(queries, late, min(count, len(late)), metric=self._faiss.METRIC_INNER_PRODUCT)
+        if most := min(count, len(self._late)):
+            found = self._faiss.knn(queries, self._late, most, metric=self._faiss.METRIC_INNER_PRODUCT)
             cosines.append(found[0])
-            places.append(found[1] + begin)
-            begin += len(late)
+            places.append(found[1] + self._linked)
         best = np.argsort(-np.hstack(cosines), axis=1, kind="stable")[:, :count]
         out = np.take_along_axis(np.hstack(places), best, 1)
         out[~vectors.any(1)] = -1
@@ -144,10 +146,8 @@ class FleetIndex:
         rows = centered(vectors, self._mean)
         self.drives.append((name, list(version), len(vectors)))
         self._new.append(rows)
-        self._late.append(rows)
-        while len(self._late) > 1 and len(self._late[-1]) >= len(self._late[-2]):  # few large ones are searched faster
-            self._late[-2:] = [np.concatenate(self._late[-2:])]
-        if sum(map(len, self._late)) > _LATE:
+        self._late = np.concatenate([self._late, rows])
+        if len(self._late) > _LATE:
             self._link()
 
     def _link(self) -> None:
@@ -155,8 +155,8 @@ class FleetIndex:
         if self._graph is None:
             self._graph = self._faiss.IndexHNSWFlat(WIDTH, _LINKS, self._faiss.METRIC_INNER_PRODUCT)
         self._graph.hnsw.efConstruction = _BUILD
-        self._graph.add(np.concatenate(self._late))
-        self._late, self._relinked = [], True
+        self._graph.add(self._late)
+        self._late, self._relinked = self._late[:0], True
 
     def save(self) -> None:
         """Write what is new to its folder. What was there before stays usable until the last file has its name.
