@@ -278,17 +278,13 @@ class ActiveMap:
         return open_for_localization(self._path, self._config.slam)
 
     def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
-        """Where it is in a map that stays as it is; one that cannot be read does not show it."""
+        """Where it is in a map that stays as it is; says what is new. A map that cannot be read does not show it."""
         before = localizer.state
-        located = self.slam.map_step(keyframe).located
+        located = self.located = self.slam.map_step(keyframe).located
         assert located is not None
         if located.unreadable and not self._unreadable:  # once a map, not with each keyframe
             self._log.error(located.registration.reason)
             self._unreadable = True
-        self._tell(before, located)
-
-    def _tell(self, before: State, located: LocalizationResult) -> None:
-        self.located = located
         if located.state is before:
             return
         if located.state is State.RELOCALIZED:
