@@ -43,20 +43,22 @@ DELIVERY = 5.0
 
 @dataclass(frozen=True)
 class Options:
-    """What is played, and how."""
+    """Publish a recording. Exit code 2 for one that cannot be read."""  # the help: typer takes a command from this
 
-    bag: Path
-    rate: float
-    start: float
-    duration: float | None
-    loop: bool
-    topics: tuple[str, ...]
-    wait: float
-    subscribers: int
-    clock: bool
-    log: Path | None
-    lockstep: bool = False
-    listener: str = ""
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap or .db3 file")]
+    rate: Annotated[float, typer.Option(help="speed, 1 is that of the recording", min=0.001)] = 1.0
+    start: Annotated[float, typer.Option(help="seconds to skip at the start", min=0)] = 0.0
+    duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None
+    loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False
+    topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None
+    wait: Annotated[float, typer.Option(help="longest wait for a subscriber to the clouds, s", min=0)] = 30.0
+    subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1
+    listener: Annotated[str, typer.Option("--for", help="only nodes of this name count, such as slam_node")] = ""
+    clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True
+    log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="no timing: each cloud after the dpm2/odom of the one before")
+    ] = False
 
 
 class BagPlayer:
@@ -71,7 +73,7 @@ class BagPlayer:
         if not options.bag.exists():
             raise UsageError(f"{options.bag}: no such file or folder")
         self._bag: Bag = open_bag(options.bag)
-        if missing := [topic for topic in options.topics if topic not in self._bag.types]:
+        if missing := [topic for topic in options.topics or () if topic not in self._bag.types]:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
         # A CameraInfo that was recorded once was latched.
         once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
@@ -292,40 +294,18 @@ class BagPlayer:
 def main(arguments: Sequence[str]) -> int:
     """`bag_player BAG [options] [--ros-args ...]`."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(_play)
+    app.command()(Options)
     ros_context(arguments)
+    nodes = list[Any]()
     try:
         own = remove_ros_args(["bag_player", *arguments])[1:]
-        return int(app(args=own, standalone_mode=False, prog_name="bag_player") or 0)
+        options = app(args=own, standalone_mode=False, prog_name="bag_player")
+        if not isinstance(options, Options):  # --help
+            return int(options or 0)
+        if options.lockstep and options.rate != 1.0:
+            raise UsageError("--lockstep goes as fast as the node: without --rate")
+        nodes.append(rclpy.create_node("bag_player"))
+        BagPlayer(nodes[0], options).play()
+        return 0
     finally:
-        end_ros()
-
-
-def _play(
-    bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap or .db3 file")],
-    rate: Annotated[float, typer.Option(help="speed, 1 is that of the recording", min=0.001)] = 1.0,
-    start: Annotated[float, typer.Option(help="seconds to skip at the start", min=0)] = 0.0,
-    duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False,
-    topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None,
-    wait: Annotated[float, typer.Option(help="longest wait for a subscriber to the clouds, s", min=0)] = 30.0,
-    subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1,
-    listener: Annotated[str, typer.Option("--for", help="only nodes of this name count, such as slam_node")] = "",
-    clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True,
-    log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None,
-    lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="no timing: each cloud after the dpm2/odom of the one before")
-    ] = False,
-) -> int:
-    """Publish a recording. Exit code 2 for one that cannot be read."""
-    if lockstep and rate != 1.0:
-        raise UsageError("--lockstep goes as fast as the node: without --rate")
-    node = rclpy.create_node("bag_player")
-    try:
-        options = Options(
-            bag, rate, start, duration, loop, tuple(topics or ()), wait, subscribers, clock, log, lockstep, listener
-        )
-        BagPlayer(node, options).play()
-    finally:
-        end_ros(node)
-    return 0
+        end_ros(*nodes)
