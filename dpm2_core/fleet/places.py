@@ -8,7 +8,6 @@ Using Hierarchical Navigable Small World Graphs", TPAMI 2020.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.extras import needs
-from dpm2_core.files import atomic_write, not_written, write_json
+from dpm2_core.files import atomic_write, write_json
 from dpm2_core.fleet.part import Advance, Figures, Part
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.store.check import check_map
@@ -27,8 +26,8 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
 _WORK = "dpm2_core.fleet.places:describe"
-_VECTORS = "places.npy"
-_INDEX, _ROWS, _LISTED = "index.faiss", "index.f32", "index.json"
+_PLACES, _VECTORS = "places", "places.npy"
+_INDEX, _LISTED = "index.faiss", "index.json"
 _LATE = 20_000
 """Places up to which each is compared: 100 keyframes cost 30 ms then, and 0.3 s to take them into the graph."""
 _LINKS, _BUILD, _SEARCH = 32, 80, 64
@@ -38,7 +37,7 @@ _LINKS, _BUILD, _SEARCH = 32, 80, 64
 def places_part(name: str, path: Path) -> Part:
     """The part that reads the places of a drive's map."""
     stat = path.stat()
-    return Part(f"places/{name}", _WORK, {"path": path, "version": [stat.st_size, stat.st_mtime_ns]}, fresh=True)
+    return Part(f"{_PLACES}/{name}", _WORK, {"path": path, "version": [stat.st_size, stat.st_mtime_ns]}, fresh=True)
 
 
 def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int]) -> Figures:
@@ -62,13 +61,13 @@ def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int])
     return {"keyframes": len(data), "weights": sorted({s.weights for s in data.sessions if s.weights})}
 
 
-def vectors_of(out: Path, part: Part) -> Vector:
-    """(N, 528) of a part that is done; zeros where a keyframe has none."""
-    return np.asarray(np.load(out / part.name / _VECTORS), np.float32)
+def vectors_of(out: Path, name: str) -> Vector:
+    """(N, 528) of a drive whose part is done; zeros where a keyframe has none."""
+    return np.asarray(np.load(out / _PLACES / name / _VECTORS), np.float32)
 
 
 class FleetIndex:
-    """The places of all drives in the order in which the drives came; kept in a folder.
+    """The places of all drives in the order in which the drives came; kept beside the vectors of each drive.
 
     Vectors are compared by their cosine, less the mean of those that came first: what all places share does not tell
     them apart. Places that came late are compared one by one, until they are worth their way into the graph: so a
@@ -80,9 +79,10 @@ class FleetIndex:
 
     drives: list[tuple[str, Sequence[int], int]]
     _graph: Any
+    _late: Vector
 
     def __init__(self, folder: Path) -> None:
-        """With what is in the folder, if it is whole."""
+        """With what is in the folder of the drives' places, if it is whole."""
         with needs("fleet", "the index of places"):
             import faiss
         self._faiss: Any = faiss
@@ -92,16 +92,24 @@ class FleetIndex:
             listed = json.loads((folder / _LISTED).read_text(encoding="utf-8"))
             drives: list[Any] = [(str(name), list(version), int(count)) for name, version, count in listed["drives"]]
             mean = np.array(listed["mean"], np.float32).reshape(WIDTH)
-            total = sum(count for *_, count in drives)
-            vectors = np.memmap(folder / _ROWS, np.float32, "r", shape=(total, WIDTH))
-        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+            graph = self._kept_graph(int(listed["linked"]))
+            begins = np.cumsum([0, *(count for *_, count in drives)]).tolist()
+            late = drives[begins.index(0 if graph is None else graph.ntotal) :]
+            vectors = [vectors_of(folder, name) for name, *_ in late]
+            if [each.shape for each in vectors] != [(count, WIDTH) for *_, count in late]:
+                return
+        except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError):
             return  # none, or one that is not whole: it is made anew
-        self.drives, self._mean, self._kept = drives, mean, total
-        with suppress(RuntimeError):  # none, or damaged: its places are compared one by one
-            graph = faiss.read_index(str(folder / _INDEX))
-            if graph.ntotal <= total and graph.d == WIDTH:
-                self._graph = graph
-        self._late = np.array(vectors[self._linked :])
+        self.drives, self._mean, self._graph = drives, mean, graph
+        self._late = np.concatenate([self._late, *(centered(each, mean) for each in vectors)])
+
+    def _kept_graph(self, linked: int) -> Any:
+        """The graph of so many places; None where it is none, another one, or damaged: then each is compared."""
+        with suppress(RuntimeError):
+            graph = self._faiss.read_index(str(self._folder / _INDEX)) if linked else None
+            if graph is not None and (graph.ntotal, graph.d) == (linked, WIDTH):
+                return graph
+        return None
 
     def clear(self) -> None:
         """Forget all, as where a drive has changed."""
@@ -109,8 +117,7 @@ class FleetIndex:
         self._mean = np.zeros(WIDTH, np.float32)
         self._graph = None
         self._late = np.zeros((0, WIDTH), np.float32)  # places after those in the graph
-        self._new: list[Vector] = []  # places that are not in the file yet
-        self._kept, self._relinked = 0, False  # places in the file; whether the graph differs from its file
+        self._relinked = False  # whether the graph differs from its file
 
     @property
     def _linked(self) -> int:
@@ -145,7 +152,6 @@ class FleetIndex:
             self._mean = vectors[vectors.any(1)].mean(0)
         rows = centered(vectors, self._mean)
         self.drives.append((name, list(version), len(vectors)))
-        self._new.append(rows)
         self._late = np.concatenate([self._late, rows])
         if len(self._late) > _LATE:
             self._link()
@@ -159,28 +165,14 @@ class FleetIndex:
         self._late, self._relinked = self._late[:0], True
 
     def save(self) -> None:
-        """Write what is new to its folder. What was there before stays usable until the last file has its name.
+        """Write to its folder what the vectors of the drives do not say.
 
         Raises:
-            Dpm2Error: it cannot be written.
+            Dpm2Error: it cannot be written. What was there before stays usable.
         """
-        rows = self._folder / _ROWS
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with rows.open("r+b" if self._kept else "wb") as file:
-                file.truncate(self._kept * WIDTH * 4)  # what a save that was cut short has left
-                file.seek(0, 2)
-                for vectors in self._new:
-                    file.write(vectors.tobytes())
-                file.flush()
-                os.fsync(file.fileno())
-            if self._graph is None:
-                (self._folder / _INDEX).unlink(missing_ok=True)
-        except OSError as error:
-            raise not_written(rows, error) from error
-        self._kept, self._new = self._kept + sum(map(len, self._new)), []
-        if self._graph is not None and self._relinked:
+        if self._relinked:
             with atomic_write(self._folder / _INDEX, "wb") as file:
                 file.write(self._faiss.serialize_index(self._graph).tobytes())
-        self._relinked = False
-        write_json(self._folder / _LISTED, {"drives": self.drives, "mean": self._mean.tolist()})
+            self._relinked = False
+        listed = {"drives": self.drives, "mean": self._mean.tolist(), "linked": self._linked}
+        write_json(self._folder / _LISTED, listed)

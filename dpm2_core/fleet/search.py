@@ -93,7 +93,7 @@ class Search:
             index.clear()  # a drive is gone, or another one by now; or what was found for it is gone
         new = [name for name in parts if name not in {known for known, *_ in index.drives}]
         for name in new:
-            vectors = vectors_of(self.kept, parts[name])
+            vectors = vectors_of(self.kept, name)
             write_json(self._candidates(name), _candidates(index, vectors))
             index.add(name, versions[name], vectors)
         if new:

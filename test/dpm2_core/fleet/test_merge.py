@@ -26,6 +26,7 @@ from dpm2_core.fleet.regions import Join
 from dpm2_core.fleet.run import View, carry_out
 from dpm2_core.fleet.search import Search
 from dpm2_core.sim.world import build_world
+from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, append_map, load_map, save_as
@@ -268,6 +269,13 @@ def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tm
     assert joined()[0] == ["a", "b", "c"]
 
 
+def describe_as(folder: Path, name: str, vectors: Vector) -> Vector:
+    """Leave the vectors of a drive's places where its part does."""
+    (folder / "places" / name).mkdir(parents=True)
+    np.save(folder / "places" / name / "places.npy", vectors)
+    return vectors
+
+
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
     """Also after one that was cut short, which counts as none."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
@@ -277,13 +285,14 @@ def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise:
     index = FleetIndex(tmp_path)
     assert (index.similar(again, 3) == -1).all()
     for name, vectors in zip("ab", drives, strict=True):
-        index.add(name, [1, 2], vectors)
+        index.add(name, [1, 2], describe_as(tmp_path, name, vectors))
     index.save()
     kept = FleetIndex(tmp_path)
     assert kept.drives == [("a", [1, 2], 50), ("b", [1, 2], 50)]
     np.testing.assert_array_equal(kept.similar(again, 3)[:, 0], np.arange(50))
     assert (kept.similar(drives[1], 3)[7] == -1).all()
-    (tmp_path / "index.f32").write_bytes((tmp_path / "index.f32").read_bytes()[:1000])
+    file = tmp_path / "places" / "b" / "places.npy"
+    file.write_bytes(file.read_bytes()[:1000])
     assert not FleetIndex(tmp_path).drives
 
 
@@ -292,9 +301,8 @@ def test_candidates_that_are_gone_are_looked_for_anew(tmp_path: Path, noise: np.
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     search = Search(tmp_path, SlamSettings(), Cluster(), View())
     parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}) for name in "ab"}
-    for part in parts.values():
-        (search.kept / part.name).mkdir(parents=True)
-        np.save(search.kept / part.name / "places.npy", noise.normal(size=(50, WIDTH)).astype(np.float32))
+    for name in parts:
+        describe_as(search.kept, name, noise.normal(size=(50, WIDTH)).astype(np.float32))
     search.index(parts)
     file = search.kept / "candidates" / "b.json"
     found = file.read_text()
@@ -325,21 +333,23 @@ def test_late_places_and_those_in_the_graph_are_found_alike(
         rows = index.similar(again[0], 40)
         assert all(len(set(row)) == 40 for row in rows.tolist())  # none is found twice
 
-    index = FleetIndex(tmp_path)
-    for number in range(4):
-        index.add(f"d{number}", [0], drives[number])
+    index, file, listed = FleetIndex(tmp_path), tmp_path / "index.json", b""
+    for number, vectors in enumerate(drives[:4]):
+        index.add(f"d{number}", [0], describe_as(tmp_path, f"d{number}", vectors))
         index.save()
-        index = FleetIndex(tmp_path)
+        if number == 2:
+            whole = file.read_bytes()
+            file.write_bytes(listed)  # as by one that was killed when the graph was written, and not the list
+            index = FleetIndex(tmp_path)
+            assert len(index.drives) == 2
+            check(index, 2)
+            file.write_bytes(whole)
+        index, listed = FleetIndex(tmp_path), file.read_bytes()
         if number > 1:
             check(index, number + 1)
     graph = (tmp_path / "index.faiss").read_bytes()
-    index.add("d4", [0], drives[4])
+    index.add("d4", [0], describe_as(tmp_path, "d4", drives[4]))
     check(index, 5)
-    with (tmp_path / "index.f32").open("ab") as file:
-        file.write(bytes(1234))  # by one that was killed
-    index = FleetIndex(tmp_path)
-    assert len(index.drives) == 4
-    index.add("d4", [0], drives[4])
     index.save()
     check(FleetIndex(tmp_path), 5)
     for damaged in (graph[:1000], b""):
