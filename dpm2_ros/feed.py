@@ -56,7 +56,6 @@ class Feed:
         self._robot = namespace.strip("/")
         self.opened = -float("inf")
         self._streams: dict[str, Stream] = {}  # by session, the one that was heard last at the end
-        self._main: Stream | None = None
         self._acks = 0
         self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
         self._pose_topic = namespace + ODOM
@@ -161,7 +160,7 @@ class Feed:
             raise
         if stream.put(id, part, value):
             self._hand_on(stream, time.monotonic())
-        if stream is not self._main and stream.holds:
+        if stream.robot != self._robot and stream.holds:
             self._bound()
 
     def _usable(self, message: PointCloud2, id: int) -> Descriptors | None:
@@ -191,7 +190,7 @@ class Feed:
         stream.hear(now, live)
         while len(self._streams) > _STREAMS:
             unknown = (s for s in self._streams.values() if not s.taken)
-            oldest = next(unknown, None) or next(s for s in self._streams.values() if s is not self._main)
+            oldest = next(unknown, None) or next(s for s in self._streams.values() if s.robot != self._robot)
             del self._streams[oldest.session]
         if session and stream.robot is None and now - stream.acknowledged > 0.4 and self._acks < _ACKS:
             self._acks += 1
@@ -200,7 +199,7 @@ class Feed:
 
     def _bound(self) -> None:
         """Unknown drives may not fill the memory: those whose last message is oldest are dropped."""
-        held = {session: s.holds for session, s in self._streams.items() if s is not self._main}
+        held = {session: s.holds for session, s in self._streams.items() if s.robot != self._robot}
         total = sum(held.values())
         for session, size in held.items():
             if total <= _HELD:
@@ -218,15 +217,15 @@ class Feed:
 
     def _place(self, stream: Stream, now: float) -> bool:
         """Whose drive it is, if that is certain: the robot's, or that of another one in the same namespace."""
-        main, name = self._main, self._robot or "/"
+        main, name = self.robots.get(self._robot), self._robot or "/"
         if not stream.ready:
             return False
-        if main is None or main is stream or not main.live or now - main.heard > SILENT:
-            if main is not None and main is not stream:
+        if main is None or not main.live or now - main.heard > SILENT:
+            if main is not None:
                 self._node.get_logger().warning(f"robot {name} has started again: a new session of its own")
                 main.replaced()
                 self._mapper.restart(self._robot)
-            self._main, stream.robot = stream, self._robot
+            stream.robot = self._robot
             return True
         if main.heard < stream.since + BESIDE:
             return False
