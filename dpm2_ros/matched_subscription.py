@@ -33,11 +33,10 @@ class MatchedSubscription:
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
-        self._node, self._kind, self._wanted, self._callback = node, kind, kind, callback
+        self._node, self._wanted, self._callback = node, kind, callback
         self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
         self._given, self.topic = topic, node.resolve_topic_name(topic)
-        self.reliability = ReliabilityPolicy.RELIABLE
-        self._durability = DurabilityPolicy.VOLATILE
+        self._suits = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, kind
         self._subscription: Any = None
         self.problem = ""
         self.refresh()
@@ -48,7 +47,7 @@ class MatchedSubscription:
 
     def refresh(self) -> None:
         """Follow the publishers of this moment."""
-        requested, offered = self.reliability, self._node.get_publishers_info_by_topic(self.topic)
+        requested, offered = self._suits[0], self._node.get_publishers_info_by_topic(self.topic)
         best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
         if self._setting != "auto":
             requested = ReliabilityPolicy[self._setting.upper()]
@@ -61,12 +60,11 @@ class MatchedSubscription:
         kind = self._kind_of({info.topic_type for info in offered})
         if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
             self.problem = f"{self.topic} is best effort, ros.reliability asks for reliable"
-        now = self.reliability, self._durability, self._kind
-        if self._subscription is not None and (requested, durability, kind) == now:
+        now, self._suits = self._suits, (requested, durability, kind)
+        if self._subscription is not None and self._suits == now:
             return
-        before, other_type = self._subscription, kind is not self._kind
-        self.reliability, self._durability = requested, durability
-        self._kind, raw = kind, self._wanted is PointCloud2 and kind is not PointCloud2
+        before, other_type = self._subscription, kind is not now[2]
+        raw = self._wanted is PointCloud2 and kind is not PointCloud2
         if before is not None and other_type:  # DDS allows one type a topic
             self._node.destroy_subscription(before)
         keep = HistoryPolicy.KEEP_LAST

@@ -62,10 +62,8 @@ class Diagnostics:
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
         known = self._inputs.calibration
-        if known.camera is not None:
-            out.append(self._beside("camera", "image", known.camera.topic))
-        if known.second_camera is not None:
-            out.append(self._beside("second camera", "image", known.second_camera.topic))
+        for part, camera in zip(("camera", "second camera"), known.cameras, strict=False):
+            out.append(self._beside(part, "image", camera.topic))
         if known.second_topic:
             out.append(self._beside("second lidar", "cloud", known.second_topic))
         if (imu := self._imu()) is not None:
