@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of `make dist` as a user gets them: installed into fresh environments, and the programs started there.
 
-python -m tools.check_dist DIST [EXTRA...]: wheel and sdist with the base install, then the wheel with each extra.
+`python -m tools.check_dist`: wheel and sdist with the base install, then the wheel with each extra.
 """
 
 from __future__ import annotations
@@ -11,8 +11,12 @@ import sys
 import tempfile
 import venv
 from pathlib import Path
+from typing import Annotated
 
-from dpm2_core.errors import UsageError, exit_code
+import typer
+
+from dpm2_core.commands.options import run_command
+from dpm2_core.errors import UsageError
 
 PROGRAMS = (("dpm2", "version"), ("dpm2", "config", "dump"), ("dpm2", "doctor", "--no-test"))
 NODES = ("slam_node", "mapper_node", "bag_player")
@@ -45,22 +49,18 @@ def _torch() -> str:
     return str(torch.__version__).partition("+")[0]
 
 
-def main() -> int:
-    """Check what is named."""
-
-    def work() -> None:
-        if len(sys.argv) < 2:
-            raise UsageError("usage: python -m tools.check_dist DIST [EXTRA...]")
-        folder = Path(sys.argv[1]).resolve()
-        wheels, sdists = sorted(folder.glob("*.whl")), sorted(folder.glob("*.tar.gz"))
-        if len(wheels) != 1 or len(sdists) != 1:
-            raise UsageError(f"{folder}: want one wheel and one sdist; `make dist` makes them")
-        with tempfile.TemporaryDirectory() as place:
-            for distribution, extra in [(wheels[0], ""), (sdists[0], ""), *((wheels[0], e) for e in sys.argv[2:])]:
-                check(distribution, extra, Path(place))
-
-    return exit_code(work)
+def check_all(
+    dist: Annotated[Path, typer.Argument(help="Folder that `make dist` made.")],
+    extras: Annotated[list[str] | None, typer.Argument(metavar="EXTRA...")] = None,
+) -> None:
+    """Check the wheel and the sdist of a folder."""
+    wheels, sdists = sorted(dist.resolve().glob("*.whl")), sorted(dist.resolve().glob("*.tar.gz"))
+    if len(wheels) != 1 or len(sdists) != 1:
+        raise UsageError(f"{dist}: want one wheel and one sdist; `make dist` makes them")
+    with tempfile.TemporaryDirectory() as place:
+        for distribution, extra in [(wheels[0], ""), (sdists[0], ""), *((wheels[0], name) for name in extras or ())]:
+            check(distribution, extra, Path(place))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(check_all))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The moving picture of the README: python -m tools.make_picture OUT.png DRIVE... (APNG; `make picture`).
+"""The moving picture of the README (APNG; `make picture`).
 
 Each drive goes through the SLAM; what is drawn is the map as it grows, seen from above, and the way. No data of a drive
 but this view of it gets into the picture.
@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
+from dpm2_core.commands.options import run_command
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.errors import Dpm2Error, UsageError, exit_code
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write
 from dpm2_core.geometry import se3
@@ -119,20 +122,17 @@ def write_apng(path: Path, images: list[Picture]) -> None:
             raise Dpm2Error(f"{path}: {file.tell() / 1e6:.1f} MB, more than {MOST / 1e6:g}")
 
 
-def main() -> int:
+def make_picture(
+    out: Annotated[Path, typer.Argument(metavar="OUT.png")],
+    drives: Annotated[list[str], typer.Argument(metavar="[TITLE=]DRIVE...")],
+) -> None:
     """Drives beside each other."""
-
-    def work() -> None:
-        if len(sys.argv) < 3:
-            raise UsageError("usage: python -m tools.make_picture OUT.png TITLE=DRIVE...")
-        parts = []
-        for argument in sys.argv[2:]:
-            title, _, drive = argument.rpartition("=")
-            parts.append(moments(Path(drive), title or Path(drive).name))
-        write_apng(Path(sys.argv[1]), [np.hstack(images) for images in zip(*parts, strict=True)])
-
-    return exit_code(work)
+    parts = []
+    for argument in drives:
+        title, _, drive = argument.rpartition("=")
+        parts.append(moments(Path(drive), title or Path(drive).name))
+    write_apng(out, [np.hstack(images) for images in zip(*parts, strict=True)])
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(make_picture))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records that stand on the weights, measured again: python -m tools.measure [NAME...] (`make measure`).
+"""Records that stand on the weights, measured again (`make measure`).
 
 What was stopped goes on: a record is whole if the code has not changed since the commit that it names.
 """
@@ -11,8 +11,12 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from dpm2_core.errors import Dpm2Error, UsageError, exit_code
+import typer
+
+from dpm2_core.commands.options import run_command
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, git_commit
 
 RECORDS = REPOSITORY / "benchmarks"
@@ -56,17 +60,12 @@ def _is_current(commit: str | None) -> bool:
     return commit is not None and not subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode
 
 
-def main(names: Sequence[str]) -> None:
-    """Measure what is left, one after the other.
-
-    Raises:
-        UsageError: the checkout has changes that no commit has, or a name is wrong.
-        Dpm2Error: a benchmark failed.
-    """
+def measure(names: Annotated[list[str] | None, typer.Argument(help="Records; all without.")] = None) -> None:
+    """Measure what is left, one after the other."""
     commit = git_commit()
     if commit is None or commit.endswith("+"):
         raise UsageError("a record names the commit that it is of: commit what has changed first")
-    for name in remaining(names):
+    for name in remaining(names or ()):
         print(f"{name}: at {measured_at(RECORDS / f'{name}.json') or 'no commit'}, measured again", flush=True)
         bench = [sys.executable, "-m", "dpm2_core.cli", "bench", name, *COMMANDS.get(name, ())]
         command = ["make", TARGETS[name]] if name in TARGETS else bench
@@ -75,4 +74,4 @@ def main(names: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(lambda: main(sys.argv[1:])))
+    sys.exit(run_command(measure))
