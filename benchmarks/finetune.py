@@ -28,7 +28,7 @@ from dpm2_core.network.weights import load_model
 from dpm2_core.sim.drive import simulate
 from dpm2_core.sim.settings import DriveConfig, LidarConfig, PresetName
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import record_table
 
 LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)
 """32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights know 64 from +2 to -24.8 deg, at 1.5 to 2 m."""
@@ -82,7 +82,7 @@ def bench_finetune(options: Options) -> Report:
             out = folder / f"{variant}_{seed}_{digest[:8]}"
             run = _run(settings, folder / "data", out, validations)
             runs[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
-            write_report(path, "finetune", report(results, chosen, digest), options)
+            write_report(path, report(results, chosen, digest), options)
     return report(results, chosen, digest)
 
 
@@ -152,15 +152,11 @@ def report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> 
             }
             for name in UNSEEN
         }
-    figures = ("up to 5 m", "5 to 20 m", "all", "deg", "success")
-    title = "Median errors of pairs in unseen worlds, m"
-    table = FigureTable(title, names=["losses", "seed", "LiDAR"], figures=figures)
-    lines = [("before", "", before)]
-    lines += [(variant, seed, run["after"]) for variant, seeds in runs.items() for seed, run in seeds.items()]
-    for variant, seed, measured in lines:
-        for name, row in measured.items():
-            cells = [f"{row[figure]:.4f}" for figure in _MEDIANS]
-            table.add_row(variant, seed, name, *cells, f"{row['success']:.1%}")
+    columns = dict(zip(("up to 5 m", "5 to 20 m", "all", "deg"), (f"{{{name}:.4f}}" for name in _MEDIANS), strict=True))
+    rows = {"before": {"": before}}
+    rows |= {variant: {seed: run["after"] for seed, run in seeds.items()} for variant, seeds in runs.items()}
+    table = record_table("Median errors of pairs in unseen worlds, m", ["losses", "seed", "LiDAR"],
+                         columns | {"success": "{success:.1%}"}, rows)  # fmt: skip
     record = {
         "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
         "settings": settings.model_dump(mode="json"), "weights_sha256": digest, "pairs": results.get("pairs"),

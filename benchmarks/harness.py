@@ -168,10 +168,10 @@ def torch_threads(number: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def write_report(path: Path, name: str, report: Report, options: Options, program: str = "dpm2") -> None:
+def write_report(path: Path, report: Report, options: Options, program: str = "dpm2") -> None:
     """The results of a benchmark; see `write_record`."""
     results = {"overrides": list(options.overrides), **report.results}
-    write_record(path, name, results, program, options.threads)
+    write_record(path, results, program, options.threads)
 
 
 def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def bench_neural(options: Options) -> Report:
             parts[name] = {"commit": git_commit(), "seconds": round(perf_counter() - started, 1), **found}
             parts = {known: parts[known] for known in PARTS if known in parts}
             report = Report({**same, "parts": parts}, view(parts))
-            write_report(path, "neural", report, options)
+            write_report(path, report, options)
             if name == "image":
                 title = "Highway and tunnel, pairs without a prior"
                 success_png(options.out / "neural_image.png", found["pairs"], title)

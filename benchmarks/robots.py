@@ -35,7 +35,7 @@ from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import record_table
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
 from dpm2_ros.runtime import end_ros, ros_context
 from tools.replay import ros_environment, start, stop
@@ -121,13 +121,10 @@ def bench(
         "single_robot_ape_rmse_m": alone,
         "robots": robots,
     }
-    write_record(out / "robots.json", "robots", results, "python -m benchmarks.robots")
-    columns = list(next(iter(robots.values())))
+    write_record(out / "robots.json", results, "python -m benchmarks.robots")
     title = f"{maps} map, APE {_rms(errors):.3f} m; of one robot alone {alone:.3f} m"
-    table = FigureTable(title, names=["robot"], figures=columns)
-    for name, row in robots.items():
-        table.add_row(name, *(f"{row[column]:.4g}" for column in columns))
-    Console().print(table)
+    columns = {name: f"{{{name}:.4g}}" for name in ("keyframes", "keyframes_missing", "ape_rmse_m")}
+    Console().print(record_table(title, ["robot"], columns, robots))
     return 1 if maps > 1 or any(row["keyframes_missing"] for row in robots.values()) else 0
 
 

@@ -22,7 +22,7 @@ from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import record_table
 from tools.demo import Outcome, evaluate_replay
 from tools.replay import replay
 
@@ -57,14 +57,9 @@ def bench(
                     played = replay(source, work, parameters=parameters, watched=watched)
                     runs[name].append(evaluate_replay(source, played, work))
             results |= {f"{title}{name}": _figures(of) for name, of in runs.items()}
-    table = FigureTable(
-        "Bag -> bag_player -> slam_node -> /dpm2/odom", names=["drive"], figures=[*FIGURES, "failed checks"]
-    )
-    for name, row in results.items():
-        table.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row.values()))
-    write_report(
-        out / "ros.json", "ros", Report({"drives": results}, Group(table)), options, "python -m benchmarks.ros"
-    )
+    columns = {name: f"{{{name}:.4g}}" for name in FIGURES} | {"failed checks": "{failed_checks:.4g}"}
+    table = record_table("Bag -> bag_player -> slam_node -> /dpm2/odom", ["drive"], columns, results)
+    write_report(out / "ros.json", Report({"drives": results}, Group(table)), options, "python -m benchmarks.ros")
     Console().print(table)
     return 1 if any(row["failed_checks"] for row in results.values()) else 0
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from dpm2_core.frame import Array
+
 RANGES = (5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 75.0)
 """Edges of the bins of distance, m."""
 _START = 0.02  # rad, how far off azimuth 0 a ring may begin

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +15,7 @@ from benchmarks.scan_statistics import RANGES, statistics
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import HDL64E, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, cells_of
 
 _SCANS = 20
 _SEEDS = (900_500, 900_501)
@@ -73,22 +72,23 @@ def _figure(options: Options, results: dict[str, Any]) -> None:
     lines_png(options.out / "sensor.png", panels, "A real LiDAR (KITTI) and the simulated one")
 
 
+_ROWS = {
+    "points": "points",
+    "gap between upper rings, deviation, deg": "ring_gap_deg[0][1]",
+    "gap between lower rings, deviation, deg": "ring_gap_deg[1][1]",
+    "origin of the upper beams over the sensor's, m": "upper_origin_m",
+    "elevation beside that, deviation, deg": "wobble_deg",
+    "mean of a ring over the ground, deviation, m": "ring_bias_m",
+    "noise along a ring at 10 to 15 m, m": "ring_range_noise_m[1]",
+    "at 30 to 45 m, m": "ring_range_noise_m[4]",
+    "lost at 5 to 10 m": "lost[0]",
+    "lost at 45 to 75 m": "lost[5]",
+    "intensity 0": "intensity[zeros]",
+}
+
+
 def _table(results: dict[str, Any]) -> FigureTable:
-    names = list(results)
-    table = FigureTable("The sensor's own errors", names=["figure"], figures=names)
-    rows: list[tuple[str, Sequence[Any]]] = [
-        ("points", [results[n]["points"] for n in names]),
-        ("gap between upper rings, deviation, deg", [results[n]["ring_gap_deg"][0][1] for n in names]),
-        ("gap between lower rings, deviation, deg", [results[n]["ring_gap_deg"][1][1] for n in names]),
-        ("origin of the upper beams over the sensor's, m", [results[n]["upper_origin_m"] for n in names]),
-        ("elevation beside that, deviation, deg", [results[n]["wobble_deg"] for n in names]),
-        ("mean of a ring over the ground, deviation, m", [results[n]["ring_bias_m"] for n in names]),
-        ("noise along a ring at 10 to 15 m, m", [results[n]["ring_range_noise_m"][1] for n in names]),
-        ("at 30 to 45 m, m", [results[n]["ring_range_noise_m"][4] for n in names]),
-        ("lost at 5 to 10 m", [results[n]["lost"][0] for n in names]),
-        ("lost at 45 to 75 m", [results[n]["lost"][5] for n in names]),
-        ("intensity 0", [results[n]["intensity"]["zeros"] for n in names]),
-    ]
-    for name, values in rows:
-        table.add_row(name, *("-" if value is None else f"{value:.3g}" for value in values))
+    table = FigureTable("The sensor's own errors", names=["figure"], figures=list(results))
+    for name, figure in _ROWS.items():
+        table.add_row(name, *(cells_of(of, [f"{{{figure}:.3g}}"])[0] for of in results.values()))
     return table

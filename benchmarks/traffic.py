@@ -72,7 +72,7 @@ def bench_traffic(options: Options) -> Report:
                 settings = settings_of(options, f"slam.registration={registration}")
                 found = {m: _run(scans, truth, settings, m) for m in methods}
                 runs[registration] = runs.get(registration, {}) | found
-                write_report(path, "traffic", _report(drives, options), options)
+                write_report(path, _report(drives, options), options)
     return _report(drives, options)
 
 

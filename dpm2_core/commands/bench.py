@@ -63,7 +63,7 @@ def bench(
     for name in names:
         report = BENCHES[name].run(options)
         path = out / f"{name}.json"
-        write_report(path, name, report, options)
+        write_report(path, report, options)
         Console().print(report.view, f"written to {path}")
 
 

@@ -180,7 +180,7 @@ def ablation(
     found = compare(chosen, out)
     results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
     report = out / "ablation.json"
-    write_record(report, "ablation", results)
+    write_record(report, results)
     for table in ablation_tables(found):
         Console().print(table)
     Console().print(f"written to {report}")

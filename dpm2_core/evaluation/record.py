@@ -18,14 +18,14 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
-def write_record(path: Path, name: str, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
-    """Results with everything that is needed to assess and repeat them, as JSON.
+def write_record(path: Path, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
+    """Results with everything that is needed to assess and repeat them, as JSON; the file has the benchmark's name.
 
     Raises:
         Dpm2Error: the file could not be written.
     """
     record = {
-        "benchmark": name,
+        "benchmark": path.stem,
         "command": shlex.join([*program.split(), *sys.argv[1:]]),
         "commit": git_commit(),
         "machine": {"processor": _processor(), "cpus": os.cpu_count(), "threads": threads},

@@ -121,7 +121,7 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome
     commits = sorted({str(part["part"]["commit"]) for part in figures.values()})
     if len(commits) > 1:
         outcome.notes.append(f"parts were made at several commits: {', '.join(commits)}")
-    write_record(request.out / f"{name}.json", name, _record(request, outcome, figures), threads=request.workers)
+    write_record(request.out / f"{name}.json", _record(request, outcome, figures), threads=request.workers)
     tables = [html_table(table.record()) for table in outcome.tables]
     runs = [(f"{row}, {sequence}", path) for sequence, of in outcome.runs.items() for row, path in of.items()]
     with atomic_write(request.out / f"{name}.html") as file:

@@ -36,7 +36,7 @@ def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_p
     found = report.results["ratios"]["both"]["new"]["all_m"]
     assert found == {"mean": pytest.approx(0.7), "spread": pytest.approx(0.1), "seeds": 2}
     path = tmp_path / "finetune.json"
-    write_report(path, "finetune", report, options)
+    write_report(path, report, options)
     same = {"settings": settings.model_dump(mode="json"), "weights_sha256": "digest"}
     assert {key: earlier(path, key, **same) for key in results} == results
     other = {**same, "settings": FinetuneSettings(radius=3.0).model_dump(mode="json")}
