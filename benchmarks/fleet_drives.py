@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.data.trajectory import read_trajectory, write_kitti
+from dpm2_core.data.trajectory import arc_lengths, read_trajectory, write_kitti
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.part import DONE
@@ -37,7 +37,7 @@ def chained(files: Sequence[Path], meters: float, out: Path) -> None:
     parts, T_way_road = [], np.eye(4)
     for file in files:
         poses = read_trajectory(file).poses
-        far = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+        far = arc_lengths(poses[:, :3, 3])
         part = T_way_road @ se3.inverse(poses[0]) @ poses[far < meters]
         parts.append(part[:-1])
         T_way_road = part[-1]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.estimates import Edge
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -65,7 +66,7 @@ def error_of(loop: Edge, truth: Array) -> tuple[float, float]:
 def revisits(truth: Array) -> dict[str, set[int]]:
     """The keyframes that come back to an earlier place, by their heading there; (N, 4, 4) true poses."""
     positions = truth[:, :3, 3]
-    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    path = arc_lengths(positions)
     heading = np.arctan2(truth[:, 1, 0], truth[:, 0, 0])
     kinds: dict[str, set[int]] = {"same": set(), "reverse": set(), "cross": set()}
     for node in range(len(truth)):

@@ -12,6 +12,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from benchmarks.loops import check_loops
+from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.sim.simulated_drive import SimulatedDrive
@@ -65,7 +66,7 @@ def bench_paper(options: Options) -> Report:
 def _lap() -> SimulatedDrive:
     """Round a block, and on into the street where it began."""
     drive = SimulatedDrive("loop", "suburb", 950_000, "suburb")
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drive.poses[:, :3, 3], axis=0), axis=1))])
+    way = arc_lengths(drive.poses[:, :3, 3])
     again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
     lap = way[(way > 50) & (again < 10)]
     end = int(np.searchsorted(way, _LAPS * lap[0])) if len(lap) else len(way)

@@ -222,6 +222,11 @@ def stamps_of(numbers: Keys) -> Keys:
     return numbers * round(FRAME_PERIOD * 1e9)
 
 
+def arc_lengths(positions: Array) -> Array:
+    """(N,) m along a line of positions (N, 2+), from its first."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+
+
 def frame_period(stamps: Keys | Sequence[int]) -> float:
     """Median time from one of these stamps (N,) ns to the next, s; that of KITTI's frames where there are too few."""
     return float(np.median(np.diff(np.asarray(stamps)))) * 1e-9 if len(stamps) > 1 else FRAME_PERIOD

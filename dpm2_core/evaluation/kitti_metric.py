@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data.trajectory import Keys, frame_period, stamps_of
+from dpm2_core.data.trajectory import Keys, arc_lengths, frame_period, stamps_of
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -64,8 +64,9 @@ def segment_errors(
     at = np.flatnonzero(known(gt))  # position of each true pose among the frames
     gt, est = gt[at], est[at]
     step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(gt[:, :3, 3], axis=0), axis=1))])
-    first, length = (grid.ravel() for grid in np.meshgrid(np.arange(0, len(gt), step), lengths, indexing="ij"))
+    travelled = arc_lengths(gt[:, :3, 3])
+    starts = np.arange(0, len(gt), step)
+    first, length = starts.repeat(len(lengths)), np.tile(np.array(lengths, np.float64), len(starts))
     last = np.searchsorted(travelled, travelled[first] + length, side="right")  # the first frame beyond the length
     whole = last < len(gt)
     first, last, length = first[whole], last[whole], length[whole]

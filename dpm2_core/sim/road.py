@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from dpm2_core.data.text import read_numbers
-from dpm2_core.data.trajectory import FRAME_PERIOD
+from dpm2_core.data.trajectory import FRAME_PERIOD, arc_lengths
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.sim.floorplan import FloorPlan, car_park, office
@@ -266,11 +266,6 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     slip = position[:, 3] - np.interp(travelled, drive.s, drive.yaw)
     slip = np.remainder(slip + np.pi, 2 * np.pi) - np.pi
     return Road([*streets, *sides], len(streets), drive, times, travelled, heights, slip)
-
-
-def arc_lengths(xy: Array) -> Array:
-    """(N,) m along a line of points (N, 2+), from its first."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
 
 
 def _first_visits(xy: Array) -> Iterator[tuple[int, int]]:

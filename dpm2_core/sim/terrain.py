@@ -18,11 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
+from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array
 from dpm2_core.sim.materials import Label, Material
 from dpm2_core.sim.mesh import Mesh, make, merge
-from dpm2_core.sim.road import Road, arc_lengths
+from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import Preset
 
 RESOLUTION = 0.5
