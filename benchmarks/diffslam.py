@@ -56,7 +56,7 @@ def street_scans() -> tuple[list[Tensor], Tensor]:
     """Eight scans (N, 3) of a drive, traffic included, and their exact trajectory (8, 4, 4)."""
     world, lidar = build_world("straight", "suburb", seed=8, length=100.0), Lidar()
     times = 2.0 + 0.1 * np.arange(SCANS)
-    poses = np.stack([world.drive_pose(float(t), lidar.config.height) for t in times])
+    poses = np.stack([lidar.pose(world, float(t)) for t in times])
     scans = [
         lidar.scan(world, T, float(t), np.random.default_rng(i)).points[:, :3]
         for i, (T, t) in enumerate(zip(poses, times, strict=True))

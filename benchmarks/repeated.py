@@ -56,13 +56,12 @@ def _simulated(kind: PresetName, network: NetworkSettings) -> tuple[list[Frame],
     config, camera = real_sensor(LidarConfig()), training_camera(network)
     if kind == "indoor":
         config = config.model_copy(update={"height": 1.0, "car_body": False, "min_range": 0.4})
-    world, lidar, sway = build_world("random", kind, _SEED, 200.0), Lidar(config), config.real.sway
+    world, lidar = build_world("random", kind, _SEED, 200.0), Lidar(config)
     view, frames, poses = calibration(camera), [], []
     for i in range(_FRAMES):
         time, noise = 0.1 * i if kind != "indoor" else 0.5 * i, np.random.default_rng([_SEED, i])  # at 1.2 m/s
-        T = world.drive_pose(time, config.height, sway)
-        points = lidar.drive_scan(world, T, time, noise).points
-        poses.append(T @ lidar.T_level_lidar)
+        poses.append(lidar.pose(world, time))
+        points = lidar.drive_scan(world, poses[-1], time, noise).points
         pixels = render(world, camera, poses[-1] @ view.T_lidar_cam, time, noise)
         frames.append(Frame(i, points, images=(Image(pixels, view),)))
     return frames, np.stack(poses)

@@ -44,14 +44,12 @@ def bench_sensor(options: Options) -> Report:
 
 def _simulated(config: LidarConfig) -> list[np.ndarray]:
     """Scans of drives in towns, as the drives of the excerpts are."""
-    lidar, sway = Lidar(config), config.real.sway
-    out = []
+    lidar, out = Lidar(config), []
     for kind in _KINDS:
         for seed in _SEEDS:
             world, rng = build_world("random", kind, seed, 300.0), np.random.default_rng(seed)
-            for time in np.linspace(0, 15, _SCANS // (len(_KINDS) * len(_SEEDS))):
-                T = world.drive_pose(float(time), config.height, sway)
-                out.append(lidar.drive_scan(world, T, float(time), rng).points)
+            for time in np.linspace(0, 15, _SCANS // (len(_KINDS) * len(_SEEDS))).tolist():
+                out.append(lidar.drive_scan(world, lidar.pose(world, time), time, rng).points)
     return out
 
 

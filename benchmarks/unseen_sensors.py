@@ -71,7 +71,7 @@ def drive(
     for _ in range(scans):
         T, time = world.sample_pose(noise, height=height, sway=sway)
         own = np.random.default_rng([seed, len(samples)])
-        scan = lidar.drive_scan(world, T, time, own)
+        scan = lidar.drive_scan(world, T @ lidar.T_level_lidar, time, own)
         level = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)
         samples.append(Sample(crop(level, network.points), T, ()))
     write_packed(folder, samples, {"source": "synthetic city", "preset": place, "seed": seed})

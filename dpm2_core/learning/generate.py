@@ -91,7 +91,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     samples, scale = list[Sample](), ROOM_SCALE if PRESETS[kind].indoor == "rooms" else 1.0
     for _ in range(settings.frames):
         T, time = world.sample_pose(noise, height=height, sway=sway)
-        scan = lidar.drive_scan(world, T, time, noise)
+        scan = lidar.drive_scan(world, T @ lidar.T_level_lidar, time, noise)
         points = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)  # what the network is given
         images: tuple[Image, ...] = ()
         if settings.images:

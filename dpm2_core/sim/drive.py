@@ -135,10 +135,8 @@ class _Drive:
         self.imu = None if drive.imu is None else Imu(drive.imu, np.random.default_rng([world.seed, _IMU_STREAM]))
         rng = np.random.default_rng([world.seed, _GNSS_STREAM])
         self.gnss = None if drive.gnss is None else Receiver(drive.gnss, rng)
-        self.times = np.arange(_frames(drive)) * FRAME_PERIOD
-        height, sway = drive.lidar.height, drive.lidar.real.sway
-        self.T_world_level = np.stack([world.drive_pose(t, height, sway) for t in self.times])
-        self.T_world_lidar = self.T_world_level @ self.lidar.T_level_lidar
+        self.times = np.arange(_frames(drive), dtype=np.float64) * FRAME_PERIOD
+        self.T_world_lidar = self._poses(self.times)
         color = calibration(drive.camera)
         # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
         T_level_cam0 = color.T_lidar_cam.copy()
@@ -168,7 +166,7 @@ class _Drive:
     def _write_frame(self, sequence: Path, i: int) -> None:
         world, time, T = self.world, float(self.times[i]), self.T_world_lidar[i]
         rng = np.random.default_rng([world.seed, _LIDAR_STREAM, i])
-        scan = self.lidar.drive_scan(world, self.T_world_level[i], time, rng)
+        scan = self.lidar.drive_scan(world, T, time, rng)
         scan.points.tofile(sequence / "velodyne" / f"{i:06d}.bin")
         scan.label.tofile(sequence / "labels" / f"{i:06d}.label")
         scan.static.tofile(sequence / "static" / f"{i:06d}.bin")
@@ -212,9 +210,7 @@ class _Drive:
 
     def _poses(self, times: Array) -> Array:
         """T_world_lidar (K, 4, 4) at times (K,) s."""
-        height, sway = self.lidar.config.height, self.lidar.config.real.sway
-        poses = [self.world.drive_pose(float(t), height, sway) for t in times]
-        return np.reshape(poses, (-1, 4, 4)) @ self.lidar.T_level_lidar
+        return np.reshape([self.lidar.pose(self.world, float(t)) for t in times], (-1, 4, 4))
 
     def _write_ground(self, path: Path) -> None:
         """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""

@@ -66,8 +66,7 @@ class Layout:
         return [FURNITURE[k][0](self.rng) for k in kinds]
 
     def _free(self, xy: Array) -> bool:
-        row, column = self.terrain._cell(xy)
-        return not self.taken[row, column].any()
+        return not self.taken[self.terrain.cell(xy)].any()
 
     def _take(self, outline: ArrayLike) -> None:
         corners = np.rint((np.asarray(outline) - self.terrain.origin) / RESOLUTION).astype(np.int32)
@@ -103,7 +102,7 @@ class Layout:
             size = np.ones(n) if scale is None else rng.uniform(*scale, n)
             keep = terrain.edge_at(xy) > band[0] - 0.25
             keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + reach[which] * size
-            row, column = terrain._cell(xy)
+            row, column = terrain.cell(xy)
             keep &= self.taken[row, column] == 0
             if radius:
                 close = cKDTree(xy).query_pairs(2 * radius, output_type="ndarray")
@@ -191,8 +190,7 @@ class Layout:
                 span = Kerbline(line.xy[part], line.outward[part], line.junction[part])
                 clear = self._free(span.xy) and (self.drive.query(span.xy)[0] > CLEAR_OF_DRIVE + 0.5).all()
                 if rng.random() < share and clear:
-                    row, column = self.terrain._cell(span.xy)
-                    self.taken[row, column] = 1
+                    self.taken[self.terrain.cell(span.xy)] = 1
                     yield from kinds[int(rng.choice(3, p=[0.45, 0.3, 0.25]))](span)
 
     def _hedge(self, line: Kerbline) -> Iterator[Mesh]:

@@ -109,13 +109,13 @@ class Lidar:
         points = self._points(aim, returns, believed)
         return Scan(points, label[back], moving[back], self.beams.ring[back], time_offset, static)
 
-    def drive_scan(self, world: World, T_world_level: Array, time: float, rng: np.random.Generator) -> Scan:
-        """One turn of the mounted sensor as it drives, with what a driver leaves of the motion (`Imperfections.skew`).
+    def pose(self, world: World, time: float) -> Array:
+        """T_world_lidar (4, 4) of the mounted sensor at a time of the drive, s."""
+        return world.drive_pose(time, self.config.height, self.config.real.sway) @ self.T_level_lidar
 
-        Args:
-            T_world_level: (4, 4), without the turn of the mount. time: s, of the drive, whose motion it has then.
-        """
-        T_world_lidar = T_world_level @ self.T_level_lidar
+    def drive_scan(self, world: World, T_world_lidar: Array, time: float, rng: np.random.Generator) -> Scan:
+        """One turn at a pose (4, 4), moving as the drive does at a time, s, with what a driver leaves of the motion
+        (`Imperfections.skew`)."""
         if not self.config.real.skew:
             return self.scan(world, T_world_lidar, time, rng)
         twist = world.drive_twist(time, self.config.height, self.config.real.sway)

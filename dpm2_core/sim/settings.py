@@ -221,6 +221,11 @@ class Preset(Settings):
     indoor: Literal["", "rooms", "deck"] = ""
     """Inside a building: the way leads through rooms or along a deck, and nothing is beside it but them."""
 
+    @property
+    def wide(self) -> bool:
+        """Whether it has two lanes each way."""
+        return self.half_width > 10
+
 
 PRESETS: dict[PresetName, Preset] = {
     "city": Preset(
@@ -281,5 +286,5 @@ def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
         raise UsageError(f"--traffic {factor:g}: there is none indoors; want 0 to 1")
     if factor <= 1:
         return own.model_copy(update={"traffic": own.traffic * factor, "people": own.people * factor})
-    wide = {} if own.half_width > 10 else {"lane": 1.8, "half_width": 9.4 if own.parked else 7.2}
+    wide = {} if own.wide else {"lane": 1.8, "half_width": 9.4 if own.parked else 7.2}
     return own.model_copy(update={"traffic": nominal.traffic * factor, "columns": True, **wide})

@@ -149,7 +149,7 @@ def road_marking(
         )
 
     dash = (np.remainder(along, 9.0) < 4.0).astype(np.float32)
-    if half > 10:
+    if preset.wide:
         paint = sum(line(y, 0.15) for y in (-1.0, 1.0, 1.0 - half + 1.6, half - 2.6)) + dash * (
             line(-4.7, 0.14) + line(4.7, 0.14)
         )

@@ -58,8 +58,7 @@ class SimulatedDrive(_Simulated):
         world = build_world(road, preset, seed)
         super().__init__(name, world, world.road.times)
         self._lidar = Lidar(LidarConfig())
-        height = self._lidar.config.height
-        self.poses = np.stack([self.world.drive_pose(float(t), height) for t in self.times])
+        self.poses = np.stack([self._lidar.pose(world, float(t)) for t in self.times])
 
     def frame(self, position: int) -> Frame:
         """As `IndexedSource`."""

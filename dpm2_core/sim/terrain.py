@@ -128,13 +128,14 @@ class Terrain:
                 height -= 0.6 * ditch * np.exp(-(((self.edge - 2.2) / 0.8) ** 2))
         return height.astype(np.float32)
 
-    def _cell(self, xy: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    def cell(self, xy: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Rows and columns (N,) of the rasters at points (N, 2); beyond them, at their borders."""
         at = np.rint((np.asarray(xy) - self.origin.astype(np.asarray(xy).dtype)) / RESOLUTION).astype(np.int32)
         return at[..., 1].clip(0, self.edge.shape[0] - 1), at[..., 0].clip(0, self.edge.shape[1] - 1)
 
     def edge_at(self, xy: ArrayLike) -> NDArray[np.float32]:
         """Distance to the kerb, m, at points (N, 2)."""
-        return self.edge[self._cell(xy)]
+        return self.edge[self.cell(xy)]
 
     def height_at(self, xy: ArrayLike) -> Array:
         """Ground height, m, at points (N, 2), bilinear between the 1 m nodes of the mesh, without kerbs."""
@@ -164,7 +165,7 @@ class Terrain:
 
     def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
         """Of points (N, 2): m to the left of the nearest street's center, m along it, and whether at a crossing."""
-        sample = self.nearest[self._cell(xy)]
+        sample = self.nearest[self.cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
         away = xy - self.center[sample].astype(xy.dtype)
         c, s = np.cos(yaw), np.sin(yaw)
@@ -180,7 +181,7 @@ class Terrain:
             s = np.linspace(0, length[-1], int(length[-1]) + 1)
             xy = np.stack([np.interp(s, length, line[:, k]) for k in (0, 1)], -1)
             xy[1:-1] = (xy[:-2] + 2 * xy[1:-1] + xy[2:]) / 4
-            sample = self.nearest[self._cell(xy)]
+            sample = self.nearest[self.cell(xy)]
             ahead = np.gradient(xy, axis=0)
             outward = np.stack([-ahead[:, 1], ahead[:, 0]], -1) / np.linalg.norm(ahead, axis=1, keepdims=True)
             away = np.einsum("ij,ij->i", outward, xy - self.center[sample])

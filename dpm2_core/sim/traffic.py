@@ -31,7 +31,7 @@ class Traffic:
     Attributes:
         models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; a negative speed is
             against it. follows: (M,) it is `start` ahead of the car instead, and `speed` is relative to the car's.
-            phase: (M,) of its small variations. gap: m, (M,) or for all; nearer to the sensor it is left out.
+            phase: (M,) of its small variations. gap: (M,) m, nearer to the sensor it is left out.
     """
 
     road: Road
@@ -42,7 +42,7 @@ class Traffic:
     lateral: Array
     follows: NDArray[np.bool_]
     phase: Array
-    gap: Array | float = GAP
+    gap: Array
 
     def poses(self, time: float) -> tuple[Array, Array]:
         """Places (M, 2) and headings (M,) at a time, s."""
@@ -116,7 +116,7 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
     follows = rng.random(n_cars) < 0.3
     oncoming = rng.random(n_cars) < 0.7
     pace = preset.speed * rng.uniform(0.7, 1.1, n_cars)
-    if preset.half_width > 10:  # two lanes each way
+    if preset.wide:
         lateral = np.where(oncoming, 2 * preset.lane - 3.6 * rng.integers(0, 2, n_cars), 3.6)
     else:
         follows |= ~oncoming
@@ -133,7 +133,7 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
         np.zeros(n_people, bool),
     )
     columns = [np.concatenate(both) for both in zip(of_cars, of_people, strict=True)]
-    columns.append(rng.uniform(0, 6.3, n_cars + n_people))
+    columns += [rng.uniform(0, 6.3, n_cars + n_people), np.full(n_cars + n_people, GAP)]
     return Traffic(road, terrain, cars + walkers, *columns)
 
 
@@ -143,7 +143,7 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
     library = [car(rng) for _ in range(12)] + [truck(rng) for _ in range(8)]
     lengths = np.array([np.ptp(mesh.vertices[:, 0]) for mesh in library])
     across = 2 * preset.lane
-    beside, oncoming = (lane, (across, across - lane)) if preset.half_width > 10 else (-lane, (across, across + lane))
+    beside, oncoming = (lane, (across, across - lane)) if preset.wide else (-lane, (across, across + lane))
     parts = []
     for lane_at, trucks in ((0.0, 0.4), (beside, 0.7), (oncoming[0], 0.4), (oncoming[1], 0.4)):
         kind, at = _queue(lengths, trucks, 400 / preset.traffic, length, rng)
@@ -157,7 +157,7 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
         parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lane_at, same_way))))
     kind, *queues = (np.concatenate(part) for part in zip(*parts, strict=True))
     queues += [rng.uniform(0, 6.3, len(kind)), np.full(len(kind), ALONGSIDE)]
-    rest = others.start, others.speed, others.lateral, others.follows, others.phase, np.full(len(others.start), GAP)
+    rest = others.start, others.speed, others.lateral, others.follows, others.phase, others.gap
     columns = (np.concatenate(both) for both in zip(queues, rest, strict=True))
     return Traffic(others.road, others.terrain, [library[k] for k in kind] + others.models, *columns)
 

@@ -147,7 +147,7 @@ def test_a_driver_that_knows_the_motion_undoes_it_and_another_leaves_its_share(t
 
 def test_the_real_sensor_scans_deterministically_and_its_mount_does_not_move_the_world(city: World) -> None:
     tilted = Lidar(real_sensor(LidarConfig(columns=720)).model_copy(update={"pitch": 15.0, "roll": 3.0}))
-    T = city.pose_at(40.0)
+    T = city.pose_at(40.0) @ tilted.T_level_lidar
     first, second = (tilted.drive_scan(city, T, 1.0, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
     level = se3.transform(tilted.T_level_lidar, first.points)
