@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import venv
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +34,8 @@ def check(distribution: Path, extra: str, work: Path) -> None:
     run = place / "bin"
     wanted = f"{distribution}[{extra}]" if extra else str(distribution)
     # The torch that is here already, so that each environment need not fetch its own.
-    (place / "constraints.txt").write_text(f"torch=={_torch()}\n", encoding="utf-8")
+    torch = version("torch").partition("+")[0]
+    (place / "constraints.txt").write_text(f"torch=={torch}\n", encoding="utf-8")
     pip = [str(run / "pip"), "install", "-qq", "--disable-pip-version-check", "-c", str(place / "constraints.txt")]
     subprocess.run([*pip, wanted], check=True)
     for name, *arguments in PROGRAMS:
@@ -41,12 +43,6 @@ def check(distribution: Path, extra: str, work: Path) -> None:
     for name in NODES:
         assert (run / name).is_file(), f"{name} is missing"
     print(f"{distribution.name} with {extra or 'nothing more'}: sound")
-
-
-def _torch() -> str:
-    import torch
-
-    return str(torch.__version__).partition("+")[0]
 
 
 def check_all(
