@@ -37,8 +37,7 @@ from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import record_table
 from dpm2_ros.conversions import cloud_to_msg, parse_keyframe_name
-from dpm2_ros.runtime import end_ros, ros_context
-from tools.replay import ros_environment, start, stop
+from tools.replay import SpunNode, ros_environment, start, stop
 
 ROAD = "07"
 SPANS = {"red": (0, 420), "blue": (340, 760), "green": (680, 1100)}
@@ -50,22 +49,17 @@ OUTAGE = (60, 90)
 _START, _PERIOD = 1_000_000_000, 100_000_000  # ns: stamps; the scans were taken at 10 Hz
 
 
-class _Scans:
+class _Scans(SpunNode):
     """Publishes the scans of all robots; notes the keyframes that they make."""
 
     def __init__(self, source: SimulatedDrive) -> None:
-        import rclpy
         from nav_msgs.msg import Odometry
-        from rclpy.executors import SingleThreadedExecutor
         from sensor_msgs.msg import PointCloud2
 
         from dpm2_ros.mapping import KEEP_ALL
 
-        ros_context([])
+        super().__init__("scans")
         self._source, self.made = source, {name: set[int]() for name in SPANS}
-        self._node = rclpy.create_node("scans")
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
         self._lidars = {name: self._node.create_publisher(PointCloud2, f"/{name}/points", 10) for name in SPANS}
         for name in SPANS:
             self._node.create_subscription(Odometry, f"/{name}/dpm2/keyframe_odom", self._on_keyframe, KEEP_ALL)
@@ -86,16 +80,6 @@ class _Scans:
             n = first + EVERY * tick
             points = self._source.frame(n).points
             self._lidars[name].publish(cloud_to_msg(points, _START + n * _PERIOD, f"{name}/lidar"))
-
-    def spin(self, seconds: float) -> None:
-        """Take what arrives during that time."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        end_ros(self._node)
 
 
 def bench(

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -118,17 +118,16 @@ def replay(
     player: subprocess.Popen[bytes] | None = None
     result, maps = Replay(), set((out / "map").glob("*/map.ply"))
     try:
-        with _Listener(result) as listener:
-            alive = _watch(slam, "slam_node", out)
+        with closing(_Listener(result)) as listener:
             while not listener.connected():  # or the first poses would be sent before there is a subscriber
-                alive()
+                _check_alive(slam, out)
                 listener.spin(0.1)
             if watched:
                 listener.watch_all()
             playing = [str(source.path), "--rate", str(rate), "--wait", "60", "--log", str(times)]
             player = start("bag_player", playing, environment, out / "bag_player.log")
             while player.poll() is None:
-                alive()
+                _check_alive(slam, out)
                 listener.spin(0.2)
                 progress(len(result.poses))
             if player.returncode:
@@ -144,14 +143,10 @@ def replay(
     return result
 
 
-def _watch(process: subprocess.Popen[bytes], name: str, out: Path) -> Callable[[], None]:
-    """A function that raises when the process has ended."""
-
-    def alive() -> None:
-        if process.poll() is not None:
-            raise Dpm2Error(f"{name} ended with {process.returncode}: {_tail(out / f'{name}.log')}")
-
-    return alive
+def _check_alive(slam: subprocess.Popen[bytes], out: Path) -> None:
+    """Raise where it has ended."""
+    if slam.poll() is not None:
+        raise Dpm2Error(f"slam_node ended with {slam.returncode}: {_tail(out / 'slam_node.log')}")
 
 
 def _drain(listener: _Listener, result: Replay) -> None:
@@ -166,27 +161,45 @@ def _drain(listener: _Listener, result: Replay) -> None:
         listener.spin(0.2)
 
 
-class _Listener:
+class SpunNode:
+    """A node of this process, which is spun between other work."""
+
+    def __init__(self, name: str) -> None:
+        """With a context of its own, by what `os.environ` holds."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        ros_context([])
+        self._node = rclpy.create_node(name)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+
+    def spin(self, seconds: float) -> None:
+        """Take what arrives during that time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        """Destroy it, and end ROS in this process."""
+        self._executor.shutdown()
+        end_ros(self._node)
+
+
+class _Listener(SpunNode):
     """Subscribes to what slam_node publishes."""
 
     def __init__(self, result: Replay) -> None:
-        self._result = result
-        self._map_stamp = -1
-
-    def __enter__(self) -> _Listener:
-        import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from nav_msgs.msg import Odometry
-        from rclpy.executors import SingleThreadedExecutor
         from sensor_msgs.msg import PointCloud2
 
         from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
         from dpm2_ros.tf_message import TFMessage
 
-        ros_context([])
-        self._node = rclpy.create_node("replay_listener")
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
+        super().__init__("replay_listener")
+        self._result = result
+        self._map_stamp = -1
         subscribe = self._node.create_subscription
         subscribe(Odometry, "/dpm2/odom", self._on_odom, 1000)
         subscribe(Odometry, "/dpm2/keyframe_odom", self._on_keyframe, KEEP_ALL)
@@ -195,11 +208,6 @@ class _Listener:
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         if TFMessage is not None:
             subscribe(TFMessage, "/tf", self._on_tf, 1000)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        end_ros(self._node)
 
     def watch_all(self) -> None:
         """Subscribe to the other topics of slam_node, too, and leave their messages as the bytes that they came as."""
@@ -222,12 +230,6 @@ class _Listener:
     def map_is_complete(self) -> bool:
         """Whether the last map holds the last keyframe."""
         return bool(self._result.keyframes) and self._map_stamp == self._result.keyframes[-1]
-
-    def spin(self, seconds: float) -> None:
-        """Take what arrives during that time."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
 
     def _on_odom(self, message: Any) -> None:
         stamp = stamp_ns(message.header)
