@@ -52,7 +52,8 @@ def open_roads(
     for preset, seed in WORLDS.items():
         world, rng = build_world("random", preset, seed, LENGTH), np.random.default_rng(seed)
         stops = np.arange(spacing, world.road.drive.length - spacing, spacing)
-        road = [(world.pose_at(s), _when(world, s)) for s in stops]
+        times = np.interp(stops, world.road.travelled, world.road.times).tolist()
+        road = [(world.pose_at(s), time) for s, time in zip(stops, times, strict=True)]
         there = [world.sample_pose(rng, heading=_AHEAD) for _ in range(visits)]
         task = progress.add_task(preset, total=len(road) + len(there))
         seen = [_Seen(T, _frame(world, T, time, rng)) for T, time in progress.track(road + there, task_id=task)]
@@ -62,11 +63,6 @@ def open_roads(
             for word, images in (("without images", False), ("with images", True))
         }
     return out
-
-
-def _when(world: World, s: float) -> float:
-    """The time at which the drive passes arc length `s`."""
-    return float(np.interp(s, world.road.distance(world.road.times), world.road.times))
 
 
 def _frame(world: World, T: Array, time: float, rng: np.random.Generator) -> Frame:

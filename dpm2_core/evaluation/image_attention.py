@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.canvas import BACKGROUND, ESTIMATE, INK, new_figure, save_png
@@ -77,7 +76,8 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     views = to_device(views, device)
     xyz = encoded.tokens.xyz
     seen = (seen_from(xyz, views, 0) & encoded.tokens.mask)[0].cpu().numpy()
-    uv = _projected(xyz, views)
+    projected, _ = project(xyz, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
+    uv = projected[0].cpu().numpy().astype(np.float64)
     height, width = encoder.settings.image.size
     if point is None:
         if not seen.any():
@@ -96,12 +96,6 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     heat /= max(float(heat.max()), 1e-9)
     pixels = views.pixels[0, 0].permute(1, 2, 0).cpu().numpy()
     return ImageAttention(pixels, xyz[0].cpu().numpy().astype(np.float64), uv, seen, point, heat)
-
-
-def _projected(xyz: Tensor, views: Any) -> Array:
-    """(N, 2) pixels of reference points (1, N, 3) in the first image."""
-    uv, _ = project(xyz, views.K[:, 0].float(), views.T_lidar_cam[:, 0].float())
-    return uv[0].cpu().numpy().astype(np.float64)
 
 
 def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str) -> None:

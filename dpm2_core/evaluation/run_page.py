@@ -114,7 +114,7 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
             [*np.round(end[:, :2].ravel(), 2).tolist(), loop.accepted, loop.reason]
             for end, loop in zip(ends, run.loops, strict=True)
         ],
-        "states": _runs_of(run.states),
+        "states": [(state, len(list(group))) for state, group in groupby(run.states)],
         "stages": stages,
         "time": [
             round(float(part.mean()), 2) for part in np.array_split(total, max(1, min(_BINS, len(total)))) if len(part)
@@ -141,11 +141,6 @@ def _flat(positions: Array) -> list[float]:
     sound = positions[np.isfinite(positions).all(1), :2]
     found: list[float] = np.round(sound, 2).ravel().tolist()
     return found
-
-
-def _runs_of(states: Sequence[str]) -> list[tuple[str, int]]:
-    """Each state that lasts, and for how many frames."""
-    return [(state, len(list(group))) for state, group in groupby(states)]
 
 
 def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:

@@ -12,7 +12,6 @@ import numpy as np
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
-from dpm2_core.data.open import open_source
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span, digest_of
 from dpm2_core.data.trajectory import Keys, Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
@@ -54,7 +53,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
     config = load_settings(Config, None, drive["settings"])
     source: Source | Path = drive["data"]
     if corrupt is not None:
-        source = CorruptedSource(open_recording(drive["data"], config, True), parse_corruption(corrupt))
+        source = CorruptedSource(open_drive(drive["data"], drive["settings"]), parse_corruption(corrupt))
     with OfflineRun(source, config, drive["frames"]) as run:
         result = run.run(counted(advance, len(run)))
         if result.interrupted:
@@ -79,8 +78,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     Raises:
         UsageError: it is not installed, or as `own`. Dpm2Error: it gave another number of poses than frames.
     """
-    config = load_settings(Config, None, drive["settings"])
-    source = open_recording(drive["data"], config, False)
+    source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
     program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
     for frame in prefetch(source.frames(start, stop)):
@@ -99,7 +97,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     write_tum(folder / TRAJECTORY, stamps, poses)
     write_frames(folder / "frames.csv", [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
                  {"total": seconds})  # fmt: skip
-    truth = _truth(source, (start, stop))
+    truth = _truth(source, start, stop)
     write_truth(folder / TRUTH, stamps, truth)
     fps = len(seconds) / sum(seconds)
     write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
@@ -112,10 +110,9 @@ def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
     Raises:
         UsageError: no such file, or nothing in it belongs to the sequence.
     """
-    config = load_settings(Config, None, drive["settings"])
-    source = open_recording(drive["data"], config, False)
+    source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
-    truth = _truth(source, (start, stop))
+    truth = _truth(source, start, stop)
     # Only names and stamps are wanted, but a source gives them with its frames alone.
     keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
     index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
@@ -154,8 +151,8 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
     return poses
 
 
-def _truth(source: Source, frames: Span) -> Array:
-    truth = read_ground_truth(source, None, *span_of(source, frames))
+def _truth(source: Source, start: int, stop: int) -> Array:
+    truth = read_ground_truth(source, None, start, stop)
     if truth is None or isinstance(truth, Trajectory):
         raise UsageError(f"{source.name}: no ground truth to compare with")
     return truth
@@ -175,13 +172,9 @@ def _measured(
     return metrics.model_dump(exclude={"per_length", "per_speed"})
 
 
-def open_drive(data: Path | str, settings: Sequence[str]) -> Source:
-    """A drive as the settings KEY=VALUE of `Config` have it read.
-
-    Raises:
-        UsageError: as `open_source`.
-    """
-    return open_source(data, load_settings(Config, None, settings).input)
+def open_drive(data: Path, settings: Sequence[str], images: bool = True) -> Source:
+    """A drive as the settings KEY=VALUE of `Config` have it read; see `open_recording`."""
+    return open_recording(data, load_settings(Config, None, settings), images)
 
 
 def drive_content(data: Path, settings: Sequence[str]) -> str:
@@ -193,7 +186,7 @@ def has_sequence(data: Path, settings: Sequence[str]) -> str:
     """Why a sequence cannot be opened; empty where it can."""
     config = load_settings(Config, None, settings)
     try:
-        open_source(data, config.input.model_copy(update={"images": False}))
+        open_recording(data, config, images=False)
     except UsageError as error:
         return str(error)
     return ""

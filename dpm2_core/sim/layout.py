@@ -46,7 +46,8 @@ class Layout:
         if preset.boundaries:
             yield from self._boundaries(preset.boundaries)
         kerb = preset.sidewalk or 1.2
-        furniture = self._furniture()
+        kinds = self.rng.choice(len(FURNITURE), 14, p=[p for _, p in FURNITURE])
+        furniture = [FURNITURE[k][0](self.rng) for k in kinds]
         yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, scale=None)
         trees = [plants.tree(self.rng) for _ in range(10)]
         distant = [plants.tree(self.rng, 0.4) for _ in range(10)]
@@ -60,10 +61,6 @@ class Layout:
         yield from self._scattered(clutter, preset.clutter, (kerb + 2.5, kerb + 22), 1.2)
         tufts = [plants.tuft(self.rng) for _ in range(8)]
         yield from self._scattered(tufts, 100 * preset.tufts, (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0)
-
-    def _furniture(self) -> list[Mesh]:
-        kinds = self.rng.choice(len(FURNITURE), 14, p=[p for _, p in FURNITURE])
-        return [FURNITURE[k][0](self.rng) for k in kinds]
 
     def _free(self, xy: Array) -> bool:
         return not self.taken[self.terrain.cell(xy)].any()
