@@ -21,6 +21,7 @@ from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.tables import FigureTable, record_table
 
 REGISTRATIONS = ("adaptive", "refined", "neural", "geometric")
+_BLIND = "slam.visual.enabled=false"
 _SYNTHETIC_FRAMES = 80
 _RATES = tuple(f"every {every}" for every in EVERY)
 _SYNTHETIC: tuple[tuple[str, PresetName, int], ...] = (("loop", "city", 940_000), ("random", "suburb", 940_001))
@@ -37,7 +38,7 @@ def bench_hard(options: Options) -> Report:
     """
     methods: dict[str, Method] = {}
     for name in requested(options, (*REGISTRATIONS, BASELINE)):
-        run = kiss_icp(options) if name == BASELINE else _slam(options, name)
+        run = kiss_icp(options) if name == BASELINE else dpm2(options, f"slam.registration={name}", _BLIND)
         if run is not None:
             methods[name] = run
     results: dict[str, Any] = {}
@@ -70,10 +71,6 @@ def draw(path: Path, results: Mapping[str, Any]) -> None:
         for drive, hard in results.items()
     }
     verdicts_png(path, panels, "Who survives what: worst error afterwards, m")
-
-
-def _slam(options: Options, registration: str) -> Method:
-    return dpm2(options, f"slam.registration={registration}", "slam.visual.enabled=false")
 
 
 def _figures(case: Case, outcome: Outcome) -> dict[str, Any]:

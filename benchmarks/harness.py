@@ -62,10 +62,11 @@ def excerpt() -> Path:
 
 def settings_of(options: Options, *more: str) -> SlamSettings:
     """Settings of the SLAM as asked for, with `more` of the kind `slam.registration=neural`."""
-    return _configuration(options, *more).slam
+    return configuration_of(options, *more).slam
 
 
-def _configuration(options: Options, *more: str) -> Config:
+def configuration_of(options: Options, *more: str) -> Config:
+    """The same, and how drives are read."""
     return load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides, *more])
 
 
@@ -100,7 +101,7 @@ def drives(options: Options, more: Sequence[Source] = ()) -> Iterator[dict[str, 
     Raises:
         UsageError: there is none.
     """
-    how = _configuration(options).input
+    how = configuration_of(options).input
     if options.sources:
         yield _named([*(open_source(path, how) for path in options.sources), *more])
         return

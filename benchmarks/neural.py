@@ -152,14 +152,13 @@ def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options:
 def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Encode and register, raw points to pose, by stages; KISS-ICP in turns with it, and what the camera adds."""
     frames = frames[:60]
-    rounds: list[list[dict[str, Any]]] = []
-    kiss = kiss_icp(options)
+    kiss, rounds = kiss_icp(options), []
     for _ in range(options.repetitions):
-        rounds.append([stage_times(network, frames), kiss(frames).seconds[1:] if kiss else None])  # type: ignore[list-item]
+        rounds.append((stage_times(network, frames), None if kiss is None else kiss(frames).seconds[1:]))
     best, baseline = min(rounds, key=lambda r: r[0]["stages_ms"]["total"]["median"])
     out: dict[str, Any] = {**best}
     if baseline is not None:
-        out[BASELINE] = quantiles_ms(np.asarray(baseline))
+        out[BASELINE] = quantiles_ms(baseline)
         out["ratio"] = round(best["stages_ms"]["total"]["median"] / out[BASELINE]["median"], 3)
     if network.encoder.image is None:
         out["with the camera"] = "not answered: these weights have no camera"

@@ -23,7 +23,6 @@ from benchmarks.harness import Options
 from benchmarks.lossy_link import LOSS, Link, inside
 from benchmarks.roads import open_road, road_files
 from dpm2_core.commands.options import run_command
-from dpm2_core.config import load_settings
 from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error, exit_code
 from dpm2_core.evaluation.metrics import align, ape_rmse
@@ -32,7 +31,7 @@ from dpm2_core.frame import Array
 from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.parts import parts_of
-from dpm2_core.slam.settings import Config
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import record_table
@@ -191,7 +190,7 @@ def _evaluated(data: MapData, name: str, made: set[int], errors: Array) -> dict[
 
 def _alone(source: SimulatedDrive) -> float:
     """APE of the keyframes of one robot that drives all of the road in one process, without ROS, m."""
-    slam = make_slam(load_settings(Config).slam)
+    slam = make_slam(SlamSettings())
     for n in range(0, SPANS["green"][1], EVERY):
         slam.process(source.frame(n))
     slam.mapper.finish()

@@ -11,8 +11,7 @@ from typing import Any
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors
-from dpm2_core.config import load_settings
+from benchmarks.harness import Options, Report, configuration_of, drives, processors
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.live_view import LiveView
@@ -21,7 +20,6 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import Frame
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.mapping.mapper import Mapper
-from dpm2_core.slam.settings import Config
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamResult
@@ -71,10 +69,9 @@ def bench_views(options: Options) -> Report:
 
 def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
     """Seconds of a run, and of these the seconds in which the view was fed; leaves `drive.dpm2map`."""
-    chosen = load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides])
     shown = 0.0
     with (
-        OfflineRun(source, chosen, map_file=place / "drive.dpm2map") as drive,
+        OfflineRun(source, configuration_of(options), map_file=place / "drive.dpm2map") as drive,
         LiveView(source.name, viewer=False, record=place / "run.rrd") as live,
         Progress(transient=True) as progress,
     ):
