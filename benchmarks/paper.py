@@ -52,24 +52,22 @@ def bench_paper(options: Options) -> Report:
         UsageError: there is no drive, or one has no ground truth.
     """
     results: dict[str, Any] = {}
-    more = [] if options.sources else [_lap()]
+    more = [] if options.sources else [lap()]
     with drives(options, more) as sources, processors(options.threads), Progress(transient=True) as progress:
         for name, source in sources.items():
             frames = list(source.frames())
-            truth, results[name] = truth_of(source)[: len(frames)], {}
-            ways = requested(options, WAYS)
-            for way in progress.track(ways, description=name):
+            truth, results[name] = truth_of(source), {}
+            for way in progress.track(requested(options, WAYS), description=name):
                 results[name][way] = _driven(settings_of(options, *WAYS[way]), frames, truth)
     return Report({"settings": WAYS, "drives": results}, Group(_table(results)))
 
 
-def _lap() -> SimulatedDrive:
+def lap() -> SimulatedDrive:
     """Round a block, and on into the street where it began."""
     drive = SimulatedDrive("loop", "suburb", 950_000, "suburb")
     way = arc_lengths(drive.poses[:, :3, 3])
     again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
-    lap = way[(way > 50) & (again < 10)]
-    end = int(np.searchsorted(way, _LAPS * lap[0])) if len(lap) else len(way)
+    end = int(np.searchsorted(way, _LAPS * way[(way > 50) & (again < 10)][0]))
     drive.times, drive.poses = drive.times[:end:_EVERY], drive.poses[:end:_EVERY]
     return drive
 

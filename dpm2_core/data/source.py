@@ -71,7 +71,7 @@ class IndexedSource(ABC):
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, read one at a time."""
-        return map(self.frame, range(self._count)[start:stop])
+        return map(self.frame, range(len(self))[start:stop])
 
     def _note_unposed(self, where: object, known: NDArray[np.bool_]) -> None:
         """Say of how many frames there is no pose; `known` (len,)."""

@@ -41,6 +41,9 @@ class _Simulated(IndexedSource):
         super().__init__(name, len(times))
         self.world, self.times = world, times
 
+    def __len__(self) -> int:
+        return len(self.times)
+
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1, simulated ahead in another thread."""
         return prefetch(super().frames(start, stop))

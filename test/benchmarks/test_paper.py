@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.paper import WAYS
+from benchmarks.paper import WAYS, lap
 from dpm2_core.commands.bench import bench
 from dpm2_core.config import load_settings
 from dpm2_core.slam.settings import Config
@@ -31,6 +31,18 @@ def test_each_way_is_a_part_of_the_preset() -> None:
         for key, value in values.items() if value != ours[part][key]
     }  # fmt: skip
     assert changed == differing
+
+
+@pytest.mark.slow
+def test_the_simulated_drive_is_of_every_second_scan_of_a_good_lap() -> None:
+    """It was as long as the whole drive, of whose second half no scan is there."""
+    drive = lap()
+    assert len(drive) == len(drive.poses)
+    (last,) = drive.frames(len(drive) - 1)
+    assert last.index == len(drive) - 1
+    back = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
+    assert back.max() > 50
+    assert back[len(back) // 2 :].min() < 10  # m: it comes back to where it began
 
 
 @pytest.mark.slow
