@@ -115,11 +115,6 @@ def kiss_from_identity(threads: int) -> PairMethod | None:
     return register
 
 
-def pair_poses(method: PairMethod, frames: Sequence[Frame], pairs: Pairs) -> list[Array | None]:
-    """T_first_second (4, 4) of each pair; None where there was no result."""
-    return [method(frames[a], frames[b]) for a, b in pairs]
-
-
 def fitted_poses(registration: ScanRegistration, frames: Sequence[Frame], pairs: Pairs, poses: Array) -> list[Array]:
     """T_first_second (4, 4) of each pair by the points, started at the poses (N, 4, 4); where the points find nothing
     there, as the poses have it.
@@ -166,7 +161,7 @@ def all_pairs(
     out: dict[str, dict[str, Any]] = {}
     for kind, pairs in pairs_of(poses, most).items():
         truth = [se3.inverse(poses[a]) @ poses[b] for a, b in pairs]
-        found = {name: pair_poses(method, frames, pairs) for name, method in kinds[kind].items()}
+        found = {name: [method(frames[a], frames[b]) for a, b in pairs] for name, method in kinds[kind].items()}
         out[kind] = {name: summarized(pair_errors(T, truth)) for name, T in found.items()}
         if "neural" in found:
             fitted = fitted_poses(points, frames, pairs, poses)

@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 from rich.console import Group
@@ -15,7 +14,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
-from benchmarks.relocalise_visits import kept, measured, relocalizer_in, row_of, success_rates
+from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Frame, Points
@@ -64,9 +63,7 @@ def bench_relocalise(options: Options) -> Report:
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):
-                started = perf_counter()
-                found = relocalizer.find(Keyframe(0, 0, 0, np.eye(4), cloud))
-                rows.append(row_of(found, truth, perf_counter() - started))
+                rows.append(looked_for(relocalizer.find, Keyframe(0, 0, 0, np.eye(4), cloud), truth))
                 progress.advance(task)
             results = {"keyframes": len(data), "lateral_m": LATERAL, **success_rates(rows)}
         if not options.sources:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.relocalise_visits import kept, measured, relocalizer_in, row_of, success_rates
+from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Frame, Image
@@ -83,10 +82,5 @@ def _relocalised(
     keyframes = [keyframe(place.frame) for place in known]
     poses = np.stack([place.T_map_lidar for place in known])
     in_map = KnownMap(keyframes, lambda n: keyframes[n].cloud, poses, lambda n: keyframes[n].thumbnail)
-    relocalizer = relocalizer_in(settings, network, in_map)
-    rows = []
-    for place in visited:
-        visit, started = keyframe(place.frame), perf_counter()
-        found = relocalizer.find(visit)
-        rows.append(row_of(found, place.T_map_lidar, perf_counter() - started))
-    return success_rates(rows)
+    find = relocalizer_in(settings, network, in_map).find
+    return success_rates([looked_for(find, keyframe(place.frame), place.T_map_lidar) for place in visited])

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
@@ -33,19 +35,24 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
     """Figures of results: found or not, m and degrees off, seconds."""
     ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
     right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
-    given = meters[ok.astype(bool)]
+    given = meters[ok]
     return {
         "visits": len(rows),
         "right": round(float(right.mean()), 4),
-        "no_answer": int((~ok.astype(bool)).sum()),
+        "no_answer": int((~ok).sum()),
         "wrong": int((ok & ~right).sum()),
         "median_error_m": round(float(np.median(given)), 4) if len(given) else None,
         "seconds": {f"p{q}": round(float(np.percentile(seconds, q)), 3) for q in (50, 95)},
     }
 
 
-def row_of(result: Registration, truth: Array, seconds: float) -> tuple[bool, float, float, float]:
-    """A result for `success_rates`; `truth` T_map_lidar (4, 4)."""
+def looked_for(
+    find: Callable[[Keyframe], Registration], visit: Keyframe, truth: Array
+) -> tuple[bool, float, float, float]:
+    """The result for `success_rates` of a visit; `truth` T_map_lidar (4, 4)."""
+    started = perf_counter()
+    result = find(visit)
+    seconds = perf_counter() - started
     return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
 
 
