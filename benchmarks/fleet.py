@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import sys
@@ -25,6 +24,7 @@ from rich.console import Group
 from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
 from benchmarks.fleet_growth import bench_growth, bench_whole
 from benchmarks.harness import Options, Report, earlier, requested
+from benchmarks.resident import peak_mb
 from benchmarks.roads import FIRST_SEED, road_files
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.machine import processors
@@ -114,7 +114,7 @@ def bench_town(folder: Path, options: Options) -> dict[str, Any]:
         "ape_of_each_drive_m": grown,
         "rejected": merged.rejected,
         "added": added,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+        "peak_mb": peak_mb(),
     }
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.resident import peak_mb
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
 from dpm2_core.fleet.places import FleetIndex
@@ -82,7 +83,7 @@ def bench_whole(folder: Path) -> dict[str, Any]:
 
 def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
     """As `merge` does it: the graph of all drives, then their maps into one file."""
-    start, began = _peak_mb(), time.process_time()
+    start, began = peak_mb(), time.process_time()
     with ExitStack() as stack:
         stores = [(path.stem, stack.enter_context(MapStore.open(path))) for path in sorted(folder.glob("d*.dpm2map"))]
         maps = {name: load_map(store, descriptors=False) for name, store in stores}
@@ -97,14 +98,8 @@ def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
         "joins": len(joins),
         "cpu_s": {"graph": solved - began, "file": time.process_time() - solved},
         "file_mb": round((folder / "town.dpm2map").stat().st_size / 2**20),
-        "memory_mb": {"start": start, "peak": _peak_mb()},
+        "memory_mb": {"start": start, "peak": peak_mb()},
     }
-
-
-def _peak_mb() -> int:
-    """Largest resident set of this process since its start, MB."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) // 1024
 
 
 def _way(count: int) -> Array:

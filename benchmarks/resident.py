@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from dpm2_core.errors import Dpm2Error
@@ -15,8 +14,17 @@ def resident_mb() -> float:
     Raises:
         Dpm2Error: the system is not Linux.
     """
+    return round(_kilobytes("VmRSS") / 1024, 1)
+
+
+def peak_mb() -> int:
+    """The largest that it has had since the process began, MB."""
+    return _kilobytes("VmHWM") // 1024
+
+
+def _kilobytes(name: str) -> int:
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     except OSError:
-        raise Dpm2Error("the memory benchmark reads /proc/self/statm, which only Linux has") from None
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
+        raise Dpm2Error("the memory benchmark reads /proc/self/status, which only Linux has") from None
+    return next(int(line.split()[1]) for line in lines if line.startswith(name))

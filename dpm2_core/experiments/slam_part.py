@@ -20,7 +20,7 @@ from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.evaluation.metrics import Metrics, evaluate
-from dpm2_core.evaluation.run_folder import METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
+from dpm2_core.evaluation.run_folder import FRAMES, METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
 from dpm2_core.experiments.peers import make_peer
 from dpm2_core.files import write_json
 from dpm2_core.fleet.part import Advance, Figures, counted
@@ -95,7 +95,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     if len(poses) != len(stamps):
         raise Dpm2Error(f"{name}: {len(poses)} poses for {len(stamps)} frames")
     write_tum(folder / TRAJECTORY, stamps, poses)
-    write_frames(folder / "frames.csv", [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
+    write_frames(folder / FRAMES, [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
                  {"total": seconds})  # fmt: skip
     truth = _truth(source, start, stop)
     write_truth(folder / TRUTH, stamps, truth)
