@@ -201,7 +201,9 @@ class Inputs:
     def _on_image(self, camera: CameraTopic, message: Any) -> None:
         check_header(message.header)
         check_size(message)
-        self._add(camera.topic, self._stamp(message) + self._image_shift, message)
+        stamp = self._stamp(message)
+        self.calibration.check_sensor(camera.topic, message.header.frame_id, stamp)
+        self._add(camera.topic, stamp + self._image_shift, message)
 
     def _on_second(self, message: PointCloud2 | bytes) -> None:
         cloud, problem = checked_cloud(message)
@@ -217,13 +219,16 @@ class Inputs:
     def _on_imu(self, message: Imu) -> None:
         check_header(message.header)
         if self.imu is not None:
-            self.imu.add(self._stamp(message), message)
+            stamp = self._stamp(message)
+            self.calibration.check_sensor(self.calibration.imu_topic, message.header.frame_id, stamp)
+            self.imu.add(stamp, message)
             self.imu_received += 1
 
     def _on_fix(self, message: NavSatFix) -> None:
         check_header(message.header)
         if self.gnss is not None:
             stamp = self._stamp(message)
+            self.calibration.check_sensor(self.calibration.gnss_topic, message.header.frame_id, stamp)
             self.gnss.add(stamp, message)
             self.gnss_received, self.gnss_last = self.gnss_received + 1, (stamp, time.monotonic())
 
@@ -242,6 +247,9 @@ class Inputs:
         info = info_of(camera.topic, message)
         if _usable(camera.info):
             decode_camera(info, np.eye(4), "camera")  # raises where what is known is to stay
+            frame, known, images = info.header.frame_id, camera.info.header.frame_id, self.calibration.frame_of(camera)
+            if images and frame.lstrip("/") not in (images, known.lstrip("/")):
+                raise RejectedError("another frame", f"a CameraInfo in frame {frame[:80]!r}, the images' is {images!r}")
         camera.info = info
 
     def _on_static(self, message: Any) -> None:

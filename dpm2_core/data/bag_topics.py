@@ -17,6 +17,8 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
+_LOOKED_AT = 20  # CameraInfo, for one in the frame of the images
+
 
 class TopicChoice:
     """Chooses the topics of one bag; the bag's `notes` say where there were others.
@@ -78,18 +80,25 @@ class TopicChoice:
         return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
 
     def camera(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
-        """The camera of an image topic with its first CameraInfo of use; None without, which is an error where it is
-        asked for."""
+        """The camera of an image topic with its first CameraInfo of use, by its frame that of the first image if there
+        are some of several cameras; None without, which is an error where it is asked for."""
         info_topic = info_topic or info_topic_beside(topic)
-        problem = f"no CameraInfo on {info_topic}"
+        problem, usable, image = f"no CameraInfo on {info_topic}", list[CameraTopic](), self._bag.first(topic)
+        frame = image.header.frame_id.lstrip("/") if image else ""
         for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
             info = info_of(topic, message)
             try:
                 decode_camera(info, np.eye(4), info_topic)
             except MessageError as error:  # drivers send zeros before the calibration is there
                 problem = str(error)
-            else:
-                return CameraTopic(topic, info)
+                continue
+            usable.append(CameraTopic(topic, info))
+            if info.header.frame_id.lstrip("/") == frame:
+                return usable[-1]
+            if len(usable) == _LOOKED_AT:
+                break
+        if usable:
+            return usable[0]
         if asked:
             raise UsageError(f"{self._path}: {problem} for {topic}; {self._contents()}")
         self._bag.notes.append(f"images of {topic} are left out: {problem}")

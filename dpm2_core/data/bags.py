@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import islice
@@ -22,7 +22,7 @@ from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.message_kinds import CLOUDS, IMAGES, PATH
-from dpm2_core.data.messages import MessageError, decode_points, serialized_stamp, stamp_ns
+from dpm2_core.data.messages import MessageError, decode_points, serialized_frame, serialized_stamp, stamp_ns
 from dpm2_core.data.pairing import AHEAD, JUMP, SWEEP, Beside, RawMessage, clouds_after_others, is_due
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import note_once
@@ -102,6 +102,7 @@ class BagSource:
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
+        known.heard.clear()
         for index, (stamp, recorded, cloud, beside) in enumerate(islice(self._pairs(), stop)):
             if index < start:
                 continue
@@ -263,20 +264,27 @@ class BagSource:
                 yield stamp, time, data, {other: message for other, message in found if message is not None}
                 for sensor in beside.values():
                     sensor.forget(stamp)
-            elif topic in (self.imu_topic, gnss):
-                self._add_sample(topic, stamp, data)
-            else:
-                beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
+                continue
+            with self._or_left_out(topic):
+                if topic in (self.imu_topic, gnss):
+                    sample = self._bag.decode(topic, data)
+                    known.check_sensor(topic, sample.header.frame_id, stamp)
+                    (self._imu if topic == self.imu_topic else self._gnss).add(stamp, sample)
+                else:
+                    if topic != known.second_topic:  # whose clouds are moved each by its own frame
+                        known.check_sensor(topic, serialized_frame(data), stamp)
+                    beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
 
     def _in_order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
         """With those stamps of clouds corrected that are not between their neighbors', which is noted."""
         topic = self.points_topic
         return in_order(messages, topic, partial(note_corrected, self.notes, whose=f"{topic}: "))
 
-    def _add_sample(self, topic: str, stamp: int, data: bytes) -> None:
-        buffer = self._imu if topic == self.imu_topic else self._gnss
+    @contextmanager
+    def _or_left_out(self, topic: str) -> Iterator[None]:
+        """Inside, a message of a sensor beside the LiDAR is taken; one that cannot be is left out, and counted."""
         try:
-            buffer.add(stamp, self._bag.decode(topic, data))
+            yield
         except MessageError as error:
             left_out, why = self._unsound.get(topic, (0, str(error)))
             self._unsound[topic] = left_out + 1, why

@@ -24,6 +24,7 @@ from dpm2_core.geometry import se3
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
 _LENGTH = 300  # characters of a problem, whatever is in the message
+_SILENT = 2_000_000_000  # ns by its stamps after which another sensor may take the place of one
 
 
 @dataclass(eq=False)
@@ -45,6 +46,7 @@ class Calibration:
         lidar_frame: that of the drive's clouds: one in another frame cannot be used. Empty: any can.
         transforms: of /tf_static.
         angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
+        heard: topic of a sensor beside the LiDAR to its frame, and the stamp (ns) of its last message.
     """
 
     points_topic: str
@@ -56,6 +58,25 @@ class Calibration:
     lidar_frame: str = ""
     transforms: TransformTree = field(default_factory=TransformTree)
     angle_correction_deg: float | None = None
+    heard: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+    def check_sensor(self, topic: str, frame: str, stamp: int) -> None:
+        """Take note of a message with its frame and stamp (ns); on each topic the sensor that was heard first counts.
+
+        Raises:
+            MessageError: it is of another one, as where drivers are remapped to one topic: two IMUs would be taken for
+                one that turns, two cameras for one that jumps. One that names no frame may be of any.
+        """
+        known, last = self.heard.get(topic, ("", stamp))
+        frame = frame.lstrip("/") or known
+        if known and frame != known and abs(stamp - last) < _SILENT:
+            found = f"a message in frame {frame[:80]!r}, those before are in {known!r}"
+            raise MessageError(f"{found}: a topic has one sensor")
+        self.heard[topic] = frame, stamp
+
+    def frame_of(self, camera: CameraTopic) -> str:
+        """The frame of a camera's images; empty where it is not known yet, or they name none."""
+        return self.heard.get(camera.topic, ("", 0))[0]
 
     @property
     def cameras(self) -> list[CameraTopic]:

@@ -60,6 +60,14 @@ def serialized_stamp(data: bytes, time: int) -> int:
     return sec * 1_000_000_000 + nanosec or time
 
 
+def serialized_frame(data: bytes) -> str:
+    """frame_id of a serialized message that begins with a header, without decoding the rest; empty if it has none."""
+    if len(data) < 16:
+        return ""
+    (length,) = struct.unpack_from("<I" if data[1] & 1 else ">I", data, 12)
+    return bytes(data[16 : 16 + length]).rstrip(b"\0").decode(errors="replace")
+
+
 def restamped(data: bytes, stamp: int) -> bytes:
     """A serialized message that begins with a header, with another stamp, ns."""
     return data[:4] + struct.pack(_stamp_format(data), *divmod(stamp, 1_000_000_000)) + data[12:]

@@ -41,10 +41,10 @@ class Robot(Rig):
             publish_static(self, "base_link", "imu_link", T_BASE_IMU)
         self.wait(lambda: topic != "/imu" or self.imu.get_subscription_count(), "the subscription to the IMU")
 
-    def sample(self, stamp: int, rates: Any = BIAS) -> None:
+    def sample(self, stamp: int, rates: Any = BIAS, frame: str = "imu_link") -> None:
         """One of a robot at rest."""
         up = T_BASE_IMU[:3, :3].T @ [np.sin(PITCH), 0, np.cos(PITCH)]
-        message = Imu(header=header(stamp, "imu_link"), linear_acceleration=vector(self.gravity * up))
+        message = Imu(header=header(stamp, frame), linear_acceleration=vector(self.gravity * up))
         message.angular_velocity = vector(np.asarray(rates))
         self.imu.publish(message)
 
@@ -94,6 +94,20 @@ def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) 
     assert said.message.startswith("no transform from 'imu_link' to 'lidar'")
     assert said.level == DiagnosticStatus.WARN
     np.testing.assert_allclose(transform_matrix(r.odom[0].pose.pose)[:3, :3], np.eye(3), atol=0.01)
+
+
+def test_another_imu_on_the_topic_changes_nothing(robot: Callable[..., Robot]) -> None:
+    """Upside down, and not level: its samples are rejected and counted, the pose is that of the first alone."""
+    r = robot()
+    publish_static(r, "base_link", "other", se3.exp([np.pi, 0, 0, 0, 0, 0]))
+    r.sample(r.drive.stamp(0) - r.drive.period)
+    r.wait(lambda: r.node.calibration.heard, "a sample")
+    for k in range(20):
+        r.sample(r.drive.stamp(0) - r.drive.period + k * r.drive.period // 20, frame="other")
+    r.stand(0, 1)
+    first = transform_matrix(r.odom[0].pose.pose)
+    np.testing.assert_allclose(first[2, :3], [np.sin(PITCH), 0, np.cos(PITCH)], atol=0.01)  # base's axes, heights
+    assert sum(r.node.rejections.values()) == 20
 
 
 def test_forces_of_the_other_sign_are_said_at_the_start(

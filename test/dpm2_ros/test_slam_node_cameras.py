@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import IMAGE
+from dpm2_core.data.topics import IMAGE, KITTI
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg
 from test.helpers.rig import Camera, Rig, publish_static, record_frames
@@ -108,6 +108,26 @@ def test_two_cameras_of_one_frame_are_one_too_many(rig: Callable[..., Rig]) -> N
         r.send_and_wait(n)
     assert [len(frame.images) for frame in frames] == [1, 1]
     r.status("second camera", saying(f"its frame 'camera' is that of {IMAGE}: two cameras"), since=0)
+
+
+def test_two_cameras_on_one_topic_are_not_taken_for_one_that_jumps(rig: Callable[..., Rig]) -> None:
+    """The images of the one that was heard first count, with its calibration, also where the other's are nearer."""
+    r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
+    other, frames = Camera(r, frame="left"), record_frames(r)
+    for name, x in (("camera", 0.5), ("left", -1.0)):
+        publish_static(r, "lidar", name, se3.make(AHEAD[:3, :3], [x, 0, 0]))
+    for n in range(4):
+        camera.send(n, offset=0.01)
+        r.wait(lambda n=n: r.node.calibration.cameras[0].info is not None, "the calibration")
+        other.send(n)
+        r.wait(lambda n=n: sum(r.node.rejections.values()) == 2 * n + 2, "the rejections")
+        r.send_and_wait(n)
+    assert {kind.rpartition(": ")[0]: count for kind, count in r.node.rejections.items()} == {
+        IMAGE: 4,
+        f"{KITTI.camera}/camera_info": 4,
+    }
+    images = [image for frame in frames for image in frame.images]
+    assert [(image.time_offset, image.camera.T_lidar_cam[0, 3]) for image in images] == [(0.01, 0.5)] * 4
 
 
 def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:

@@ -83,6 +83,19 @@ def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path
     assert own.notes == []
 
 
+def test_the_antenna_of_a_fix_is_not_that_of_another_receiver(bags: Any, tmp_path: Path) -> None:
+    """Two on one topic, 6 m apart: the fixes of one had the antenna of the other, and the map another heading."""
+    place = {"gnss": (3, 0, 0), "rear": (-3, 0, 0)}
+    tree = [(0.5, "/tf_static", bags.transform("velo_link", frame, xyz)) for frame, xyz in place.items()]
+    rear = [(t + 0.01, topic, nav(bags, t - 0.12, frame="rear")) for t, topic, _ in drive(bags) if topic == "/fix"]
+    messages = sorted([*tree, *drive(bags), *rear], key=lambda m: m[0])
+    source = BagSource(bags.write(tmp_path / "b", messages), InputSettings(gnss_topic="/fix"))
+    fixes = [frame.fix for frame in source.frames() if frame.fix is not None]
+    assert [fix.antenna.tolist() for fix in fixes] == [[3, 0, 0]] * 2
+    problem = "a message in frame 'rear', those before are in 'gnss': a topic has one sensor"
+    assert source.notes == [f"/fix: 2 samples left out (the first: {problem})"]
+
+
 def test_an_antenna_without_a_place_is_known_until_it_has_one(bags: Any) -> None:
     """Clouds without a fix of their own, nine of ten, took the problem away: /diagnostics mostly said "in use"."""
     fixes, calibration, said = FixBuffer(), Calibration(POINTS, gnss_topic="/fix"), list[str]()

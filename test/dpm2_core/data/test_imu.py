@@ -164,6 +164,22 @@ def test_a_gyroscope_alone_is_enough(bags: Any) -> None:
         assert np.isnan(forces).all()
 
 
+def test_two_imus_on_one_topic_are_not_taken_for_one_that_turns(bags: Any, tmp_path: Path) -> None:
+    """The samples of both were turned by the place of the last one. Where the first falls silent the other counts."""
+    first = drive(bags, until=1.2, frame="first")
+    other = [(t + 0.005, "/imu", imu(bags, t + 0.005, frame="/other")) for t in 0.9 + 0.01 * np.arange(300)]
+    late = [(t, POINTS, bags.cloud(t)) for t in (2.0, 3.0, 3.5)]
+    tree = [(0.5, "/tf_static", bags.transform("velo_link", "first", (0, 0, 0)))]
+    tree.append((0.5, "/tf_static", bags.transform("velo_link", "other", (0, 0, 0), np.diag([1.0, -1, -1]))))
+    source = BagSource(bags.write(tmp_path / "b", sorted([*tree, *first, *other, *late], key=lambda m: m[0])))
+    for _ in range(2):  # read again
+        upwards = {frame.stamp: frame.imu.forces[:, 2].tolist() for frame in source.frames() if frame.imu is not None}
+        assert all(up == pytest.approx(9.8) for stamp, ups in upwards.items() for up in ups if stamp < 2 * SECOND)
+        assert upwards[round(3.5 * SECOND)] == pytest.approx([-9.8] * 31)
+    left_out = "/imu: 229 samples left out (the first: a message in frame 'other', those before are in 'first': a"
+    assert any(note.startswith(left_out) for note in source.notes)
+
+
 def test_unsound_samples_of_a_bag_are_counted(bags: Any, tmp_path: Path) -> None:
     messages = [quarter(bags), *drive(bags)]
     messages[20:20] = [(messages[20][0], "/imu", imu(bags, 1.0, rates=(NAN, 0, 0)))] * 3

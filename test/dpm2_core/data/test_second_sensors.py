@@ -12,7 +12,7 @@ import pytest
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
-from test.helpers.recordings import IMAGE, POINTS, Message, by_time, clouds, rig
+from test.helpers.recordings import IMAGE, INFO, POINTS, Message, by_time, clouds, rig, seen
 
 # --- a second LiDAR
 
@@ -112,6 +112,24 @@ def test_two_lidars_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp
 
 
 # --- a second camera
+
+
+def test_two_cameras_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp_path: Path) -> None:
+    """As of drivers in namespaces that are remapped to one topic. The other's images are nearer to the clouds, and its
+    calibration comes first: the images of the camera that was heard first count, with its calibration."""
+    sent = [(0.9, INFO, bags.info(0.9)), *clouds(bags, [1, 1.1, 1.2])]
+    sent[0][2].header.frame_id, sent[0][2].width = "left", 4
+    for n, t in enumerate((1, 1.1, 1.2)):
+        first, second = bags.image(t + 0.01, value=n), bags.image(t, value=9)
+        second.header.frame_id = "left"
+        sent += [(t - 0.02, IMAGE, first), (t - 0.01, IMAGE, second)]
+    place = (1, "/tf_static", bags.transform("velo_link", "left", (0, 1, 0)))
+    source = BagSource(bags.write(tmp_path / "b", by_time([*rig(bags), place, *sent])))
+    for _ in range(2):  # read again
+        assert seen(source) == [0, 1, 2]
+    problem = "a message in frame 'left', those before are in 'cam': a topic has one sensor"
+    assert f"{IMAGE}: 3 samples left out (the first: {problem})" in source.notes
+
 
 REAR, REAR_INFO = "/rear/image_raw", "/rear/camera_info"
 
