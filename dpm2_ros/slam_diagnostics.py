@@ -245,7 +245,7 @@ class Diagnostics:
             level, text = WARN, silence
         elif problem := self._frames.problems.get(topic):
             level, text = ERROR, problem
-        elif not sensor.awaited:
+        elif not sensor.fits:
             level, text = WARN, f"{what}s come too late or have stamps of another clock"
         else:
             return self._status(part, OK, "in use", figures)

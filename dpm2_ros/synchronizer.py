@@ -74,6 +74,8 @@ class SensorState:
     """Messages for which a cloud had not waited."""
     missed: int = 0
     """Clouds in a row that left without it."""
+    unused: int = 0
+    """Messages in a row that went with no cloud."""
     last_arrival: float | None = None
     present: bool = True
     """Whether there is a publisher; clouds do not wait for a sensor without one."""
@@ -82,6 +84,11 @@ class SensorState:
     def awaited(self) -> bool:
         """Whether a cloud still waits for this sensor."""
         return self.missed < PATIENCE
+
+    @property
+    def fits(self) -> bool:
+        """Whether its messages go with clouds. A slow sensor misses most of these, and its messages go with some."""
+        return self.awaited or self.unused < PATIENCE
 
     def waits(self, stamp: int) -> bool:
         """Whether a cloud of that stamp (ns) should."""
@@ -186,6 +193,7 @@ class Synchronizer:
         sensor, left = self.sensors[topic], self.left
         tolerance = sensor.messages.tolerance
         sensor.received += 1
+        sensor.unused += 1
         sensor.last_arrival = now
         late = left is not None and -JUMP < stamp - left.stamp <= (tolerance if sensor.missed else -tolerance)
         sensor.late += late
@@ -216,6 +224,7 @@ class Synchronizer:
         for topic, sensor in sensors.items():
             sensor.matched += found[topic] is not None
             sensor.missed += found[topic] is None
+            sensor.unused *= found[topic] is None
             sensor.messages.forget(head.stamp)
         head.beside = {topic: message for topic, message in found.items() if message is not None}
         self._queue.popleft()

@@ -174,6 +174,21 @@ def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
     assert camera_of(synchronizer).late == 20
 
 
+@pytest.mark.parametrize(("late", "fits"), [(0.0, True), (0.09, False)])
+def test_a_slow_camera_fits_where_its_images_are_used(late: float, fits: bool) -> None:
+    """Of 2 Hz beside 20: most clouds have no image, and all images have a cloud, unless they are too late."""
+    synchronizer, said = make(), list[bool]()
+    for tick in range(2000):  # 10 ms
+        now = 0.01 * tick
+        if tick % 50 == round(100 * late):
+            synchronizer.add("/image", (100 + 10 * tick - round(1000 * late)) * MS, tick, now)
+        if tick % 5 == 0:
+            synchronizer.add_cloud((100 + 10 * tick) * MS, tick, now)
+        drain(synchronizer, now)
+        said.append(camera_of(synchronizer).fits)
+    assert set(said[-1000:]) == {fits}
+
+
 @pytest.mark.parametrize("images", [0, 5], ids=["never comes", "stops"])
 def test_a_camera_that_brings_no_more_is_given_up_after_some_frames(images: int) -> None:
     synchronizer = make()
