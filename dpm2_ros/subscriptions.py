@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time_source import CLOCK_TOPIC
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, NavSatFix, PointCloud2
 from std_msgs.msg import Float64
 
@@ -28,7 +29,7 @@ from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
-from dpm2_ros.guard import GuardedNode
+from dpm2_ros.guard import GuardedNode, take_waiting
 from dpm2_ros.losses import Losses
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
@@ -170,6 +171,7 @@ class Inputs:
 
     def _on_cloud(self, message: PointCloud2 | bytes, info: Mapping[str, Any]) -> None:
         cloud, *others = self.subscriptions
+        self._take_clock()
         for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
             other.take()
         # Several publishers count each for themselves.
@@ -197,6 +199,13 @@ class Inputs:
             self._node.get_logger().warning(said)
         elif check is not StampCheck.ACCEPTED:
             self._node.get_logger().warning(said, throttle_duration_sec=5)
+
+    def _take_clock(self) -> None:
+        """Follow what has come on /clock already: in lockstep no other time passes, and its time is the cloud's."""
+        if self._node.get_clock().ros_time_is_active:
+            for subscription in list(self._node.subscriptions):
+                if subscription.topic_name == CLOCK_TOPIC:
+                    take_waiting(subscription)
 
     def _on_image(self, camera: CameraTopic, message: Any) -> None:
         check_header(message.header)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Float64
 
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
@@ -23,6 +24,7 @@ from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.runtime import end_ros, ros_context
 from dpm2_ros.settings import RosSettings
+from dpm2_ros.stamps import stamp_to_msg
 from dpm2_ros.subscriptions import LATCHED, Inputs
 
 INFO = CameraInfo(height=6, width=8, k=[5.0, 0, 4, 0, 5, 3, 0, 0, 1], p=[5.0, 0, 4, 0, 0, 5, 3, 0, 0, 0, 1, 0])
@@ -170,6 +172,35 @@ def test_a_camera_info_that_cannot_be_used_replaces_none_that_can(node: Callable
         rclpy.spin_once(n, timeout_sec=0.2)
     assert sum(n.rejections.values()) == 1
     assert made.calibration.cameras[0].info == INFO
+
+
+class LastFirst(GuardedNode):
+    """Of what has come on several topics, an executor takes that of its last subscription first."""
+
+    @property
+    def subscriptions(self) -> Iterator[Any]:
+        yield from reversed(list(super().subscriptions))
+
+
+def test_a_cloud_has_the_time_of_the_clock_that_was_sent_before_it(domain: int) -> None:
+    """Whichever is taken first. With that of the cloud before, a gap in a replay in lockstep was a clock that was
+    set."""
+    ros_context(["--ros-args", "-p", "use_sim_time:=true"], domain)
+    n = LastFirst("listener")
+    try:
+        made = inputs(n, points_topic="/points", images=False)
+        clock, clouds = n.create_publisher(Clock, "/clock", 10), n.create_publisher(PointCloud2, "/points", 10)
+        taken: list[float] = []
+        end = time.monotonic() + 20
+        for seconds in (5, 8):
+            clock.publish(Clock(clock=stamp_to_msg(seconds * 10**9)))
+            clouds.publish(cloud_to_msg(CLOUD, seconds * 10**9, "lidar"))
+            while len(taken) < seconds // 4 and time.monotonic() < end:
+                rclpy.spin_once(n, timeout_sec=0.1)
+                taken += [bundle.clock for bundle in [made.take(0.0)] if bundle is not None]
+        assert taken == [5.0, 8.0]
+    finally:
+        end_ros(n)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 90.0, -5.1])
