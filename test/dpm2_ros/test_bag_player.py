@@ -67,8 +67,8 @@ def listener(ros: Callable[..., Any], tmp_path: Path) -> Listener:
     return Listener(ros(), tmp_path / "player.log")
 
 
-def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Path, drive: Any, tmp_path: Path) -> None:
-    player = listener.play(str(bag), "--wait", "90", "--rate", "2", "--log", str(tmp_path / "times.csv"))
+def test_everything_arrives_as_recorded(listener: Listener, bag: Path, drive: Any) -> None:
+    player = listener.play(str(bag), "--wait", "90", "--rate", "2")
     assert player.wait(180) == 0, listener.output()
     wait = listener.harness.wait
     wait(lambda: len(listener.clouds) == len(listener.images) == drive.frames, "every cloud and image")
@@ -79,14 +79,6 @@ def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Pat
         np.testing.assert_array_equal(decode_points(message)[0], frame.points)
         np.testing.assert_array_equal(decode_image(image), frame.images[0].pixels)
     assert {t.child_frame_id for t in listener.static[0].transforms} >= {"velo_link", "camera_color_left"}
-    with (tmp_path / "times.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    published = np.array([int(row["published_ns"]) for row in rows if row["topic"] == topics.POINTS])
-    assert len(published) == drive.frames
-    # 0.1 s at twice the speed, from the first message on; on a busy machine single ones may be late, but none early
-    late = (published - int(rows[0]["published_ns"])) * 1e-9 - 0.05 * np.arange(drive.frames)
-    assert (late > -0.04).all()  # not by a period; the first one may have been late by less
-    assert np.median(late) < 0.3
     ticks = lambda: [message.clock.sec * 10**9 + message.clock.nanosec for message in listener.clock]  # noqa: E731
     wait(lambda: ticks()[-1:] == [source.stamps[-1]], "the last of /clock")
     now = np.array(ticks())
@@ -94,6 +86,43 @@ def test_everything_arrives_as_recorded_and_in_time(listener: Listener, bag: Pat
     assert (np.diff(now) >= -20_000_000).all()  # while it waits the clock is measured, and may be ahead by a moment
     assert now[0] >= source.stamps[0] - 20_000_000
     assert now[-1] == source.stamps[-1]
+
+
+class VirtualTime:
+    """Of a machine on which nothing takes time but waiting: in place of the player's `time` and of its `STOP`."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        self.now += 1e-6  # or what waits for others, which take real time, would wait for ever
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return round(self.now * 1e9)
+
+    def wait(self, seconds: float) -> bool:
+        self.now += seconds
+        return False
+
+    def is_set(self) -> bool:
+        return False
+
+
+def test_each_message_goes_out_when_it_is_due(
+    listener: Listener, bag: Path, drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At twice the speed, as far as the player has to do with it: not what a busy machine makes of it."""
+    virtual = VirtualTime()
+    for name in ("time", "STOP"):
+        monkeypatch.setattr(f"dpm2_ros.bag_player.{name}", virtual)
+    listener.hear_here(bag, rate=2.0, log=tmp_path / "times.csv")
+    with (tmp_path / "times.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(row["topic"] == topics.POINTS for row in rows) == drive.frames
+    recorded, published = (np.array([int(row[key]) for row in rows]) for key in ("log_time_ns", "published_ns"))
+    late = (published - published[0]) - (recorded - recorded[0]) / 2
+    assert np.abs(late).max() < 1e6  # ns: a microsecond for each look at the clock
 
 
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
