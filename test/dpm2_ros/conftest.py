@@ -11,7 +11,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from concurrent.futures import Future
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -177,9 +178,13 @@ class Harness:
     def remove(self, node: Node) -> None:
         """Close a node under test before the end."""
         self._closing.remove(node)
-        self._executor.remove_node(node)
-        node.close()  # type: ignore[attr-defined]
-        node.destroy_node()
+
+        def end() -> None:
+            self._executor.remove_node(node)
+            node.close()  # type: ignore[attr-defined]
+            node.destroy_node()
+
+        self._between_waits(end, f"the end of {node.get_name()}")
 
     def start(self, name: str, arguments: Sequence[str], log: Path, **variables: str) -> subprocess.Popen[bytes]:
         """One of the executables as a process that sees these nodes, and in the end is killed."""
@@ -278,12 +283,25 @@ class Harness:
         self.destroy(reader)
 
     def destroy(self, entity: Any) -> None:
-        """A publisher or subscription of the tester, between two waits of the thread that spins: rclpy raises in that
-        thread where it is about to wait for one that another thread destroys."""
+        """A publisher or subscription of the tester."""
         is_publisher = entity in list(self.node.publishers)
         destroy = self.node.destroy_publisher if is_publisher else self.node.destroy_subscription
-        task = self._executor.create_task(destroy, entity)
-        self.wait(task.done, "the end of a publisher or subscription")
+        self._between_waits(partial(destroy, entity), "the end of a publisher or subscription")
+
+    def _between_waits(self, work: Callable[[], Any], what: str) -> None:
+        """In the thread that spins, between two of its waits: rclpy raises in that thread where it is about to wait for
+        something that another thread destroys, and no callback is to meet a node that another thread is closing."""
+        done = Future[Any]()
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except BaseException as error:
+                done.set_exception(error)
+
+        self._executor.create_task(run)
+        self.wait(done.done, what)
+        done.result()
 
     @staticmethod
     def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:
@@ -298,17 +316,17 @@ class Harness:
             time.sleep(max(0.01, 5 * (time.thread_time() - began)))
 
     def close(self) -> None:
-        """Kill the processes, close the nodes under test, then everything else."""
+        """Kill the processes, end the thread that spins, close the nodes under test, as programs do, and the rest."""
         for process in self._processes:
             process.kill()
             process.wait()
+        self._ended.set()
+        self._executor.wake()
+        self._thread.join()
         try:
             for node in self._closing:
                 node.close()
         finally:
-            self._ended.set()
-            self._executor.wake()
-            self._thread.join()
             self._executor.shutdown()
             end_ros(*self._closing, self.node)
 
