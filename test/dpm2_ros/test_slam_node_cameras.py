@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Image, PointCloud2
 
@@ -62,7 +63,7 @@ def test_the_cloud_is_painted_into_its_image_for_who_looks(rig: Callable[..., Ri
 SECOND = "input.second_image_topic:=/rear/image"
 
 
-def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig]) -> None:
+def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
     """The second looks back. Without a place it is left out, said; late and silent it costs its image alone."""
     r, camera = with_camera(rig, PLACE, SECOND, "ros.sync_timeout:=1.0")
     rear = Camera(r, "/rear/image", "/rear/camera_info", "rear")
@@ -93,6 +94,7 @@ def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig]) -> None:
     np.testing.assert_allclose(frames[1].images[1].camera.T_lidar_cam[:3, 2], [-1, 0, 0], atol=1e-9)
     r.wait(lambda: len(shown[0]) == 4 and len(shown[1]) == 3, "every image with its cloud")
     assert {message.header.frame_id for message in shown[1]} == {"rear"}
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     r.status("second camera", saying("no image on /rear/image for"))
     assert figures(r.processed(5))["failed registrations"] == "0"
 
@@ -171,7 +173,9 @@ def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
     r.status("second lidar", having(received=5, used=5, late=0))
 
 
-def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig], drive: Any) -> None:
+def test_a_camera_that_never_comes_comes_late_and_stops(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every cloud gets its pose all the while, and /diagnostics shows it."""
     r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=0.05")
     frames = record_frames(r)
@@ -185,6 +189,7 @@ def test_a_camera_that_never_comes_comes_late_and_stops(rig: Callable[..., Rig],
     assert r.status("camera", saying("in use"), since=seen).level == DiagnosticStatus.OK
     r.send_and_wait(*range(10, drive.frames))
     assert [bool(frame.images) for frame in frames] == [3 <= n < 10 for n in range(drive.frames)]
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     assert r.status("camera", saying("no image")).level == DiagnosticStatus.WARN
 
 

@@ -196,10 +196,11 @@ def test_one_cloud_stamped_far_ahead_costs_that_cloud_alone(rig: Callable[..., R
     assert np.linalg.norm(end - drive.pose(drive.frames - 1)[:3, 3]) < ACCURATE
 
 
-def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig]) -> None:
+def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
     r = rig()
     assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud yet")).level == DiagnosticStatus.STALE
     r.send_and_wait(0)
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud for")).level == DiagnosticStatus.STALE
 
 
@@ -229,9 +230,12 @@ def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: C
         assert harness.status(f"slam_node: {part}", saying(says)).level != DiagnosticStatus.OK
 
 
-def test_a_lidar_that_comes_back_less_reliable_than_asked_for_is_reported(rig: Callable[..., Rig]) -> None:
+def test_a_lidar_that_comes_back_less_reliable_than_asked_for_is_reported(
+    rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     r = rig("ros.reliability:=reliable")
     r.send_and_wait(0)
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     r.harness.destroy(r.lidar)
     r.harness.publisher(PointCloud2, POINTS, reliable=False)
     assert r.status("odometry", saying(f"{POINTS} is best effort")).level == DiagnosticStatus.ERROR
