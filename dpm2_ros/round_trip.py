@@ -13,6 +13,10 @@ import subprocess
 import sys
 import time
 
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from std_msgs.msg import UInt8MultiArray
+
 from dpm2_core.errors import Dpm2Error, exit_code
 from dpm2_ros.runtime import end_ros, ros_context
 
@@ -27,10 +31,6 @@ def receive(topic: str) -> dict[str, object]:
     Raises:
         Dpm2Error: none came.
     """
-    import rclpy
-    from rclpy.qos import qos_profile_sensor_data
-    from std_msgs.msg import UInt8MultiArray
-
     ros_context([])
     node = rclpy.create_node("dpm2_round_trip_receiver")
     arrived: list[float] = []
@@ -56,10 +56,6 @@ def receive(topic: str) -> dict[str, object]:
 
 def send(topic: str) -> None:
     """Five messages a second, until the process is ended, or for as long as one waits for them."""
-    import rclpy
-    from rclpy.qos import qos_profile_sensor_data
-    from std_msgs.msg import UInt8MultiArray
-
     ros_context([])
     node = rclpy.create_node("dpm2_round_trip_sender")
     publisher = node.create_publisher(UInt8MultiArray, topic, qos_profile_sensor_data)
