@@ -195,7 +195,7 @@ class Layout:
         h, w = rng.uniform(0.7, 2.2), rng.uniform(0.5, 1.2)
         green = plants.GREENS[rng.integers(len(plants.GREENS))]
         section = ((0.0, -0.3), (0.0, h / 2), (0.08, h), (w / 2, h + 0.05), (w - 0.08, h), (w, h / 2), (w, -0.3))
-        mesh = kerbside_ribbon(self.terrain, line, section, Label.VEGETATION, Material.LEAF, green * 0.8)
+        mesh = kerbside_ribbon(self.terrain, line, section, Surface(Label.VEGETATION, Material.LEAF, green * 0.8))
         mesh.vertices += rng.normal(0, 0.08, mesh.vertices.shape).astype(np.float32)
         yield mesh
         corners = mesh.vertices[mesh.faces[rng.integers(0, len(mesh), 5 * len(mesh))]]
@@ -205,18 +205,10 @@ class Layout:
     def _wall(self, line: Kerbline) -> Iterator[Mesh]:
         h, brick = self.rng.uniform(0.4, 2.2), self.rng.random() < 0.5
         color = (150, 92, 76) if brick else self.rng.uniform(130, 210) * np.array([1, 0.98, 0.93])
-        section = (
-            (0.0, -0.5),
-            (0.0, h),
-            (-0.04, h),
-            (-0.04, h + 0.06),
-            (0.29, h + 0.06),
-            (0.29, h),
-            (0.25, h),
-            (0.25, -0.5),
-        )
-        material = Material.BRICK if brick else Material.CONCRETE
-        yield kerbside_ribbon(self.terrain, line, section, Label.FENCE, material, color)
+        coping = [(-0.04, h), (-0.04, h + 0.06), (0.29, h + 0.06), (0.29, h)]
+        section = [(0.0, -0.5), (0.0, h), *coping, (0.25, h), (0.25, -0.5)]
+        stone = Surface(Label.FENCE, Material.BRICK if brick else Material.CONCRETE, color)
+        yield kerbside_ribbon(self.terrain, line, section, stone)
 
     def _fence(self, line: Kerbline) -> Iterator[Mesh]:
         """Pickets and two rails, per meter."""

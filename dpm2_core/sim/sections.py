@@ -25,7 +25,7 @@ def swept(path: Path, terrain: Terrain, profile: ArrayLike, surface: Surface) ->
     every = slice(None, None, 4)  # 2 m
     xy = np.stack([path.at(path.s, y)[0][every] for y in profile[:, 0]], 1)
     z = terrain.height_at(path.xy[every])[:, None] + profile[None, :, 1]
-    return sheet(np.concatenate([xy, z[..., None]], -1), *surface)
+    return sheet(np.concatenate([xy, z[..., None]], -1), surface)
 
 
 def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh]:

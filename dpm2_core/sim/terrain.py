@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array
-from dpm2_core.sim.materials import Label, Material
+from dpm2_core.sim.materials import Label, Material, Surface
 from dpm2_core.sim.mesh import Mesh, make, merge
 from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import Preset
@@ -234,33 +234,20 @@ class Terrain:
     def _sidewalks(self) -> Iterator[Mesh]:
         if not (width := self.preset.sidewalk):
             return
+        section = ((-0.02, -0.02), (0.0, KERB), (0.12, KERB), (width, KERB), (width + 0.05, -0.1))
         for line in self.contour(0.0):
-            yield kerbside_ribbon(
-                self,
-                line,
-                ((-0.02, -0.02), (0.0, KERB), (0.12, KERB), (width, KERB), (width + 0.05, -0.1)),
-                Label.SIDEWALK,
-                Material.PAVING,
-                (165, 160, 152),
-            )
+            yield kerbside_ribbon(self, line, section, Surface(Label.SIDEWALK, Material.PAVING, (165, 160, 152)))
 
 
-def kerbside_ribbon(
-    terrain: Terrain,
-    line: Kerbline,
-    profile: tuple[tuple[float, float], ...],
-    label: Label,
-    material: Material,
-    color: ArrayLike,
-) -> Mesh:
+def kerbside_ribbon(terrain: Terrain, line: Kerbline, profile: ArrayLike, surface: Surface) -> Mesh:
     """A section of (offset outward, height over the ground) points, m, drawn along a line on the terrain."""
     section = np.asarray(profile, float)
     xy = line.xy[:, None] + line.outward[:, None] * section[:, :1]
     z = terrain.height_at(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + section[:, 1]
-    return sheet(np.concatenate([xy, z[..., None]], -1), label, material, color)
+    return sheet(np.concatenate([xy, z[..., None]], -1), surface)
 
 
-def sheet(points: ArrayLike, label: Label, material: Material, color: ArrayLike) -> Mesh:
+def sheet(points: ArrayLike, surface: Surface) -> Mesh:
     """A surface through a grid (N, M, 3) of points; surface coordinates are meters along its columns and rows."""
     points = np.asarray(points, float)
     n, m = points.shape[:2]
@@ -269,7 +256,7 @@ def sheet(points: ArrayLike, label: Label, material: Material, color: ArrayLike)
     faces = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
     along, across = arc_lengths(points[:, m // 2]), arc_lengths(points[n // 2])
     uv = np.stack(np.broadcast_arrays(along[:, None], across[None]), -1).reshape(-1, 2)
-    return make(points.reshape(-1, 3), faces, label, material, color, uv[faces])
+    return make(points.reshape(-1, 3), faces, *surface, uv[faces])
 
 
 def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
