@@ -87,6 +87,15 @@ class ActiveMap:
             self._log.info(f"robot {robot or '/'}: its place in the map is known")
         return result.loops
 
+    def settle(self, wait: bool = False) -> bool:
+        """What another process has solved is in the map, and in where its robots are; see `Mapper.settle`."""
+        if not self.mapper.settle(wait):
+            return False
+        if self._T_map_odom is not None:  # not so of a robot that has started again: its last keyframe is of before
+            found = {robot: self.mapper.T_map_odom_of(robot) for robot in self._T_map_odom}
+            self._T_map_odom = {robot: T for robot, T in found.items() if T is not None}
+        return True
+
     def localise(self, name: str = "") -> str:
         """End the map that grows, if it does, and look for the robot in its file; says so in words.
 
@@ -194,6 +203,7 @@ class ActiveMap:
             raise UsageError("no map is saved: in localization_mode the map stays as it is, in its file")
         if not self.mapper.keyframes:
             raise UsageError("no map is saved: there is no keyframe yet")
+        self.settle(wait=True)
         try:
             folder = self._folders[name] = self._folders.get(name) or self._maps.claimed(name, self._path)
             save_map(self.mapper, folder)

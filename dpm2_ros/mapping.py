@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ class MapperThread:
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
         self._of_no_use = ""  # why it is, in words
+        self._settled: Future[None] = self._submit(lambda: None)  # done: nobody looks for what has been solved
         node.create_timer(0.1, self._show)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
@@ -205,6 +207,10 @@ class MapperThread:
         self._changes += 1
         return result
 
+    def _settle(self) -> None:
+        if self.active.settle():
+            self._changes += 1
+
     def _take_in(self, number: int, make: Callable[[], Keyframe]) -> None:
         before, behind = self.keyframes, self.store_problem
         try:
@@ -239,10 +245,13 @@ class MapperThread:
             self._loop_closures.publish(edge_to_msg(loop.T_from_to, loop.covariance, stamp, *names))
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        await respond(self._node, self._thread.submit(self.active.save, self._config.ros.map_name), response)
+        save = partial(self.active.save, self._config.ros.map_name)
+        await respond(self._node, self._thread.submit(self._change, save), response)
         return response
 
     def _show(self) -> None:
+        if self._settled.done() and self.active.mapper.graph.busy:
+            self._settled = self._submit(self._settle)
         for display in self._displays:
             if display.due(self._changes):
                 self._submit(display.publish)

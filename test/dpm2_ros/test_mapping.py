@@ -9,17 +9,23 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from nav_msgs.msg import Path as PathMsg
 from std_srvs.srv import Trigger
 
+from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.estimates import Edge, Registration
 from dpm2_core.geometry import se3
 from dpm2_ros.display import path_to_msg
 from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.runtime import lower_priority
+
+from ..helpers.mapping import core, mapped, placed, send_all
 
 
 def niceness() -> int:
@@ -45,6 +51,32 @@ def test_the_path_of_a_long_drive_is_soon_made() -> None:
     np.testing.assert_allclose([transform_matrix(one.pose) for one in message.poses], poses, atol=1e-9)  # rounding
     assert [one.header.stamp.nanosec for one in message.poses] == list(range(2000))
     assert path_to_msg(np.zeros((0, 4, 4)), [], "map").poses == []
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_loop_after_which_the_robot_stands_still_counts(
+    mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, saved: bool
+) -> None:
+    """What another process has solved of a large graph was taken in with the next keyframe alone: a robot that had come
+    home and stopped stayed where it was without that loop, and so did the map that ~/save_map wrote."""
+    monkeypatch.setattr("dpm2_core.slam.graph.pose_graph.SHORT", 1)  # else small graphs are solved at once
+    move, transforms = placed(mapper)
+    send_all(mapper, 0, 1, 2)
+    mapped(mapper, 3)
+    graph = core(mapper).graph  # its thread has nothing to do now
+    graph.add_loop(Edge("loop", 0, 2, Registration(se3.exp([0, 0, 0, 10.02, 0, 0]), np.eye(6) * 1e-8)))
+    graph.optimize()  # as with the last keyframe
+    if saved:
+        assert mapper.call(Trigger, "/mapper_node/save_map").success
+        poses = read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").poses
+    else:
+        path = mapper.hear(PathMsg, "/dpm2/path", 10)
+        mapper.wait(lambda: path and path[-1].poses[-1].pose.position.x > 10.01, "the path with that loop")
+        poses = np.array([transform_matrix(one.pose) for one in path[-1].poses])
+    np.testing.assert_allclose(poses[:, 0, 3], [0, 5.01, 10.02], atol=1e-3)  # of 0.1 mm, as certain as the loop is
+    move(1)
+    mapper.wait(lambda: transforms, "a transform")
+    assert transforms[-1].transforms[0].transform.translation.x == pytest.approx(0.02, abs=1e-3)
 
 
 class Failing(GuardedNode):

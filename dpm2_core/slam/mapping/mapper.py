@@ -216,10 +216,21 @@ class Mapper:
             self._writer.add(node, self.keyframes[node], thumbnail, edges)
             self._writer.sync(self.poses, self.graph.georeference)
 
+    def settle(self, wait: bool = False) -> bool:
+        """Take in what another process has solved since the last keyframe: where the robot has stopped none follows.
+
+        `wait`: for all that is to be solved. Returns whether anything was.
+        """
+        if unsolved := wait and self.graph.unsolved:
+            self._optimize(changed=True)
+        changed = self.graph.collect(wait) or unsolved
+        if changed and self._writer is not None:
+            self._writer.sync(self.poses, self.graph.georeference)
+        return changed
+
     def finish(self) -> None:
         """At the end of a drive: wait for the solver, find moving points in the last clouds, write the map file."""
-        self._optimize(changed=self.graph.unsolved)
-        self._optimize(changed=False, wait=True)
+        self.settle(wait=True)
         self.graph.close()
         for robot in self._robots.values():
             self._mark_moving(robot.window.finish(self.poses))
@@ -316,9 +327,9 @@ class Mapper:
                 return loop.rejected(str(error))
         return loop
 
-    def _optimize(self, changed: bool, wait: bool = False) -> None:
-        """Solve the graph if it has `changed`, take in what another process has solved; `wait` for that."""
-        self.graph.collect(wait)
+    def _optimize(self, changed: bool) -> None:
+        """Solve the graph if it has `changed`, take in what another process has solved."""
+        self.graph.collect()
         if changed:
             try:
                 self.graph.optimize()
