@@ -31,7 +31,7 @@ from dpm2_ros.transform_history import TransformHistory
 WAIT = 0.1
 """s that a cloud waits for the odometry that comes after it."""
 PATIENCE = 5
-"""Clouds in a row without it, after which none waits any more until it is there again."""
+"""Clouds in a row without it, after which none waits any more until it is there again, or would have been."""
 _MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
 _SLIPS = 0.01  # so much is said
 _DOUBTFUL = 1.5  # times as far off as assumed
@@ -58,7 +58,8 @@ class OtherOdometry:
         self._child = ""  # whose pose the topic has
         self.source = node.resolve_topic_name("/tf" if ros.odom_source == "tf" else ros.odom_topic)
         self.problem, self.missed, self.found, self.outweighed = f"nothing of use on {self.source} yet", 0, 0, 0
-        self._in_a_row = 0
+        self._in_a_row = 0  # clouds without it
+        self._unmet: tuple[int, str, float] | None = None  # the last such: stamp, base, and until when it was to wait
         self._comparison: Comparison | None = None
         self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
         self._ways = np.zeros(2)  # m, of late: its own, and those of the scans
@@ -73,12 +74,14 @@ class OtherOdometry:
 
     def guess(self, stamp: int, base: str, T_base_lidar: Array) -> Guess | None:
         """Where it has the LiDAR at a stamp (ns), as soon as it says so; None where it does not."""
-        end = time.monotonic() + (WAIT if self._in_a_row < PATIENCE else 0.0)
+        began = time.monotonic()
         with self._changed:
+            end = began + (WAIT if self._in_a_row < PATIENCE else 0.0)
             while (found := self._look(stamp, base)) is None and (left := end - time.monotonic()) > 0:
                 self._changed.wait(left)
+            self._in_a_row = 0 if found is not None else self._in_a_row + 1
+            self._unmet = None if found is not None else (stamp, base, began + WAIT)
         self.found, self.missed = self.found + (found is not None), self.missed + (found is None)
-        self._in_a_row = 0 if found is not None else self._in_a_row + 1
         if found is None:
             self._comparison = None
             return None
@@ -89,9 +92,10 @@ class OtherOdometry:
 
     def T_odom_base(self, stamp: int, base: str) -> Array | None:
         """(4, 4) at a stamp (ns), if it is known already."""
-        with self._changed:
-            found = self._look(stamp, base)
-        return None if found is None else found[0]
+        with self._changed, suppress(UsageError):
+            found = self._find(stamp, base)
+            return None if found is None else found[0]
+        return None
 
     def judge(self, comparison: Comparison | None) -> str:
         """What the scan of the last cloud said to it; returns why it was outweighed, or an empty text."""
@@ -131,20 +135,35 @@ class OtherOdometry:
         return "; ".join(said)
 
     def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
-        static, source = self._static(), base if self._subscription is None else self._child
-        if not source:  # no message was of use: `problem` is as at the start
-            return None
+        """As `_find`, and `problem` says why not."""
         try:
-            T, covariance = self._history.lookup(self._frame, source, stamp, static)
-            if source != base:
-                T_child_base = static.lookup(source, base)
-                T = T @ T_child_base
-                covariance = None if covariance is None else _turned(covariance, T_child_base)
+            found = self._find(stamp, base)
         except UsageError as error:
             self.problem = f"{self.source}: {error}"
             return None
-        self.problem = ""
+        if found is not None:
+            self.problem = ""
+        return found
+
+    def _find(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
+        static, source = self._static(), base if self._subscription is None else self._child
+        if not source:  # no message was of use: `problem` is as at the start
+            return None
+        T, covariance = self._history.lookup(self._frame, source, stamp, static)
+        if source != base:
+            T_child_base = static.lookup(source, base)
+            T = T @ T_child_base
+            covariance = None if covariance is None else _turned(covariance, T_child_base)
         return T, covariance
+
+    def _tell(self) -> None:
+        """Something has come: whoever waits looks again, and the next cloud waits if this one would have had it so."""
+        if self._unmet is not None and self._in_a_row >= PATIENCE:
+            stamp, base, end = self._unmet
+            with suppress(UsageError):
+                if time.monotonic() <= end and self._find(stamp, base) is not None:
+                    self._in_a_row = 0
+        self._changed.notify()
 
     def _on_tf(self, message: Any) -> None:
         check_transforms(message)
@@ -154,7 +173,7 @@ class OtherOdometry:
                 check_frame(parent)
                 check_frame(child)
                 self._history.add(parent, child, stamp_ns(stamped.header), stamped.transform)
-            self._changed.notify()
+            self._tell()
 
     def _on_odometry(self, message: Odometry) -> None:
         check_header(message.header)
@@ -174,7 +193,7 @@ class OtherOdometry:
         with self._changed:
             self._child = child
             self._history.add(frame, child, stamp_ns(message.header), message.pose.pose, covariance)
-            self._changed.notify()
+            self._tell()
 
 
 def _turned(covariance: Array, T_body_other: Array) -> Array:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -133,6 +134,25 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
     r.wait(lambda: len(r.links().get(("map", "odom"), {})) >= 7, "map -> odom")
     assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in (3, 4, 5, 6, 9, 10, 11)]
     assert r.off(r.base) < ACCURATE
+
+
+def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
+    robot: Callable[..., Robot], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where its samples come right after the clouds, none was ever used that had not been there for the first ones: no
+    cloud waited any more, and without that wait nothing was known at its stamp."""
+    monkeypatch.setattr("dpm2_ros.other_odometry.PATIENCE", 1)
+    r = robot("topic")
+    r.go(0, wheels=False)
+    r.turn_wheels(0)
+    for n in (1, 2, 3):  # from now on none waits, unless one would have had it so
+        r.send(n)
+        time.sleep(0.3)  # on a busy machine the cloud may come later yet, and need not wait
+        r.turn_wheels(n)
+        r.wait(lambda n=n: len(r.odom) > n, "the odometry of the cloud")
+        time.sleep(0.3)  # for the wheels, which come by another topic than the next cloud
+    r.status("other odometry", having(**{"clouds with it": 2, "without": 2}))
+    r.wait(lambda: set(r.links().get(("map", "odom"), {})) == {drive.stamp(2), drive.stamp(3)}, "map -> odom")
 
 
 def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
