@@ -139,6 +139,7 @@ class SlamNode(ManagedNode):
         self._held: list[OdometryResult] = []  # until the base frame is known
         self._covariance = np.zeros((6, 6))
         self._before: BodyMotion | None = None  # the last registered frame, of which `_covariance` is
+        self._unsent: BodyMotion | None = None  # the last frame, if the other odometry was not known at its stamp
 
     def _work(self) -> None:
         while not self._stopping.is_set():
@@ -280,11 +281,19 @@ class SlamNode(ManagedNode):
             self._send_map(motion)  # where the map does not grow nobody is in it by an odometry that is lost
 
     def _send_map(self, motion: BodyMotion) -> None:
-        """Where odom is: in the map, or, where the mapper is elsewhere, another's in our own."""
-        ros, T_own_odom = self._config.ros, None
+        """Where odom is: in the map, or, where the mapper is elsewhere, another's in our own.
+
+        Another odometry may tell of the end of a sweep after it has told of its middle: then with the next cloud.
+        """
+        ros, T_own_odom, before = self._config.ros, None, self._unsent
+        self._unsent = None
         if self._other is not None:
+            if before is not None:
+                self._send_map(before)
+                self._unsent = None  # stamps do not go back
             T_odom_base = self._other.T_odom_base(motion.stamp, self._base.name)
             if T_odom_base is None:  # nothing to correct
+                self._unsent = None if self._other.problem else motion
                 return
             T_own_odom = se3.orthonormalized(motion.T_odom_body @ se3.inverse(T_odom_base))
         if self._mapper is not None:

@@ -155,6 +155,28 @@ def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
     r.wait(lambda: set(r.links().get(("map", "odom"), {})) == {drive.stamp(2), drive.stamp(3)}, "map -> odom")
 
 
+def test_map_to_odom_waits_for_what_it_tells_of_the_end_of_a_sweep(robot: Callable[..., Robot], drive: Any) -> None:
+    """Of clouds that are stamped at their end, and an odometry at 10 Hz that had told of their middle alone when the
+    pose was there, map -> odom was never sent, and an odometry in use was said to be left out."""
+    r = robot("topic")
+    points = scan(pose(0))  # it stands
+    columns = {name: points[:, i] for i, name in enumerate(("x", "y", "z"))}
+    columns["time"] = np.linspace(-0.1, 0, len(points)).astype(np.float32)
+
+    def tell(stamp: int) -> None:
+        r.topic.publish(edge_to_msg(np.eye(4), 1e-4 * np.eye(6), stamp, "odom", "base_link"))
+
+    tell(drive.stamp(-1) - 20_000_000)
+    for n in range(4):
+        tell(drive.stamp(n) - 20_000_000)
+        r.lidar.publish(PointCloud2(header=header(drive.stamp(n), "lidar"), **cloud_fields(columns, PointField)))
+        r.wait(lambda n=n: len(r.odom) > n, "the odometry of the cloud")
+    said = r.status("other odometry", having(**{"clouds with it": 4, "without": 0}))
+    assert "going on without" not in said.message
+    r.wait(lambda: len(r.links().get(("map", "odom"), {})) == 3, "map -> odom")
+    assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in range(3)]  # of the last one with the next
+
+
 def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
     """Another frame, numbers that are none: counted, and the drive goes on."""
     r = robot("topic")
