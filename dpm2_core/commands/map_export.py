@@ -16,8 +16,13 @@ from dpm2_core.data.pcd import write_las, write_pcd
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_kitti, write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.map_page import write_map_page
 from dpm2_core.files import write_json
 from dpm2_core.frame import Points
+from dpm2_core.geometry import geodesy
+from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid, why_of_no_use, write_grid
+from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
+from dpm2_core.slam.mapping.parts import first_part, placed_on_earth
 from dpm2_core.slam.mapping.tiles import write_tiles
 from dpm2_core.slam.store.map_data import MapData, Way, load_map, map_cloud, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
@@ -69,8 +74,6 @@ def _loaded(store: MapStore) -> MapData:
 
 def _tied(data: MapData, out: Path) -> MapData:
     """What is tied to the first keyframe; says what is not, and is left out of a file."""
-    from dpm2_core.slam.mapping.parts import first_part
-
     tied = first_part(data)
     _say_without(out, ways(data), ways(tied), "no loop ties them to the first keyframe")
     return tied
@@ -93,9 +96,6 @@ def _cloud(data: MapData, out: Path, voxel: float) -> Points:
 
 
 def _export_geojson(data: MapData, out: Path) -> None:
-    from dpm2_core.geometry import geodesy
-    from dpm2_core.slam.mapping.parts import placed_on_earth
-
     placed, features = placed_on_earth(data), []
     if np.isnan(placed.poses).all():
         raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
@@ -112,16 +112,7 @@ def _export_geojson(data: MapData, out: Path) -> None:
     write_json(out, {"type": "FeatureCollection", "features": features})
 
 
-def _export_page(data: MapData, out: Path, voxel: float) -> None:
-    from dpm2_core.evaluation.map_page import write_map_page
-
-    write_map_page(out, _tied(data, out), voxel)
-
-
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
-    from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid, why_of_no_use, write_grid
-    from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
-
     tied = _tied(data, out)
     settings = OccupancySettings(resolution=resolution)
     write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings, tied.clouds.origin))
@@ -139,7 +130,7 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
     "ply": (lambda data, out, voxel: write_ply(out, _cloud(data, out, voxel)), "voxel"),
     "pcd": (lambda data, out, voxel: write_pcd(out, _cloud(data, out, voxel)), "voxel"),
     "las": (lambda data, out, voxel: write_las(out, _cloud(data, out, voxel)), "voxel"),
-    "html": (_export_page, "voxel"),
+    "html": (lambda data, out, voxel: write_map_page(out, _tied(data, out), voxel), "voxel"),
     "occupancy": (_export_occupancy, "resolution"),
     "tum": (lambda data, out, _: write_tum(out, *trajectory(_tied(data, out))), ""),
     "kitti": (lambda data, out, _: write_kitti(out, trajectory(_tied(data, out))[1]), ""),

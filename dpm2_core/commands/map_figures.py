@@ -5,21 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dpm2_core.commands.options import note
 from dpm2_core.database import size_with_log
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.map_data import MapData, Way, load_map, ways
 from dpm2_core.slam.store.map_file import missing_log
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
-
-if TYPE_CHECKING:
-    from dpm2_core.slam.graph.pose_graph import PoseGraph
 
 
 def say_what_is_missing(store: MapStore) -> None:
@@ -148,9 +147,6 @@ def _length(drives: Iterable[Way]) -> float:
 
 def graph_of(data: MapData) -> PoseGraph:
     """The pose graph of a map, with the poses that it has."""
-    from dpm2_core.slam.graph.pose_graph import PoseGraph
-    from dpm2_core.slam.graph.robust import RobustSettings
-
     graph = PoseGraph(RobustSettings())
     restore_solved(graph, data)
     return graph

@@ -16,7 +16,8 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import weights_id
-from dpm2_core.slam.mapping.merge import merge_maps, off_by_satellites, tie_of
+from dpm2_core.slam.graph.pose_graph import PoseGraph
+from dpm2_core.slam.mapping.merge import align, loops_by, merge_maps, off_by_satellites, optimized, tie_of
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_data import MapData, check_new, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
@@ -80,8 +81,6 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
         Dpm2Error: one shares none.
     """
     from dpm2_core.slam.build import make_loops
-    from dpm2_core.slam.graph.pose_graph import PoseGraph
-    from dpm2_core.slam.mapping.merge import align, loops_by, merge_maps, optimized
 
     (_, first), *waiting = maps
     while waiting:
