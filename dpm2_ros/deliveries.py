@@ -41,22 +41,21 @@ class Delivery:
         return below + len(above)
 
     @property
-    def delivered(self) -> int:
-        """How many are in the mapper's map file, as far as there is no gap."""
-        return self._acks.agreed[0]
+    def late(self) -> int:
+        """How many are not in the mapper's map file, from the first gap on."""
+        return len(self.file) - self._acks.agreed[0]
 
     def acknowledge(self, below: int, above: Set[int], now: float) -> None:
         """All ids below a number are in the map file; some above have arrived, too."""
         made = len(self.file)
         self._acks.add(min(below, made), {id for id in above if below <= id < made}, now)
-        whole = self.delivered == made
-        self._whole_since = None if not whole else self._whole_since or now
+        self._whole_since = None if self.late else self._whole_since or now
 
     def certain(self, now: float) -> bool:
         """Whether all are delivered, by more than one acknowledgment; of a drive without keyframes too."""
         if not len(self.file):
             return True
-        return self.delivered == len(self.file) and self._whole_since is not None and now - self._whole_since > _CERTAIN
+        return not self.late and self._whole_since is not None and now - self._whole_since > _CERTAIN
 
     def due(self, now: float, most: int) -> list[int]:
         """Ids to be sent now."""

@@ -116,7 +116,7 @@ class KeyframeSender:
         What it does not have stays on the disk, for the next start.
         """
         end = time.monotonic() + _FAREWELL
-        while any(map(self._late, self._drives)) and self._received.get_publisher_count():
+        while any(drive.late for drive in self._drives) and self._received.get_publisher_count():
             if time.monotonic() > end:
                 break
             time.sleep(_TICK)
@@ -124,7 +124,7 @@ class KeyframeSender:
             self._repeat()
         with self._lock:
             for drive in self._drives:
-                late, file = self._late(drive), drive.file
+                late, file = drive.late, drive.file
                 if late:
                     file.catch_up()  # there may be room by now
                 lost = min(late, len(file) - file.stored)
@@ -135,11 +135,6 @@ class KeyframeSender:
                     kept = "on the disk" if file.path is None else f"in {file.path}"
                     why = file.problem or "ros.map_directory is empty"
                     self._log.error(f"{lost} keyframes neither delivered nor {kept}: {why}")
-
-    @staticmethod
-    def _late(drive: Delivery) -> int:
-        """Keyframes that are not in the mapper's file."""
-        return len(drive.file) - drive.delivered
 
     def _file(self, session: str) -> KeyframeFile:
         """Of a new drive, on the disk if that can be."""

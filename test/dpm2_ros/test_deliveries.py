@@ -27,7 +27,7 @@ def test_what_is_not_acknowledged_is_sent_again_after_a_while() -> None:
     assert drive.due(2.1, 8) == list(range(8, 16))
     drive.acknowledge(12, {14}, 2.5)
     assert drive.due(4.0, 8) == [12, 13, 15, 16, 17, 18, 19]
-    assert (drive.arrived, drive.delivered) == (13, 12)
+    assert (drive.arrived, drive.late) == (13, 8)
 
 
 def test_a_keyframe_that_had_to_wait_for_an_earlier_drive_is_due_at_once() -> None:
@@ -64,7 +64,7 @@ def test_what_the_mapper_has_in_memory_alone_does_not_end_a_drive() -> None:
     drive = delivery(3)
     for n in range(20):
         drive.acknowledge(1, {1, 2}, 0.5 * n)
-    assert (drive.arrived, drive.delivered, drive.due(10.0, 8)) == (3, 1, [])
+    assert (drive.arrived, drive.late, drive.due(10.0, 8)) == (3, 2, [])
     assert not drive.certain(10.0)
 
 
