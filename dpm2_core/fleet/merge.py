@@ -218,14 +218,14 @@ def _rows(joins: Sequence[Join]) -> list[dict[str, Any]]:
     for join in joins:
         pairs[join.one, join.other].append(join)
     return [
-        {
-            "drives": list(pair),
-            "accepted": sum(join.loop.ok for join in of_pair),
-            "rejected": sum(not join.loop.ok for join in of_pair),
-            "reasons": dict(Counter(_reason(join) for join in of_pair if not join.loop.ok).most_common()),
-        }
-        for pair, of_pair in sorted(pairs.items())
+        _row(pair, sum(join.loop.ok for join in both), Counter(_reason(join) for join in both if not join.loop.ok))
+        for pair, both in sorted(pairs.items())
     ]
+
+
+def _row(drives: Sequence[str], accepted: int, reasons: Counter[str]) -> dict[str, Any]:
+    rejected = {"rejected": reasons.total(), "reasons": dict(reasons.most_common())}
+    return {"drives": list(drives), "accepted": accepted, **rejected}
 
 
 def _reason(join: Join) -> str:
@@ -235,6 +235,4 @@ def _reason(join: Join) -> str:
 def _less(row: dict[str, Any], lost: Sequence[Join]) -> dict[str, Any]:
     """A row after loops of its two drives turned out to be wrong."""
     own = [join for join in lost if [join.one, join.other] == row["drives"]]
-    reasons = Counter(row["reasons"]) + Counter(map(_reason, own))
-    accepted, rejected = row["accepted"] - len(own), row["rejected"] + len(own)
-    return {**row, "accepted": accepted, "rejected": rejected, "reasons": dict(reasons.most_common())}
+    return _row(row["drives"], row["accepted"] - len(own), Counter(row["reasons"]) + Counter(map(_reason, own)))
