@@ -12,16 +12,7 @@ from rich.console import Group
 from rich.progress import Progress
 from scipy.special import chdtri
 
-from benchmarks.harness import (
-    Options,
-    Report,
-    drives,
-    processors,
-    requested,
-    rounded,
-    settings_of,
-    truth_of,
-)
+from benchmarks.harness import Options, Report, drives, processors, requested, rounded, settings_of, truth_of
 from benchmarks.pairs import pairs_of
 from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source

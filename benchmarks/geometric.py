@@ -13,22 +13,16 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import (
-    Options,
-    Report,
-    drives,
-    processors,
-    quantiles_ms,
-    settings_of,
-    truth_of,
-)
+from benchmarks.harness import Options, Report, drives, processors, quantiles_ms, settings_of, truth_of
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.experiments.peers import cloud_and_times, kiss_icp_config
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.output import TrajectoryRecorder
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable, record_table
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
@@ -66,24 +60,25 @@ Method = Callable[[Sequence[Frame]], Outcome]
 def dpm2(options: Options, *more: str) -> Method:
     """This project's SLAM, its mapper included, with `more` settings."""
     settings = settings_of(options, *more)
+    return lambda frames: mapped(settings, frames)[0]
 
-    def run(frames: Sequence[Frame]) -> Outcome:
-        slam = make_slam(settings)
-        tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
-        cpu = process_time()
-        for i, frame in enumerate(frames):
-            started = perf_counter()
-            tracked.append(slam.process(frame).odometry)
-            seconds[i] = perf_counter() - started
-        cpu = process_time() - cpu
-        stages = {stage: np.array([t.seconds[stage] for t in tracked]) for stage in tracked[0].seconds}
-        failed = sum(not t.registration.ok for t in tracked)
-        for t in tracked:
-            recorder.add(t)
-        states = [t.state for t in tracked]
-        return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states)
 
-    return run
+def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Outcome, Mapper]:
+    """Frames through the SLAM: what came out, and the map."""
+    slam = make_slam(settings)
+    tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
+    cpu = process_time()
+    for i, frame in enumerate(frames):
+        started = perf_counter()
+        tracked.append(slam.process(frame).odometry)
+        seconds[i] = perf_counter() - started
+    cpu = process_time() - cpu
+    stages = {stage: np.array([t.seconds[stage] for t in tracked]) for stage in tracked[0].seconds}
+    failed = sum(not t.registration.ok for t in tracked)
+    for t in tracked:
+        recorder.add(t)
+    states = [t.state for t in tracked]
+    return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states), slam.mapper
 
 
 def kiss_icp(options: Options) -> Method | None:

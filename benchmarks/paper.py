@@ -10,14 +10,13 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.geometric import mapped
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from benchmarks.loops import check_loops
 from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
 from dpm2_core.sim.simulated_drive import SimulatedDrive
-from dpm2_core.slam.build import make_slam
-from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable, record_table
 
@@ -73,16 +72,12 @@ def lap() -> SimulatedDrive:
 
 
 def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> dict[str, Any]:
-    slam, recorder = make_slam(settings), TrajectoryRecorder()
-    tracked = [slam.process(frame).odometry for frame in frames]
-    for one in tracked:
-        recorder.add(one)
-    keyframes, failed = slam.mapper.keyframes, sum(not one.registration.ok for one in tracked)
-    metrics = evaluate(truth, recorder.poses(slam.mapper.poses), failed_frames=failed)
+    outcome, mapper = mapped(settings, frames)
+    metrics = evaluate(truth, outcome.poses, failed_frames=outcome.failed)
     rows = {frame.index: row for row, frame in enumerate(frames)}  # an excerpt need not begin with scan 0
-    loops = check_loops(slam.mapper.loops, truth[[rows[keyframe.index] for keyframe in keyframes]])
+    loops = check_loops(mapper.loops, truth[[rows[keyframe.index] for keyframe in mapper.keyframes]])
     return {
-        "frames": len(frames), "failed_frames": failed, "keyframes": len(keyframes),
+        "frames": len(frames), "failed_frames": outcome.failed, "keyframes": len(mapper.keyframes),
         **{name: getattr(metrics, name) for name in _ERRORS},
         "loops": {name: loops[name] for name in ("tried", "accepted", "wrong", "error_m")},
     }  # fmt: skip
