@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
@@ -53,7 +52,7 @@ def bench_beside(options: Options) -> Report:
                              for way, wrong in WAYS.items()}  # fmt: skip
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
     known = {"beams": LIDAR.beams, "frames": FRAMES, "slip": SLIP, "jump_m": JUMP}
-    return Report({**known, "worlds": results}, Group(_table(results)))
+    return Report({**known, "worlds": results}, _table(results))
 
 
 def _with(frames: Sequence[Frame], truth: Array, wrong: tuple[float, float, int] | None) -> Sequence[Frame]:

@@ -9,7 +9,6 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 
 from benchmarks.harness import Options, Report, earlier, requested, torch_threads, write_report
 from dpm2_core.config import load_settings
@@ -162,4 +161,4 @@ def report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> 
         "settings": settings.model_dump(mode="json"), "weights_sha256": digest, "pairs": results.get("pairs"),
         "ratios": summary, "before": before, "runs": runs,
     }  # fmt: skip
-    return Report(record, Group(table))
+    return Report(record, table)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 
 from benchmarks.fleet_drives import STEP, chained, odometry_of, poses_of, write_drive
 from benchmarks.fleet_growth import bench_growth, bench_whole
@@ -70,7 +69,7 @@ def bench_fleet(options: Options) -> Report:
     table = FigureTable("Fleets", names=["part"], text=["figures"])
     for name, figures in results.items():
         table.add_row(name, json.dumps(figures))
-    return Report(results, Group(table))
+    return Report(results, table)
 
 
 def bench_town(folder: Path, options: Options) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
@@ -65,7 +64,7 @@ def bench_gaps(options: Options) -> Report:
                     rows.append(evaluated(frames, truth, gap, settings))
                     progress.advance(task)
                 results[name][method] = {"summary": summary(rows), "gaps": rows}
-    return Report({"wrong_m": _WRONG, "drives": results}, Group(_table(results)))
+    return Report({"wrong_m": _WRONG, "drives": results}, _table(results))
 
 
 def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Group
+from rich.console import RenderableType
 
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
@@ -88,7 +88,7 @@ class Report:
     """A benchmark's outcome: `results` for JSON, `view` for the terminal."""
 
     results: dict[str, Any]
-    view: Group
+    view: RenderableType
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
@@ -63,7 +62,7 @@ def bench_imu(options: Options) -> Report:
             results[name]["ratio"] = results[name]["with"]["ape_rmse_m"] / results[name]["without"]["ape_rmse_m"]
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
     known = {"beams": LIDAR.beams, "imu": imu.model_dump(), "lengths_m": LENGTHS}
-    return Report({**known, "worlds": results}, Group(_table(results)))
+    return Report({**known, "worlds": results}, _table(results))
 
 
 def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import track
 
 from benchmarks.harness import Options, Report, drives, settings_of
@@ -38,7 +37,7 @@ def bench_memory(options: Options) -> Report:
                 if count % _EVERY == 0:
                     samples.append((count, resident_mb()))
             results[name] = levelling(samples) | {"keyframes": len(slam.mapper.keyframes)}
-    return Report({"drives": results}, Group(_table(results)))
+    return Report({"drives": results}, _table(results))
 
 
 def levelling(samples: list[tuple[int, float]]) -> dict[str, Any]:

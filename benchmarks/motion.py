@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
@@ -53,7 +52,7 @@ def bench_motion(options: Options) -> Report:
                 if (kiss := _kiss(frames, robot, options.threads)) is not None:
                     results[task][BASELINE] = kiss
                 progress.console.print(f"{task}: {results[task]}", soft_wrap=True)
-    return Report({"frames": FRAMES, "rides": results}, Group(_table(results)))
+    return Report({"frames": FRAMES, "rides": results}, _table(results))
 
 
 def _ours(frames: Iterable[Frame], robot: TurningRobot, settings: SlamSettings) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.geometric import mapped
@@ -58,7 +57,7 @@ def bench_paper(options: Options) -> Report:
             truth, results[name] = truth_of(source), {}
             for way in progress.track(requested(options, WAYS), description=name):
                 results[name][way] = _driven(settings_of(options, *WAYS[way]), frames, truth)
-    return Report({"settings": WAYS, "drives": results}, Group(_table(results)))
+    return Report({"settings": WAYS, "drives": results}, _table(results))
 
 
 def lap() -> SimulatedDrive:

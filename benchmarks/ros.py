@@ -13,7 +13,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Group
 
 from benchmarks.harness import Options, Report, drives, write_report
 from dpm2_core.commands.options import run_command
@@ -59,7 +58,7 @@ def bench(
             results |= {f"{title}{name}": _figures(of) for name, of in runs.items()}
     columns = {name: f"{{{name}:.4g}}" for name in FIGURES} | {"failed checks": "{failed_checks:.4g}"}
     table = record_table("Bag -> bag_player -> slam_node -> /dpm2/odom", ["drive"], columns, results)
-    write_report(out / "ros.json", Report({"drives": results}, Group(table)), options, "python -m benchmarks.ros")
+    write_report(out / "ros.json", Report({"drives": results}, table), options, "python -m benchmarks.ros")
     Console().print(table)
     return 1 if any(row["failed_checks"] for row in results.values()) else 0
 

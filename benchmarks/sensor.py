@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 
 from benchmarks.figures import lines_png
 from benchmarks.harness import Options, Report, drives
@@ -39,7 +38,7 @@ def bench_sensor(options: Options) -> Report:
         "clean": statistics(_simulated(LidarConfig())),
     }
     _figure(options, results)
-    return Report({"ranges_m": RANGES, "sensors": results}, Group(_table(results)))
+    return Report({"ranges_m": RANGES, "sensors": results}, _table(results))
 
 
 def _simulated(config: LidarConfig) -> list[np.ndarray]:

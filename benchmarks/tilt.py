@@ -8,7 +8,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of
@@ -41,7 +40,7 @@ def bench_tilt(options: Options) -> Report:
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
         named = progress.track(sources.items())
         results = {name: _of_drive(source, network, options.pairs) for name, source in named}
-    return Report({"drives": results}, Group(_table(results)))
+    return Report({"drives": results}, _table(results))
 
 
 def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:

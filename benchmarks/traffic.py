@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Group
 
 from benchmarks.harness import Options, Report, earlier, requested, settings_of, write_report
 from dpm2_core.evaluation.metrics import evaluate
@@ -165,4 +164,4 @@ def _report(drives: dict[str, Any], options: Options) -> Report:
     }  # fmt: skip
     title, names = "RPE in dense traffic, mean over drives (median)", ["registration", "filter"]
     table = record_table(title, names, columns, summary, sections=True)
-    return Report(results, Group(table))
+    return Report(results, table)

@@ -8,7 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, configuration_of, drives, processors
@@ -64,7 +63,7 @@ def bench_views(options: Options) -> Report:
                 megabytes = round(page.stat().st_size / 1e6, 2)
                 row["page"] = {"keyframes": len(data.poses), "megabytes": megabytes, **_looked_at(page)}
                 results[name] = row
-    return Report({"drives": results}, Group(_table(results)))
+    return Report({"drives": results}, _table(results))
 
 
 def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
