@@ -71,18 +71,18 @@ def bench_finetune(options: Options) -> Report:
         same = {"settings": chosen.model_dump(mode="json"), "weights_sha256": digest, "pairs": options.pairs}
         before = earlier(path, "before", **same)
         before = before or {name: errors(pairs, network) for name, pairs in validations.items()}
-        results: dict[str, Any] = {"pairs": options.pairs, "before": before, "runs": earlier(path, "runs", **same)}
+        runs = earlier(path, "runs", **same)
         for variant, seed in wanted:
-            runs = results["runs"].setdefault(variant, {})
-            if str(seed) in runs:
+            of_variant = runs.setdefault(variant, {})
+            if str(seed) in of_variant:
                 continue
             overrides = [STEPS, *options.overrides, *VARIANTS[variant], f"optimiser.seed={seed}"]
             settings = load_settings(FinetuneSettings, None, overrides)
             out = folder / f"{variant}_{seed}_{digest[:8]}"
             run = _run(settings, folder / "data", out, validations)
-            runs[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
-            write_report(path, report(results, chosen, digest), options)
-    return report(results, chosen, digest)
+            of_variant[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
+            write_report(path, report(same, before, runs), options)
+    return report(same, before, runs)
 
 
 def trainings(options: Options) -> list[tuple[str, int]]:
@@ -139,8 +139,8 @@ def errors(pairs: PairSet, model: Any) -> dict[str, float]:
     }
 
 
-def report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> Report:
-    before, runs = results["before"], results.get("runs", {})
+def report(same: dict[str, Any], before: dict[str, Any], runs: dict[str, Any]) -> Report:
+    """Errors before and after every training, which have `same` in common, and what each variant makes of them."""
     summary: dict[str, Any] = {}
     for variant, seeds in runs.items():
         summary[variant] = {
@@ -157,8 +157,7 @@ def report(results: dict[str, Any], settings: FinetuneSettings, digest: str) -> 
     table = record_table("Median errors of pairs in unseen worlds, m", ["losses", "seed", "LiDAR"],
                          columns | {"success": "{success:.1%}"}, rows)  # fmt: skip
     record = {
-        "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES},
-        "settings": settings.model_dump(mode="json"), "weights_sha256": digest, "pairs": results.get("pairs"),
+        "lidar": LIDAR.model_dump(), "drives": {"presets": DRIVES, "frames": DRIVE_FRAMES}, **same,
         "ratios": summary, "before": before, "runs": runs,
     }  # fmt: skip
     return Report(record, table)

@@ -32,12 +32,12 @@ def test_each_loss_alone_is_trained_once_and_both_for_every_seed() -> None:
 def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_path: Path) -> None:
     settings, options = FinetuneSettings(), Options(out=tmp_path)
     results = {"before": dict.fromkeys(finetune.UNSEEN, BEFORE), "runs": {"both": {"0": _run(0.6), "1": _run(0.8)}}}
-    report = finetune.report(results, settings, "digest")
+    same = {"settings": settings.model_dump(mode="json"), "weights_sha256": "digest"}
+    report = finetune.report(same, **results)
     found = report.results["ratios"]["both"]["new"]["all_m"]
     assert found == {"mean": pytest.approx(0.7), "spread": pytest.approx(0.1), "seeds": 2}
     path = tmp_path / "finetune.json"
     write_report(path, report, options)
-    same = {"settings": settings.model_dump(mode="json"), "weights_sha256": "digest"}
     assert {key: earlier(path, key, **same) for key in results} == results
     other = {**same, "settings": FinetuneSettings(radius=3.0).model_dump(mode="json")}
     assert earlier(path, "runs", **other) == {}
