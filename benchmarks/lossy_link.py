@@ -25,55 +25,53 @@ nft add rule inet link arriving iifname {name} numgen random mod 10000 '<' {shar
 
 
 def inside() -> bool:
-    """Whether this process is in the namespace that `Link.own_network` makes."""
+    """Whether this process is in the namespace that `own_network` makes."""
     return _INSIDE in os.environ
 
 
-class Link:
+def own_network(module: str) -> int:
+    """Run a module with the arguments of this process in a namespace that nothing outside shares; its exit code.
+
+    Raises:
+        UsageError: not root, or `unshare`, `ip` or `nft` are missing.
+    """
+    missing = [tool for tool in ("unshare", "ip", "nft") if shutil.which(tool) is None]
+    if os.geteuid() != 0 or missing:
+        raise UsageError(f"a network of its own needs root and util-linux, iproute2, nftables; missing: {missing}")
+    command = ["unshare", "--net", sys.executable, "-m", module, *sys.argv[1:]]
+    return subprocess.call(command, env=os.environ | {_INSIDE: "1"})
+
+
+def make_link() -> None:
     """The link; this process is at the robots' end of it."""
+    _sh(f"ip link set lo up; ip link add {_ROBOTS[0]} type veth peer name {_MAPPER[0]}")
+    _sh(f"ip address add {_ROBOTS[1]} dev {_ROBOTS[0]}; ip link set {_ROBOTS[0]} up" + _rules(_ROBOTS[0]))
 
-    @staticmethod
-    def own_network(module: str) -> int:
-        """Run a module with the arguments of this process in a namespace that nothing outside shares; its exit code.
 
-        Raises:
-            UsageError: not root, or `unshare`, `ip` or `nft` are missing.
-        """
-        missing = [tool for tool in ("unshare", "ip", "nft") if shutil.which(tool) is None]
-        if os.geteuid() != 0 or missing:
-            raise UsageError(f"a network of its own needs root and util-linux, iproute2, nftables; missing: {missing}")
-        command = ["unshare", "--net", sys.executable, "-m", module, *sys.argv[1:]]
-        return subprocess.call(command, env=os.environ | {_INSIDE: "1"})
+def start_mapper(arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> subprocess.Popen[bytes]:
+    """mapper_node at the other end, over UDP: shared memory would go past the link."""
+    name, address = _MAPPER
+    node = shlex.join([sys.executable, "-m", "dpm2_ros.executables", "mapper_node", *arguments])
+    script = f"""
+        until ip link show {name} > /dev/null 2>&1; do sleep 0.1; done
+        ip link set lo up; ip address add {address} dev {name}; ip link set {name} up {_rules(name)}
+        exec {node}"""
+    udp = {key: value for key, value in environment.items() if key != "FASTRTPS_DEFAULT_PROFILES_FILE"}
+    with log.open("wb") as file:
+        mapper = subprocess.Popen(
+            ["unshare", "--net", "sh", "-ec", script],
+            env=udp | {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
+    # The process is in this namespace still when it starts: moving the link there changes nothing.
+    _sh(f"while ip link show {name} > /dev/null 2>&1; do ip link set {name} netns {mapper.pid}; sleep 0.1; done")
+    return mapper
 
-    def __init__(self) -> None:
-        _sh(f"ip link set lo up; ip link add {_ROBOTS[0]} type veth peer name {_MAPPER[0]}")
-        _sh(f"ip address add {_ROBOTS[1]} dev {_ROBOTS[0]}; ip link set {_ROBOTS[0]} up" + _rules(_ROBOTS[0]))
 
-    def start_mapper(
-        self, arguments: Sequence[str], environment: Mapping[str, str], log: Path
-    ) -> subprocess.Popen[bytes]:
-        """mapper_node at the other end, over UDP: shared memory would go past the link."""
-        name, address = _MAPPER
-        node = shlex.join([sys.executable, "-m", "dpm2_ros.executables", "mapper_node", *arguments])
-        script = f"""
-            until ip link show {name} > /dev/null 2>&1; do sleep 0.1; done
-            ip link set lo up; ip address add {address} dev {name}; ip link set {name} up {_rules(name)}
-            exec {node}"""
-        udp = {key: value for key, value in environment.items() if key != "FASTRTPS_DEFAULT_PROFILES_FILE"}
-        with log.open("wb") as file:
-            mapper = subprocess.Popen(
-                ["unshare", "--net", "sh", "-ec", script],
-                env=udp | {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
-                stdout=file,
-                stderr=subprocess.STDOUT,
-            )
-        # The process is in this namespace still when it starts: moving the link there changes nothing.
-        _sh(f"while ip link show {name} > /dev/null 2>&1; do ip link set {name} netns {mapper.pid}; sleep 0.1; done")
-        return mapper
-
-    def set(self, up: bool) -> None:
-        """Take the link away, or give it back."""
-        _sh(f"ip link set {_ROBOTS[0]} {'up' if up else 'down'}")
+def switch_link(up: bool) -> None:
+    """Take the link away, or give it back."""
+    _sh(f"ip link set {_ROBOTS[0]} {'up' if up else 'down'}")
 
 
 def _rules(name: str) -> str:

@@ -20,7 +20,7 @@ import typer
 from rich.progress import track
 
 from benchmarks.harness import Options
-from benchmarks.lossy_link import LOSS, Link, inside
+from benchmarks.lossy_link import LOSS, inside, make_link, own_network, start_mapper, switch_link
 from benchmarks.roads import open_road, road_files
 from dpm2_core.commands.options import run_command
 from dpm2_core.console import Console
@@ -122,9 +122,9 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
     scans: _Scans | None = None
     try:
         os.environ.update(environment)  # rclpy in this process reads it when it starts
-        link = Link()
+        make_link()
         parameters = ["--ros-args", "-p", "ros.map_directory:=''", "-p", f"ros.map_file:={path}"]
-        mapper = link.start_mapper(parameters, environment, root / "mapper.log")
+        mapper = start_mapper(parameters, environment, root / "mapper.log")
         processes.append(mapper)
         scans = _Scans(source)
         for name in SPANS:
@@ -135,7 +135,7 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
         for tick in track(range((end - first) // EVERY), "driving"):
             if tick in OUTAGE:
                 count[OUTAGE.index(tick)] = sum(map(len, scans.made.values()))
-                link.set(up=tick != OUTAGE[0])
+                switch_link(up=tick != OUTAGE[0])
             scans.send(tick)
             scans.spin(1.0)
         scans.spin(2.0)
@@ -199,4 +199,4 @@ def _alone(source: SimulatedDrive) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(run_command(bench) if inside() else exit_code(lambda: Link.own_network("benchmarks.robots")))
+    sys.exit(run_command(bench) if inside() else exit_code(lambda: own_network("benchmarks.robots")))

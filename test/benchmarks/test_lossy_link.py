@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.lossy_link import Link
+from benchmarks.lossy_link import own_network
 from dpm2_core.errors import UsageError
 
 ROOT = Path(__file__).parents[2]  # the benchmarks are not installed
@@ -20,8 +20,8 @@ import socket, sys, time
 from pathlib import Path
 from benchmarks import lossy_link
 lossy_link.LOSS = 0.2
-link = lossy_link.Link()
-echo = link.start_mapper([], {"PATH": sys.argv[2]}, Path(sys.argv[1]))
+lossy_link.make_link()
+echo = lossy_link.start_mapper([], {"PATH": sys.argv[2]}, Path(sys.argv[1]))
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 s.bind(("10.73.0.1", 7400)); s.settimeout(0.2)
 
@@ -37,7 +37,8 @@ def replies(count):
 end = time.monotonic() + 20
 while not replies(1) and time.monotonic() < end:
     time.sleep(0.1)
-up = replies(60); link.set(up=False); down = replies(5); link.set(up=True); again = replies(20)
+up = replies(60); lossy_link.switch_link(up=False); down = replies(5)
+lossy_link.switch_link(up=True); again = replies(20)
 echo.kill()
 print(up, down, again)
 """
@@ -55,7 +56,7 @@ def _can() -> bool:
 def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda tool: None if tool == "nft" else tool)
     with pytest.raises(UsageError, match="nft"):
-        Link.own_network("benchmarks.robots")
+        own_network("benchmarks.robots")
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("unshare", "ip", "nft"))) or not _can(), reason="needs root, ip and nft")
