@@ -98,7 +98,7 @@ class BagSource:
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
         before, recorded_before, period, count, known = None, 0, 0, 0, self._calibration
-        found: Counter[str] = Counter()  # frames that have something of a topic
+        found, unusable = Counter[str](), Counter[str]()  # frames that have something of a topic, that is of no use
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
@@ -116,26 +116,32 @@ class BagSource:
             period = period if stepped or step <= 0 else step
             frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._frames.up, stepped=stepped)
             before, recorded_before, count = stamp, recorded, count + 1
-            found.update(image.camera.name for image in frame.images)
-            found.update(beside.keys() & {known.second_topic})
+            found.update(list(beside))
+            unusable.update([topic for topic in beside if topic in self._frames.problems and not frame.problem])
             found[known.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
             if self._frames.time_problem:
                 note_once(self.notes, f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
         for topic, (left_out, why) in self._unsound.items():
             note_once(self.notes, f"{topic}: {left_out} samples left out", f"the first: {why}")
-        self._note_missing(found, count)
+        self._note_missing(found, unusable, count)
 
-    def _note_missing(self, found: Counter[str], count: int) -> None:
-        """Say what of the other sensors is missing, given how many of `count` frames have something of each topic."""
+    def _note_missing(self, found: Counter[str], unusable: Counter[str], count: int) -> None:
+        """Say what of the other sensors is missing, given how many of `count` frames have something of each topic, and
+        how many of these something that cannot be used."""
         known, within = self._calibration, f"within {self._settings.image_tolerance} s"
-        missing = [(camera.topic, "image", within) for camera in known.cameras if found[camera.topic] < count]
-        if known.second_topic and found[known.second_topic] < count:
+        missing = [(camera.topic, "image", within) for camera in known.cameras]
+        if known.second_topic:
             missing.append((known.second_topic, "cloud", within))
         if known.gnss_topic and not found[known.gnss_topic] and count:  # fixes are rarer than clouds
             missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
-            note_once(self.notes, f"{count - found[topic]} of {count} frames have no {what} of {topic}", within)
+            details = [within] * (found[topic] < count) + [f"{unusable[topic]} have one of no use"] * bool(
+                unusable[topic]
+            )
+            if details:
+                lacking = count - found[topic] + unusable[topic]
+                note_once(self.notes, f"{lacking} of {count} frames have no {what} of {topic}", "; ".join(details))
         if found[known.second_topic]:
             first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
             if abs(apart := (second - first) * 1e-9) > _CLOCKS:

@@ -99,6 +99,16 @@ def test_a_camera_that_stops_or_starts_late(bags: Any, tmp_path: Path, shots: li
     assert f"{6 - len(shots)} of 6 frames have no image of /cam/image_raw (within 0.05 s)" in source.notes
 
 
+def test_images_that_do_not_fit_are_not_missing(bags: Any, tmp_path: Path) -> None:
+    """As of a camera that was switched to another size: they are there, and within the tolerance."""
+    times = [1 + 0.1 * i for i in range(6)]
+    images = [(t, IMAGE, bags.image(t, i, size=(4, 3) if i > 1 else (8, 6))) for i, t in enumerate(times[:5])]
+    source = BagSource(bags.write(tmp_path / "b", by_time([*clouds(bags, times), *rig(bags), *images])))
+    assert seen(source) == [0, 1, None, None, None, None]
+    assert f"{IMAGE}: image of (3, 4, 3), calibration for (6, 8); images are left out" in source.notes
+    assert f"4 of 6 frames have no image of {IMAGE} (within 0.05 s; 3 have one of no use)" in source.notes
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"encoding": "yuv411"}, "encoding 'yuv411' is not supported"), ({"size": (9, 6)}, r"image of \(6, 9, 3\)")],
