@@ -12,7 +12,7 @@ import pytest
 from dpm2_ros import feed
 from dpm2_ros.conversions import EARLIER, edge_to_msg, keyframe_name
 
-from ..helpers.mapping import OTHER, S, core, keyframes, mapped, placed, send_all
+from ..helpers.mapping import OTHER, S, core, keyframes, mapped, placed, send_all, taken_in
 
 
 @pytest.fixture
@@ -80,12 +80,12 @@ def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper:
     move(5)
     mapper.wait(lambda: len(heard) == 1, "/tf")
     mapper.wires.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name("", 0, OTHER)))
-    time.sleep(0.5)
+    taken_in(mapper)
     move(6)
     time.sleep(1.0)
     assert len(heard) == 1
     send_all(mapper, 2)  # the drive before goes on: it was another robot's
-    time.sleep(0.5)
+    taken_in(mapper)
     move(7)
     mapper.wait(lambda: len(heard) == 2, "/tf again")
 

@@ -75,6 +75,14 @@ def placed(mapper: Any) -> tuple[Callable[..., None], list[TFMessage]]:
     return move, heard
 
 
+def taken_in(mapper: Any) -> None:
+    """Until the mapper has heard of every keyframe that was sent: a pose behind theirs has been rejected. What is sent
+    on another topic may come before or after."""
+    before = sum(mapper.mapper.rejections.values())
+    mapper.wires.pose.publish(edge_to_msg(np.eye(4), np.eye(6), 1000, "odom", "no keyframe"))
+    mapper.wait(lambda: sum(mapper.mapper.rejections.values()) > before, "the rejection")
+
+
 def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> None:
     for id in ids:
         T = se3.exp([0, 0, 0, 5.0 * id + shift, 0, 0])
