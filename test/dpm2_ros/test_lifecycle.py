@@ -127,7 +127,9 @@ def test_rounds_keep_every_map_and_leave_nothing(
         assert (result.problems, result.keyframes >= 1) == ([], True)
         assert (tmp_path / name / "map.ply").is_file()
     assert m.state == "unconfigured"
-    m.harness.wait(lambda: (*held(), m.entities) == after[2], f"no more than {after[2]}, as of {after}")
+    # One of them may have been counted while something of the harness was ending.
+    no_more = lambda: all(now <= then for now, then in zip((*held(), m.entities), after[2], strict=True))  # noqa: E731
+    m.harness.wait(no_more, f"no more than {after[2]}, as of {after}")
 
 
 @pytest.mark.slow
@@ -219,7 +221,8 @@ def test_what_cannot_be_configured_stays_unconfigured(
     before, entities = held()[0], m.entities
     assert not m.change(CONFIGURE)
     assert m.state == "unconfigured"
-    assert (held()[0], m.entities) == (before, entities)
+    assert m.entities == entities
+    m.harness.wait(lambda: held()[0] <= before, f"no more threads than {before}")  # some may still be ending
     assert not (tmp_path / "maps").exists()
 
 
