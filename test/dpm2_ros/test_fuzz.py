@@ -194,7 +194,7 @@ class Fuzzer:
             publisher.publish(self._next(kind, kept))
             self.sent[topic] = self.sent.get(topic, 0) + 1
             count += 1
-            # No burst makes up for what was late: it would push a scan out of the node's queue of ten, unread.
+            # No burst makes up for what was late: it would push a scan out of the node's queue, unread.
             due = max(due + 1 / self._rate, time.monotonic())
             self._ended.wait(due - time.monotonic())
 
@@ -233,6 +233,7 @@ class Nodes:
         common = ("-p", "ros.map_directory:=''")
         robot = ["input.points_topic:=points", "ros.embed_mapper:=false", "slam.keyframes.distance:=2.0",
                  "slam.registration:=geometric",
+                 "ros.queue_depth:=100",  # of ten, others would push a scan out, unread, where the node is held up
                  "input.vertical_angle_correction_deg:='0.0'"]  # fmt: skip
         pairs = [part for pair in robot for part in ("-p", pair)]
         mapper = ("-p", f"ros.map_file:={self.file}")

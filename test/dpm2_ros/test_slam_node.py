@@ -230,7 +230,7 @@ def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Ri
     r.status("mapper", saying("6 of 6 keyframes"))
     time.sleep(2.5)  # until it is certain, and nothing of this drive is sent again
     assert r.harness.call(Trigger, "/slam_node/reset").success
-    r.wait(lambda: any(pose.child_frame_id == last + EARLIER for pose in poses), "the end of the drive", timeout=20)
+    r.wait(lambda: any(pose.child_frame_id == last + EARLIER for pose in poses), "the end of the drive")
 
 
 def test_save_map_says_what_it_did(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
