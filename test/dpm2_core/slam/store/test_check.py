@@ -286,7 +286,9 @@ def test_a_check_that_is_stopped_leaves_no_copy(tmp_path: Path, number: signal.S
     save_as(ring(300, 3000), tmp_path / "map")  # a second and more
     (tmp_path / "temporary").mkdir()
     program = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from dpm2_core.slam.store.check import Salvage; run = Salvage.run\n"
+        "Salvage.run = lambda self: (run(self), time.sleep(60))\n"  # it does not end before it is stopped
         f"from dpm2_core.cli import main; main(['map', 'check', {str(tmp_path / 'map')!r}])"
     )
     environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
