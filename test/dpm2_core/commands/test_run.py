@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 from pathlib import Path
@@ -250,12 +251,15 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, an
 
 
 def test_an_interrupt_after_the_last_frame_costs_nothing(sequence: Path, tmp_path: Path) -> None:
-    """While the results are being written."""
-    out = tmp_path / "out"
-    with started("run", sequence, "--out", out, *QUICK) as process:
+    """While the results are being written: the last of them into a pipe that nobody reads before."""
+    out, pipe = tmp_path / "out", tmp_path / "figures"
+    os.mkfifo(pipe)
+    with started("run", sequence, "--out", out, "--json", pipe, *QUICK) as process:
         next(line for line in process.stderr if f"{FRAMES}/{FRAMES}" in line)
         process.send_signal(signal.SIGINT)
-        rest = process.communicate(timeout=60)[1]
+        with open(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)) as reader:
+            rest = process.communicate(timeout=60)[1]
+            assert json.load(reader)["metrics"]
     assert process.returncode == 0, rest
     assert {file.name for file in out.iterdir()} == RESULTS
 
