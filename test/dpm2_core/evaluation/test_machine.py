@@ -71,7 +71,8 @@ def test_a_missing_ros_is_a_warning() -> None:
 @pytest.mark.slow
 def test_a_cloud_comes_back_over_dds_or_it_is_said() -> None:
     if machine.ros().level == "ok":
-        assert machine.dds().level == "ok"
+        found = machine.dds(timeout=120.0)  # s: two processes that import ROS, on a busy machine
+        assert found.level == "ok", found
         assert machine.dds(timeout=0.01).level == "warning"
     else:
         assert machine.dds().level == "note"
