@@ -50,6 +50,8 @@ def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
         problems.append(f"map file incomplete: {mapper.store_problem}")
     if problem := core.graph.problem:
         problems.append(f"poses not optimized: {problem}")
+    if problem := mapper.tf.problem():
+        problems.append(problem)
     if missing := list(mapper.missing.values()):
         problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")
     text = "; ".join([f"{mapper.keyframes} keyframes, {sum(loops)} loops", *problems])

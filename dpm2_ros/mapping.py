@@ -50,6 +50,7 @@ class MapperThread:
         active: what it works on; other threads may read there.
         written: so many keyframes, of all that were ever added, are in the map file (without one: in the map) or
             rejected, but for those that are missing.
+        tf: what sends map -> odom.
         missing: keyframes that were not unsound, but could not be taken in, by number: why, in words.
     """
 
@@ -64,7 +65,7 @@ class MapperThread:
         self.missing: dict[int, str] = {}
         self._changes = self.keyframes
         ros = config.ros
-        self._tf = TransformBroadcaster(
+        self.tf = TransformBroadcaster(
             node, ros.map_frame, ros.publish_tf_map, ros.invert_odom_tf and ros.odom_source == "own"
         )
         self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", KEEP_ALL)
@@ -109,7 +110,7 @@ class MapperThread:
         T_map_odom = self.active.T_map_odom(robot) if restarted is None or restarted.done() else None
         if T_map_odom is not None:
             T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
-            self._tf.send(T, stamp + self._config.ros.ahead, odom_frame)
+            self.tf.send(T, stamp + self._config.ros.ahead, odom_frame)
 
     def add(self, make: Callable[[], Keyframe]) -> int:
         """Take in the keyframe that `make`, called in this thread, returns; how many came before it."""

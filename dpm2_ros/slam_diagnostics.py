@@ -21,6 +21,7 @@ from dpm2_ros.other_odometry import OtherOdometry
 from dpm2_ros.state import SILENT
 from dpm2_ros.subscriptions import Inputs
 from dpm2_ros.synchronizer import StampCheck
+from dpm2_ros.tf import TransformBroadcaster
 
 OTHER_CLOCK = 1.0
 """Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
@@ -55,6 +56,8 @@ class Diagnostics:
         """Why its pose is not on /tf, in words."""
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
+        self.tf: TransformBroadcaster | None = None
+        """What sends the pose on /tf."""
         self._lost_before = self._dropped_before = 0
         self._status = partial(status, node)
         publish_diagnostics(node, self._statuses)
@@ -154,6 +157,7 @@ class Diagnostics:
             (OK, f"the way across {last.breaks} pause(s) or lift(s) is not known" if last.breaks else ""),
             (ERROR, self.frame_problem),
             (WARN, self.tf_problem),
+            (WARN, self.tf.problem() if self.tf is not None else ""),
             (WARN, f"{count} publishers on {topic}: a drive has one LiDAR" if count > 1 else ""),
             (WARN, f"cannot keep up, {dropped} clouds dropped" if dropped > self._dropped_before else ""),
             (OK, fields),
@@ -190,7 +194,10 @@ class Diagnostics:
             figures |= {"confidence": f"{result.confidence:.2f}", "worst sigma (m)": f"{result.worst_sigma:.3f}"}
         else:
             text += f": {result.reason}"
-        return self._status("localisation", _LEVEL[state], text, figures)
+        level, problem = _LEVEL[state], mapper.tf.problem()
+        if problem:
+            level, text = max(level, WARN), f"{text}; {problem}"
+        return self._status("localisation", level, text, figures)
 
     def _other_odometry(self, other: OtherOdometry) -> DiagnosticStatus:
         verdict = other.verdict

@@ -108,7 +108,7 @@ class SlamNode(ManagedNode):
             reading, self._known, self.get_logger().error, imu=self._inputs.imu, gnss=self._inputs.gnss
         )
         self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
-        self._diagnostics.other = self._other
+        self._diagnostics.other, self._diagnostics.tf = self._other, self._tf
         worker = threading.Thread(target=self._work, name="worker")
         worker.start()
         back.callback(self._end, worker)

@@ -3,16 +3,29 @@
 
 from __future__ import annotations
 
+import time
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
+from dpm2_core.data.messages import stamp_ns
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
+from dpm2_ros.checks import check_transforms
 from dpm2_ros.conversions import transform_to_msg
+from dpm2_ros.guard import excerpt, take_waiting
 from dpm2_ros.tf_message import TFMessage
+
+_KNOWN = 500  # transforms of a frame that are kept: all that may come back before they are looked for
+_RECENT = 5.0  # s
+_Link = tuple[str, int, float, float, float]
+"""Parent, stamp (ns) and place of a transform: two nodes that follow the same clouds have the same stamps."""
+_REMEDY = "see ros.odom_source, or leave it to one of the two by ros.publish_tf_odom or ros.publish_tf_map"
 
 
 class TransformBroadcaster:
-    """Publishes one transform of /tf.
+    """Publishes one transform of /tf, of one child or several, and tells where another node places such a child, too.
 
     Args:
         enabled: False publishes nothing.
@@ -20,14 +33,18 @@ class TransformBroadcaster:
     """
 
     def __init__(self, node: Node, parent: str, enabled: bool, inverted: bool = False) -> None:
-        self._parent, self._inverted = parent, inverted
-        self._publisher = None
+        self._node, self._parent, self._inverted = node, parent, inverted
+        self._publisher = self._heard = None
+        self._sent: dict[str, dict[_Link, None]] = {}  # by child, of late
+        self._other: tuple[float, str] | None = None  # when another node was heard last, and what is wrong, in words
         if not enabled:
             return
         if TFMessage is None:
             node.get_logger().error("no /tf: tf2_msgs is missing; `python -m dpm2_ros.build_tf2_msgs` builds it")
             return
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+        # Looked at now and then alone: there may be a thousand messages a second.
+        self._heard = node.create_subscription(TFMessage, "/tf", self._on_tf, 100, callback_group=_Unspun())
 
     def send(self, T_parent_child: Array, stamp: int, child: str) -> None:
         """(4, 4) at a stamp in ns."""
@@ -36,4 +53,39 @@ class TransformBroadcaster:
         link = (T_parent_child, stamp, self._parent, child)
         if self._inverted:
             link = (se3.inverse(T_parent_child), stamp, child, self._parent)
-        self._publisher.publish(TFMessage(transforms=[transform_to_msg(*link)]))
+        stamped = transform_to_msg(*link)
+        sent = self._sent.setdefault(stamped.child_frame_id, {})  # changed here, looked at in another thread
+        sent[_link(stamped)] = None
+        if len(sent) > _KNOWN:
+            del sent[next(iter(sent))]
+        self._publisher.publish(TFMessage(transforms=[stamped]))
+
+    def problem(self) -> str:
+        """Which other node places a frame that this one places, in words; empty where none does. For the executor."""
+        if self._heard is not None:
+            take_waiting(self._heard)
+        if self._other is None or time.monotonic() - self._other[0] > _RECENT:
+            return ""
+        self._node.get_logger().warning(self._other[1], throttle_duration_sec=60)
+        return self._other[1]
+
+    def _on_tf(self, message: Any) -> None:
+        check_transforms(message)
+        for stamped in message.transforms:
+            sent = self._sent.get(child := stamped.child_frame_id.lstrip("/"))
+            if sent is not None and (link := _link(stamped)) not in sent:
+                text = f"another node has {excerpt(link[0])} -> {child} on /tf, too: what is in that frame jumps"
+                self._other = time.monotonic(), f"{text}; {_REMEDY}"
+
+
+def _link(stamped: Any) -> _Link:
+    at = stamped.transform.translation
+    return stamped.header.frame_id.lstrip("/"), stamp_ns(stamped.header), at.x, at.y, at.z
+
+
+class _Unspun(CallbackGroup):
+    """Of what no executor takes: its messages wait, the oldest give way."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Never."""
+        return False

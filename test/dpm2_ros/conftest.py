@@ -199,6 +199,10 @@ class Harness:
         self._executor.wake()
         return messages
 
+    def found_by(self, node: Node, topic: str) -> bool:
+        """Whether a node has found the tester's subscription; it may have one of its own."""
+        return any(one.node_name == self.node.get_name() for one in node.get_subscriptions_info_by_topic(topic))
+
     def publisher(self, kind: type, topic: str, reliable: bool = True, latched: bool = False) -> Any:
         """A publisher."""
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT

@@ -67,7 +67,7 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
     keyframes, poses = hear(PointCloud2, "/dpm2/keyframe"), hear(Odometry, "/dpm2/keyframe_odom")
     maps, paths = hear(PointCloud2, "/dpm2/map", LATCHED), hear(PathMsg, "/dpm2/path", LATCHED)
     graphs, tf = hear(MarkerArray, "/dpm2/pose_graph", LATCHED), hear(TFMessage, "/tf")
-    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe"), "subscriptions")
+    r.wait(lambda: r.harness.found_by(r.node, "/tf") and r.node.count_subscribers("/dpm2/keyframe"), "subscriptions")
     r.send_and_wait(*range(drive.frames))
     r.wait(lambda: len(keyframes) == len(poses) >= 3, "three keyframes in 12 m")
     assert [k.header.frame_id for k in keyframes] == [f"kf_{n}" for n in range(len(keyframes))]

@@ -76,7 +76,9 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     """The driver's part of /tf_static comes first, that of the robot with the base three clouds later."""
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
-    r.wait(lambda: r.node.count_subscribers("/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "subscriptions")
+    r.wait(
+        lambda: r.harness.found_by(r.node, "/tf") and r.node.count_subscribers("/dpm2/keyframe_odom"), "subscriptions"
+    )
     publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
     for n in range(3):
         r.send(n)

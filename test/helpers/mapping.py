@@ -67,7 +67,7 @@ def points(seed: int) -> np.ndarray:
 def placed(mapper: Any) -> tuple[Callable[..., None], list[TFMessage]]:
     """What publishes an odometry at its origin, of a stamp (ns) and in a frame, and the transforms that come of it."""
     odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
-    mapper.wait(lambda: odometry.get_subscription_count() and mapper.mapper.count_subscribers("/tf"), "connections")
+    mapper.wait(lambda: odometry.get_subscription_count() and mapper.found_by(mapper.mapper, "/tf"), "connections")
 
     def move(stamp: int, frame: str = "odom") -> None:
         odometry.publish(edge_to_msg(np.eye(4), np.eye(6), stamp, frame, "base"))
