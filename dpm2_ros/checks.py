@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from dpm2_core.data.livox import cloud_of_custom
 from dpm2_core.data.messages import MessageError, check_cloud
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
+from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_pose
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_ros.conversions import check_frame
@@ -16,6 +19,7 @@ from dpm2_ros.tf_message import MOST_TRANSFORMS
 
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 2000
+_SAME = 1e-3  # m, and of a rotation's matrix: what two who write one place in their own words differ by
 
 
 def check_header(header: Any) -> None:
@@ -78,3 +82,18 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
         else:
             tree.set(parent, child, T_parent_child)
     return tree, problem
+
+
+def replaced(before: TransformTree, after: TransformTree) -> str:
+    """Which frames of a tree another one has elsewhere, in words; empty where there are none."""
+    said = []
+    for frame in before.frames:
+        old, new = before.parent(frame), after.parent(frame)
+        if old is None or new is None or old is new:
+            continue
+        if old[0] != new[0]:
+            said.append(f"{frame} is below {new[0]}, no longer below {old[0]}")
+        elif not np.allclose(old[1], new[1], atol=_SAME):
+            meters, degrees = se3.magnitude(se3.inverse(old[1]) @ new[1])
+            said.append(f"{frame} is {meters:.2f} m and {degrees:.1f} deg from where it was in {old[0]}")
+    return "; ".join(said)

@@ -28,8 +28,8 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
-from dpm2_ros.guard import GuardedNode, take_waiting
+from dpm2_ros.checks import check_header, check_size, checked_cloud, extended, replaced
+from dpm2_ros.guard import GuardedNode, excerpt, take_waiting
 from dpm2_ros.losses import Losses
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
@@ -263,7 +263,11 @@ class Inputs:
 
     def _on_static(self, message: Any) -> None:
         self._static_messages += 1
-        tree, problem = extended(self.calibration.transforms, message)
+        before = self.calibration.transforms
+        tree, problem = extended(before, message)
+        if changed := replaced(before, tree):
+            text = f"{self._static_topic}: {excerpt(changed)}; of two publishers that disagree the last one counts"
+            self._node.get_logger().warning(text, throttle_duration_sec=5)
         self.calibration.transforms = tree  # another one: the worker may be reading that of before
         if problem:
             raise RejectedError("transform", problem)

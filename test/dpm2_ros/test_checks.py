@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_ros.checks import check_header, check_size, checked_cloud, extended
+from dpm2_ros.checks import check_header, check_size, checked_cloud, extended, replaced
 from dpm2_ros.conversions import cloud_to_msg
 from dpm2_ros.guard import excerpt
 
@@ -39,6 +39,22 @@ def test_one_unsound_transform_does_not_cost_the_others(bad: dict[str, object]) 
     assert len(problem) < 500
     assert after.frames == ["base", "camera", "imu", "lidar"]
     np.testing.assert_array_equal(after.lookup("base", "lidar"), tree.lookup("base", "lidar"))
+
+
+@pytest.mark.parametrize(
+    ("later", "said"),
+    [
+        (transform("base", "lidar", x=1.0004), ""),  # as another writes it
+        (transform("base", "lidar", x=1.3), "lidar is 0.30 m and 0.0 deg from where it was in base"),
+        (transform("mast", "lidar"), "lidar is below mast, no longer below base"),
+        (transform("base", "camera", x=1.3), ""),  # a new one
+    ],
+    ids=["same", "moved", "another parent", "new"],
+)
+def test_what_two_publishers_say_otherwise_of_a_frame(later: TransformStamped, said: str) -> None:
+    tree, _ = extended(TransformTree(), message(transform("base", "lidar")))
+    after, _ = extended(tree, message(later))
+    assert replaced(tree, after) == said
 
 
 def test_the_number_of_frames_is_bounded() -> None:

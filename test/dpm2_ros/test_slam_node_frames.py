@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
@@ -31,6 +32,18 @@ T_BASE_SENSOR, T_SENSOR_LIDAR = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5]), se3.ex
 def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
     r = rig("ros.publish_tf_odom:=false", "ros.publish_tf_map:=false")
     assert r.node.count_publishers("/tf") == 0
+
+
+def test_two_publishers_that_place_the_lidar_otherwise_are_told(rig: Callable[..., Rig]) -> None:
+    """As a robot's description and a calibration: before the first cloud the place was that of whichever came last, and
+    with it the pose of the base, without a word."""
+    r = rig("ros.base_frame:=base_link")
+    log = r.harness.hear(Log, "/rosout")
+    r.wait(lambda: r.harness.found_by(r.node, "/rosout"), "the subscription to the log")
+    publish_static(r, "base_link", "lidar", se3.exp([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
+    publish_static(r, "base_link", "lidar", se3.exp([0.0, 0.0, 0.2, 1.3, 0.0, 0.0]))
+    said = "/tf_static: lidar is 0.32 m and 11.5 deg from where it was in base_link"
+    r.wait(lambda: any(line.msg.startswith(said) for line in log), "the warning")
 
 
 def test_a_namespace_holds_a_robot(rig: Callable[..., Rig]) -> None:
