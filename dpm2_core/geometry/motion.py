@@ -10,6 +10,9 @@ from dpm2_core.geometry import se3
 
 OPEN = 0.9
 """Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""
+_TURNED = 0.12**2
+"""Share of a scene's information that is noise of its normals, as for its covariance: by so much, rad, it turns the
+open direction towards another one that has all the rest. On a road seen for 10 m it was 20 to 70 degrees per scan."""
 _FREE = 0.05  # m: the speed tells nothing where it leads less far
 _HORIZON = 10.0  # s: farther ahead no motion is extrapolated
 _LONGEST = 3600.0  # s: after it nothing more is to be forgotten
@@ -84,6 +87,22 @@ def combined(of_scene: Array, of_prediction: Array) -> Array:
     information, axes = np.linalg.eigh(np.linalg.inv(of_scene))
     shown = (axes * np.maximum(information - 1, 0)) @ axes.T
     return np.asarray(np.linalg.inv(shown + np.linalg.inv(of_prediction)))
+
+
+def turned_open(of_scene: Array, of_prediction: Array) -> Array:
+    """A covariance of_scene (3, 3) [m], as uncertain beside the directions that it leaves open as these are not known
+    themselves: in them the prediction, of_prediction (3, 3), decides.
+
+    Otherwise each scan, whose open direction is a little beside that of the one before, seems to show the way along it.
+    """
+    variances, axes = np.linalg.eigh(of_scene)
+    left = variances >= OPEN**2
+    if not left.any():
+        return of_scene
+    unknown = float(np.linalg.eigvalsh(axes[:, left].T @ of_prediction @ axes[:, left])[-1])
+    turn = np.minimum(_TURNED * (1 / variances).sum() * variances, 1.0)
+    variances = np.where(left, variances, np.minimum(variances + turn**2 * unknown, 1.0))
+    return np.asarray((axes * variances) @ axes.T)
 
 
 def along_open(of_scene: Array, other: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Up
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open
 from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.other import OtherMotion, Step
@@ -166,7 +166,8 @@ class MotionState:
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""
         of_prediction = self.step.covariance if led and self.step is not None else self.of_prediction(seconds)
-        of_motion = combined(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
+        of_scene = turned_open(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
+        of_motion = combined(of_scene, of_prediction[3:, 3:])
         self.of_velocity = of_motion / seconds**2
         # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
         T_step = se3.inverse(self.T_registered) @ registration.T_target_source
