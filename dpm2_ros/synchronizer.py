@@ -73,9 +73,11 @@ class SensorState:
     late: int = 0
     """Messages for which a cloud had not waited."""
     missed: int = 0
-    """Clouds in a row that left without it."""
+    """Clouds in a row that left without it, since one came that was in time or ahead."""
     unused: int = 0
     """Messages in a row that went with no cloud."""
+    without: int = 0
+    """Clouds in a row that left without it, whether they had waited or not."""
     last_arrival: float | None = None
     present: bool = True
     """Whether there is a publisher; clouds do not wait for a sensor without one."""
@@ -87,8 +89,8 @@ class SensorState:
 
     @property
     def fits(self) -> bool:
-        """Whether its messages go with clouds. A slow sensor misses most of these, and its messages go with some."""
-        return self.awaited or self.unused < PATIENCE
+        """Whether its messages go with clouds: most of a fast one go with none, and most clouds miss a slow one."""
+        return self.without < PATIENCE or self.unused < PATIENCE
 
     def waits(self, stamp: int) -> bool:
         """Whether a cloud of that stamp (ns) should."""
@@ -197,8 +199,10 @@ class Synchronizer:
         sensor.last_arrival = now
         late = left is not None and -JUMP < stamp - left.stamp <= (tolerance if sensor.missed else -tolerance)
         sensor.late += late
-        if left is None or not late or now <= left.arrival + self._timeout:
-            sensor.missed = 0  # a late one would have come in time, had that cloud waited
+        if left is None or (not late and abs(stamp - left.stamp) < JUMP):  # by more it may be of another clock
+            sensor.missed = 0
+        elif late and stamp - left.stamp >= -tolerance and now <= left.arrival + self._timeout:
+            sensor.missed = 0  # it would have come in time, had that cloud waited
         sensor.messages.add(stamp, message, [bundle.stamp for bundle in self._queue])
 
     def pop(self, now: float) -> Bundle | None:
@@ -223,7 +227,8 @@ class Synchronizer:
             return None
         for topic, sensor in sensors.items():
             sensor.matched += found[topic] is not None
-            sensor.missed += found[topic] is None
+            sensor.missed = sensor.missed + 1 if found[topic] is None else 0
+            sensor.without = sensor.without + 1 if found[topic] is None else 0
             sensor.unused *= found[topic] is None
             sensor.messages.forget(head.stamp)
         head.beside = {topic: message for topic, message in found.items() if message is not None}

@@ -174,6 +174,30 @@ def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
     assert camera_of(synchronizer).late == 20
 
 
+@pytest.mark.parametrize("ahead", [-37, -0.3, 37])
+def test_a_camera_of_another_clock_costs_no_latency_and_is_said(ahead: float) -> None:
+    """By leap seconds, as where its driver counts them, or a little: each of its images let the next clouds wait."""
+    synchronizer, waited = make(), list[bool]()
+    for n in range(20):
+        synchronizer.add("/image", round(100 + 100 * n + 1000 * ahead) * MS, n, 0.1 * n)
+        synchronizer.add_cloud((100 + 100 * n) * MS, n, 0.1 * n + 0.01)
+        waited.append(synchronizer.pop(0.1 * n + 0.01) is None)
+        drain(synchronizer, 0.1 * n + 0.05)
+    assert waited == [n < PATIENCE for n in range(20)]
+    assert not camera_of(synchronizer).fits
+
+
+def test_a_camera_beside_a_slow_lidar_is_waited_for() -> None:
+    """One of both every 2 s, which is no other clock."""
+    synchronizer, joined = make(), list[bool]()
+    for n in range(20):
+        synchronizer.add_cloud((100 + 2000 * n) * MS, n, 2.0 * n)
+        assert synchronizer.pop(2.0 * n) is None
+        synchronizer.add("/image", (100 + 2000 * n) * MS, n, 2.0 * n + 0.02)
+        joined += [image_of(bundle) is not None for bundle in drain(synchronizer, 2.0 * n + 0.02)]
+    assert joined == [True] * 20
+
+
 @pytest.mark.parametrize(("late", "fits"), [(0.0, True), (0.09, False)])
 def test_a_slow_camera_fits_where_its_images_are_used(late: float, fits: bool) -> None:
     """Of 2 Hz beside 20: most clouds have no image, and all images have a cloud, unless they are too late."""
