@@ -49,7 +49,7 @@ class Inputs:
     Attributes:
         imu: its samples; None where none is wanted. imu_received: messages so far.
         gnss: its fixes; None where none are wanted. gnss_received: messages so far. gnss_last: stamp, ns, and arrival,
-            s, of the last.
+            s, of the last fix.
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
@@ -238,8 +238,9 @@ class Inputs:
         if self.gnss is not None:
             stamp = self._stamp(message)
             self.calibration.check_sensor(self.calibration.gnss_topic, message.header.frame_id, stamp)
-            self.gnss.add(stamp, message)
-            self.gnss_received, self.gnss_last = self.gnss_received + 1, (stamp, time.monotonic())
+            if self.gnss.add(stamp, message):  # else it says that it has no fix
+                self.gnss_last = stamp, time.monotonic()
+            self.gnss_received += 1
 
     @property
     def _clock(self) -> float:

@@ -64,16 +64,18 @@ class FixBuffer:
         with self._lock:
             self._fixes.clear()
 
-    def add(self, stamp: int, message: Any) -> None:
-        """Take a sensor_msgs/NavSatFix with its stamp (ns).
+    def add(self, stamp: int, message: Any) -> bool:
+        """Take a sensor_msgs/NavSatFix with its stamp (ns); returns whether the receiver has a fix.
 
         Raises:
             MessageError: see `decode_fix`.
         """
-        if (fix := decode_fix(message, stamp)) is not None:
-            with self._lock:
-                self.frame = message.header.frame_id
-                self._fixes.append(fix)
+        if (fix := decode_fix(message, stamp)) is None:
+            return False
+        with self._lock:
+            self.frame = message.header.frame_id
+            self._fixes.append(fix)
+        return True
 
     def take(self, stamp: int) -> Fix | None:
         """The latest of those up to a scan's stamp (ns) that were not taken before; None if there is none."""

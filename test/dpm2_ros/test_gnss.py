@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import geodesy, se3
@@ -52,6 +52,14 @@ def test_fixes_place_the_map_on_earth(rig: Callable[..., Rig], drive: Any, monke
     mapper = r.node.slam.mapper
     r.wait(lambda: mapper.graph.georeference is not None, "the map's place on Earth")
     r.status("gnss", lambda s: s.message == "in use")
+    lost = nav(drive.stamp(n), place)
+    lost.status.status = NavSatStatus.STATUS_NO_FIX
+
+    def is_said(status: DiagnosticStatus) -> bool:
+        receiver.publish(lost)  # it goes on: a receiver in a tunnel was "in use"
+        return status.message.startswith("no fix on /fix for")
+
+    assert r.status("gnss", is_said).level == DiagnosticStatus.WARN
     monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 10.0)
     receiver.publish(nav(drive.stamp(n) + 18 * 10**9, place))  # GPS has no leap seconds
     status = r.status("gnss", lambda s: s.message == "stamps of another clock, +18 s from the clouds'")
