@@ -8,6 +8,7 @@ where the map is to stay as it is, to its place there. The ROS node runs the sam
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -86,6 +87,7 @@ class Slam:
         self._pictured = pictured
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
+        self._tied: deque[tuple[int, int]] = deque()  # ids of keyframes of the odometry that loops have tied
 
     @property
     def uses_images(self) -> bool:
@@ -113,6 +115,8 @@ class Slam:
             self.odometry.request_keyframe()
         if localizer is not None and localizer.found is not None:
             self.odometry.cross_breaks(localizer.found)
+        while self._tied:
+            self.odometry.cross_breaks(*self._tied.popleft())
         result = self.odometry.process(frame)
         if localizer is not None and result.state is State.LOST:
             localizer.odometry_lost(self.odometry.next_keyframe)
@@ -146,11 +150,23 @@ class Slam:
             self._underway = None
         if self.localizer is not None:
             return MapResult([], self.localizer.add(keyframe))
-        return MapResult(self.mapper.add(keyframe))
+        loops = self.mapper.add(keyframe)
+        if any(loop.ok for loop in loops):
+            self._note_ties(keyframe, loops)
+        return MapResult(loops)
+
+    def _note_ties(self, keyframe: Keyframe, loops: list[Edge]) -> None:
+        """Loops of the last keyframe that the graph keeps, by ids as the odometry counts: below 0 before it began."""
+        keyframes, kept = self.mapper.keyframes, {(e.from_node, e.to_node) for e in self.mapper.graph.loops if e.ok}
+        offset = keyframes[-1].id - keyframe.id
+        for a, b in ((loop.from_node, loop.to_node) for loop in loops):
+            if (a, b) in kept and keyframes[a].robot == keyframes[b].robot == keyframe.robot:
+                self._tied.append((keyframes[b].id - offset, keyframes[a].id - offset))
 
     def use(self, mapper: Mapper, localizer: Localizer | None) -> None:
         """Go on in another map."""
         self.mapper, self.localizer, self._T_map_odom = mapper, localizer, None
+        self._tied.clear()
 
     def finish(self) -> None:
         """At the end of a drive: complete the map and its file."""

@@ -81,8 +81,7 @@ class Odometry:
         self._first_sweep = Sweep()
         self._bridge: Bridge | None = None
         self._left = 0.0  # the time of the last pose before the pause that is being bridged
-        self._breaks = 0
-        self._broken = 0  # id of the first keyframe after the last break
+        self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether a loop may cross it
         self._registration = self._tools.registration.fresh()
         self._keyframes.reset()
 
@@ -105,10 +104,11 @@ class Odometry:
         """Id that the next keyframe will have."""
         return self._keyframes.next_id
 
-    def cross_breaks(self, found: int) -> None:
-        """A map has shown where the keyframe of that id is: the way across the breaks before it is known."""
-        if self._breaks and found >= self._broken:
-            self._breaks = 0
+    def cross_breaks(self, found: int, since: int | None = None) -> None:
+        """A map has shown where the keyframe of that id is: the way across the breaks before it is known; or a loop,
+        where it is from the one of id `since`: across those between, but for lifts, as storeys look alike."""
+        crossed = [id <= found and (since is None or (since < id and loops)) for id, loops in self._breaks]
+        self._breaks = [one for one, known in zip(self._breaks, crossed, strict=True) if not known]
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
@@ -158,7 +158,7 @@ class Odometry:
             state=self._state(registration, enclosed),
             registration=registration,
             keyframe=keyframe,
-            breaks=self._breaks,
+            breaks=len(self._breaks),
             seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
@@ -254,7 +254,7 @@ class Odometry:
         motion.covariance = bridge.covariance(motion.T) + own.covariance
         if bridge.tries >= self._settings.restart_after and motion.twist is not None:
             self._bridge, self._failures = None, 0
-            self._break()
+            self._break(loops=True)
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T
@@ -263,16 +263,16 @@ class Odometry:
     def _step_out(self, scan: Scan, registration: Registration) -> Registration:
         """Out of what enclosed the LiDAR: a break, and a map of what is seen there begins."""
         self._motion.carry()
-        self._break()
+        self._break(loops=False)
         self._keyframes.request()
         self._registration = self._registration.fresh()
         self._registration.update(scan, self._motion.T)
         return registration.because(_CARRIED)
 
-    def _break(self) -> None:
+    def _break(self, loops: bool) -> None:
         """The way from the keyframes so far to those that follow is known no better than the pose is now."""
         self._keyframes.add_uncertainty(self._motion.covariance)
-        self._breaks, self._broken = self._breaks + 1, self.next_keyframe
+        self._breaks.append((self.next_keyframe, loops))
 
     def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Match, float]:
         """A prepared frame, predicted at T_predicted (4, 4), in the map; and how long the period was, s: as stamped or,

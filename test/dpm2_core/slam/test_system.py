@@ -6,19 +6,23 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
+from types import FrameType, SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from dpm2_core.data.thumbnail import image_of
-from dpm2_core.estimates import State
+from dpm2_core.estimates import Edge, Keyframe, Registration, State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.pipeline import OfflineRun
-from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.build import make_odometry, make_slam
 from dpm2_core.slam.loops.localizer import LocalizationResult
+from dpm2_core.slam.mapping.mapper import Mapper
+from dpm2_core.slam.odometry.keyframe_selection import KeyframeSettings
 from dpm2_core.slam.session import open_for_localization, open_session
 from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.system import Slam
 
 from ...helpers import corridor
 from ...helpers.drives import InMemory
@@ -50,6 +54,47 @@ def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Fr
         result = slam.process(frame)
         assert result.T_map_lidar is not None
         np.testing.assert_allclose(result.T_map_lidar, result.odometry.T_odom_lidar, atol=1e-9)  # rounding
+
+
+class _Loops:
+    """Stands where the mapper does: the last keyframe, and a loop to it from the one of that id, or none."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.graph = SimpleNamespace(loops=list[Edge]())
+        self.since: int | None = None
+        self.T_map_odom = np.eye(4)
+
+    def add(self, keyframe: Keyframe) -> list[Edge]:
+        self.keyframes.append(replace(keyframe, id=keyframe.id + 40))  # after those of a map that was loaded
+        if self.since is None:
+            return []
+        node = self.since if self.since >= 0 else len(self.keyframes) + self.since
+        loop = Edge("loop", node, len(self.keyframes) - 1, Registration(np.eye(4), np.eye(6)))
+        self.graph.loops.append(loop)
+        return [loop]
+
+
+@pytest.mark.parametrize(("since", "ends"), [(0, True), (-2, False), (None, False)])
+def test_a_loop_across_a_break_ends_the_doubt_of_it(
+    suburb_drive: tuple[list[Frame], Array], since: int | None, ends: bool
+) -> None:
+    """After a pause: to before it, not to a keyframe since then. It was `degraded` for the rest of the drive."""
+    frames = [replace(frame, stamp=frame.stamp + 60 * 10**9 * (n >= 6)) for n, frame in enumerate(suburb_drive[0])]
+    elsewhere = np.array([1, -1, 1, 1], np.float32)
+    frames[6:] = [replace(frame, points=frame.points * elsewhere) for frame in frames[6:]]
+    settings = GEOMETRIC.model_copy(update={"keyframes": KeyframeSettings(distance=1.0)})
+    loops = _Loops()
+    slam = Slam(make_odometry(settings), cast(Mapper, loops))
+    states = []
+    for frame in frames:
+        result = slam.process(frame)
+        states.append(result.state)
+        if result.odometry.breaks and result.map is not None and loops.since is None:
+            loops.since = since  # of the next keyframe
+    assert State.LOST in states
+    assert states[-1] is (State.TRACKING if ends else State.DEGRADED)
+    assert result.odometry.breaks == int(not ends)
 
 
 @pytest.mark.weights

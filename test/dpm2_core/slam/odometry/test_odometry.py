@@ -316,6 +316,11 @@ def test_where_a_lift_opens_the_way_is_not_known(closed: int, breaks: int) -> No
         assert opened.keyframe is not None
         assert opened.keyframe.edge is not None
         assert opened.keyframe.edge.covariance[5, 5] > 3.5**2
+        odometry.cross_breaks(opened.keyframe.id, since=opened.keyframe.id - 1)  # by a loop: to a storey that is alike
+        again = odometry.process(
+            Frame(len(seen) * 4 * 10**8, rooms.scan(pose, hall, front, len(seen)), index=len(seen))
+        )
+        assert (again.breaks, again.state) == (1, State.DEGRADED)
 
 
 def test_a_vehicle_that_stands_may_see_the_same_cloud(suburb_drive: Drive) -> None:
