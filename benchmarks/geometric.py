@@ -34,7 +34,7 @@ _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Trial:
     """One method on one drive, once.
 
     Attributes:
@@ -54,7 +54,7 @@ class Outcome:
     states: list[State] = field(default_factory=list)
 
 
-Method = Callable[[Sequence[Frame]], Outcome]
+Method = Callable[[Sequence[Frame]], Trial]
 
 
 def dpm2(options: Options, *more: str) -> Method:
@@ -63,7 +63,7 @@ def dpm2(options: Options, *more: str) -> Method:
     return lambda frames: mapped(settings, frames)[0]
 
 
-def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Outcome, Mapper]:
+def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Trial, Mapper]:
     """Frames through the SLAM: what came out, and the map."""
     slam = make_slam(settings)
     tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
@@ -78,7 +78,7 @@ def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Outcome, Ma
     for t in tracked:
         recorder.add(t)
     states = [t.state for t in tracked]
-    return Outcome(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states), slam.mapper
+    return Trial(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states), slam.mapper
 
 
 def kiss_icp(options: Options) -> Method | None:
@@ -90,7 +90,7 @@ def kiss_icp(options: Options) -> Method | None:
         return None
     from kiss_icp.kiss_icp import KissICP
 
-    def run(frames: Sequence[Frame]) -> Outcome:
+    def run(frames: Sequence[Frame]) -> Trial:
         clouds = [cloud_and_times(frame)[0] for frame in frames]
         odometry = KissICP(config)
         poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
@@ -100,7 +100,7 @@ def kiss_icp(options: Options) -> Method | None:
             odometry.register_frame(cloud, np.array([]))
             seconds[i] = perf_counter() - started
             poses[i] = odometry.last_pose
-        return Outcome(poses, seconds, process_time() - cpu)
+        return Trial(poses, seconds, process_time() - cpu)
 
     return run
 
@@ -120,13 +120,13 @@ def bench_geometric(options: Options) -> Report:
         task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
         for drive, source in sources.items():
             poses, frames = truth_of(source), list(source.frames())
-            outcomes: dict[str, list[Outcome]] = {name: [] for name in methods}
+            trials: dict[str, list[Trial]] = {name: [] for name in methods}
             for _ in range(options.repetitions):
                 for name, run in methods.items():
                     progress.update(task, description=f"{drive}: {name}")
-                    outcomes[name].append(run(frames))
+                    trials[name].append(run(frames))
                     progress.advance(task)
-            results[drive] = {method: summary(poses, outcomes[method]) for method in methods}
+            results[drive] = {method: summary(poses, trials[method]) for method in methods}
             truth[drive] = source.truth
             del frames
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
@@ -136,18 +136,18 @@ def bench_geometric(options: Options) -> Report:
     return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, shown)
 
 
-def summary(truth: Array, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def summary(truth: Array, trials: Sequence[Trial]) -> dict[str, Any]:
     """Medians over the repetitions of errors and speed, and the spread of the latter."""
-    checked = [evaluate(truth, o.poses, LENGTHS, failed_frames=o.failed) for o in outcomes]
-    fps = np.array([len(o.seconds) / o.seconds.sum() for o in outcomes])
-    seconds = np.concatenate([o.seconds for o in outcomes])
-    stages = {stage: np.concatenate([o.stages[stage] for o in outcomes]) for stage in outcomes[0].stages}
+    checked = [evaluate(truth, trial.poses, LENGTHS, failed_frames=trial.failed) for trial in trials]
+    fps = np.array([len(trial.seconds) / trial.seconds.sum() for trial in trials])
+    seconds = np.concatenate([trial.seconds for trial in trials])
+    stages = {stage: np.concatenate([trial.stages[stage] for trial in trials]) for stage in trials[0].stages}
     return {
         **_median(checked),
-        "ape_rmse_m_of_thirds": _thirds(truth, outcomes[0].poses),
+        "ape_rmse_m_of_thirds": _thirds(truth, trials[0].poses),
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(4).tolist(),
-        "cpu_ms": 1e3 * float(np.median([o.cpu_seconds / len(o.seconds) for o in outcomes])),
+        "cpu_ms": 1e3 * float(np.median([trial.cpu_seconds / len(trial.seconds) for trial in trials])),
         "frame_ms": quantiles_ms(seconds),
         "stages_ms": {stage: quantiles_ms(values) for stage, values in stages.items()},
     }

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.progress import Progress
 
 from benchmarks.figures import verdicts_png
-from benchmarks.geometric import BASELINE, Method, Outcome, dpm2, kiss_icp
+from benchmarks.geometric import BASELINE, Method, Trial, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
 from benchmarks.harness import Options, Report, drives, processors, requested, truth_of
 from dpm2_core.estimates import State
@@ -73,11 +73,11 @@ def draw(path: Path, results: Mapping[str, Any]) -> None:
     verdicts_png(path, panels, "Who survives what: worst error afterwards, m")
 
 
-def _figures(case: Case, outcome: Outcome) -> dict[str, Any]:
-    states: Sequence[State | None] = outcome.states or [None] * len(case.frames)
-    figures = {"frames": len(case.frames), "failed_frames": outcome.failed, **judged(case, outcome.poses, states)}
+def _figures(case: Case, trial: Trial) -> dict[str, Any]:
+    states: Sequence[State | None] = trial.states or [None] * len(case.frames)
+    figures = {"frames": len(case.frames), "failed_frames": trial.failed, **judged(case, trial.poses, states)}
     if case.name in _RATES:
-        metrics = evaluate(case.truth, outcome.poses, failed_frames=outcome.failed)
+        metrics = evaluate(case.truth, trial.poses, failed_frames=trial.failed)
         figures |= {key: getattr(metrics, key) for key in ("rpe_trans_m", "rpe_rot_deg", "final_drift_percent")}
     return figures
 

@@ -138,11 +138,11 @@ def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options:
     }
     if (kiss := kiss_icp(options)) is not None:
         methods[BASELINE] = kiss
-    outcomes: dict[str, list[Any]] = {name: [] for name in methods}
+    trials: dict[str, list[Any]] = {name: [] for name in methods}
     for _ in range(options.repetitions):
         for name, run in methods.items():
-            outcomes[name].append(run(frames))
-    rows = {name: summary(poses, outcomes[name]) for name in methods}
+            trials[name].append(run(frames))
+    rows = {name: summary(poses, trials[name]) for name in methods}
     if BASELINE in rows:
         for row in rows.values():
             row["frame_ms"]["ratio"] = round(row["frame_ms"]["median"] / rows[BASELINE]["frame_ms"]["median"], 3)

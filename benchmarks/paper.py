@@ -71,12 +71,12 @@ def lap() -> SimulatedDrive:
 
 
 def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> dict[str, Any]:
-    outcome, mapper = mapped(settings, frames)
-    metrics = evaluate(truth, outcome.poses, failed_frames=outcome.failed)
+    trial, mapper = mapped(settings, frames)
+    metrics = evaluate(truth, trial.poses, failed_frames=trial.failed)
     rows = {frame.index: row for row, frame in enumerate(frames)}  # an excerpt need not begin with scan 0
     loops = check_loops(mapper.loops, truth[[rows[keyframe.index] for keyframe in mapper.keyframes]])
     return {
-        "frames": len(frames), "failed_frames": outcome.failed, "keyframes": len(mapper.keyframes),
+        "frames": len(frames), "failed_frames": trial.failed, "keyframes": len(mapper.keyframes),
         **{name: getattr(metrics, name) for name in _ERRORS},
         "loops": {name: loops[name] for name in ("tried", "accepted", "wrong", "error_m")},
     }  # fmt: skip

@@ -22,7 +22,7 @@ from dpm2_core.data.convert import convert
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.tables import record_table
-from tools.demo import Outcome, evaluate_replay
+from tools.demo import Evaluation, evaluate_replay
 from tools.replay import replay
 
 WITH: dict[str, tuple[dict[str, object], bool]] = {
@@ -50,7 +50,7 @@ def bench(
             work.mkdir()
             convert(KittiSource(drive.path), bag)
             source = BagSource(bag, InputSettings(images=False))
-            runs: dict[str, list[Outcome]] = {name: [] for name in WITH}
+            runs: dict[str, list[Evaluation]] = {name: [] for name in WITH}
             for _ in range(repetitions):
                 for name, (parameters, watched) in WITH.items():
                     played = replay(source, work, parameters=parameters, watched=watched)
@@ -63,7 +63,7 @@ def bench(
     return 1 if any(row["failed_checks"] for row in results.values()) else 0
 
 
-def _figures(runs: Sequence[Outcome]) -> dict[str, float | int | None]:
+def _figures(runs: Sequence[Evaluation]) -> dict[str, float | int | None]:
     medians = {name: _median([run.summary[name] for run in runs], worst=name == "dropped") for name in FIGURES}
     return medians | {"failed_checks": sum(not holds for run in runs for holds in run.checks.values())}
 

@@ -39,7 +39,7 @@ QUEUE = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Evaluation:
     """Figures (the content of summary.json), and what was checked: text to whether it holds."""
 
     summary: dict[str, float | int | None]
@@ -63,11 +63,11 @@ def demo(
         task = progress.add_task("bag_player -> slam_node -> /dpm2/odom", total=len(source))
         parameters = {"ros.queue_depth": QUEUE, "ros.map_period": 2.0}
         result = replay(source, out, rate, parameters, lambda done: progress.update(task, completed=done))
-    outcome = evaluate_replay(source, result, out)
+    evaluation = evaluate_replay(source, result, out)
     with atomic_write(out / "summary.json") as file:
-        file.write(json.dumps(outcome.summary, indent=2) + "\n")
-    console.print(_table(source, result, outcome, out))
-    failed = [check for check, holds in outcome.checks.items() if not holds]
+        file.write(json.dumps(evaluation.summary, indent=2) + "\n")
+    console.print(_table(source, result, evaluation, out))
+    failed = [check for check, holds in evaluation.checks.items() if not holds]
     for check in failed:
         console.print(f"failed: {check}", style="red")
     if failed:
@@ -108,7 +108,7 @@ def _simulate(out: Path, frames: int, seed: int) -> None:
         raise Dpm2Error(f"dpm2 {' '.join(command)} failed")
 
 
-def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Outcome:
+def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Evaluation:
     """Compare what came out with what went in, and with the ground truth where there is some; draws the image."""
     stamps = source.stamps
     found = [stamp for stamp in dict.fromkeys(stamps.tolist()) if stamp in result.poses]
@@ -140,7 +140,7 @@ def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Outcome:
         checks["/tf has odom -> base and map -> odom"] = requested <= result.tf
     if len(found) > 1:
         _check_poses(source, result, out, found, summary, checks)
-    return Outcome(summary, checks)
+    return Evaluation(summary, checks)
 
 
 def _check_poses(
@@ -185,8 +185,8 @@ def map_poses(source: BagSource, result: Replay, found: list[int]) -> Array:
     return se3.inverse(T_base_lidar) @ T_odom_base @ T_base_lidar
 
 
-def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> FigureTable:
-    s = outcome.summary
+def _table(source: BagSource, result: Replay, evaluation: Evaluation, out: Path) -> FigureTable:
+    s = evaluation.summary
     title = f"{source.name} through ROS 2"
     table = FigureTable(title, names=["what"], figures=["value"], text=["how"], header=False)
     table.add_row("clouds in", str(s["frames_in"]), f"{source.points_topic}")
@@ -201,7 +201,7 @@ def _table(source: BagSource, result: Replay, outcome: Outcome, out: Path) -> Fi
     table.add_row(
         "map", f"{0 if result.map is None else len(result.map)}", f"points in the last of {result.maps} /dpm2/map"
     )
-    table.add_row("checks", f"{sum(outcome.checks.values())} of {len(outcome.checks)}", "hold")
+    table.add_row("checks", f"{sum(evaluation.checks.values())} of {len(evaluation.checks)}", "hold")
     table.add_row("files", "", f"{result.saved}\n{out / 'summary.json'}\n{out / 'trajectory.png'}")
     return table
 

@@ -88,9 +88,9 @@ def experiment(
             bar.update(parts, completed=done, total=total)
             bar.console.print(f"{part}: done", soft_wrap=True)
 
-        outcome = carry_out(name, request, Progress(frames_done, part_done))
-    views = Group(*(table_of.view() for table_of in outcome.tables))
-    show(views, {"tables": [table_of.record() for table_of in outcome.tables], "notes": outcome.notes}, json_file)
-    for text in outcome.notes:
+        findings = carry_out(name, request, Progress(frames_done, part_done))
+    views = Group(*(table_of.view() for table_of in findings.tables))
+    show(views, {"tables": [table_of.record() for table_of in findings.tables], "notes": findings.notes}, json_file)
+    for text in findings.notes:
         note(text, "yellow")
     note(f"Results in {out / name}.json and .html")

@@ -10,7 +10,7 @@ from pathlib import Path
 from dpm2_core.evaluation.figures import trajectories_png
 from dpm2_core.evaluation.run_folder import read_run
 from dpm2_core.evaluation.run_page import aligned
-from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
+from dpm2_core.experiments.request import Experiment, Findings, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
@@ -53,7 +53,7 @@ def _parts(request: Request, paper: Sequence[str], settings: Sequence[str] = ())
     return [[*own, *peer_parts(sequences, request, settings)]]
 
 
-def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+def _kitti_findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     sequences = present(request, TESTED, ORIGINAL_POSES)
     title = "KITTI odometry: t_err % / r_err deg per 100 m"
     caption = f"KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences. {FAILED}"
@@ -71,10 +71,10 @@ def _kitti_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
         notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
     runs = run_folders(names, sequences, request.out)
     trajectory_pictures(runs, request.out, notes)
-    return Outcome([table, speed], notes, runs)
+    return Findings([table, speed], notes, runs)
 
 
-def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+def _kitti360_findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     sequences = present(request, TESTED_360)
     title = "KITTI-360: APE mean m / APE rmse m / t_err % / r_err deg per 100 m"
     caption = f"APE: positions after SE(3) alignment, of the known poses. {FAILED}"
@@ -87,7 +87,7 @@ def _kitti360_outcome(request: Request, figures: Mapping[str, Figures]) -> Outco
     runs = run_folders(names, sequences, request.out)
     notes = missing_note(sequences, TESTED_360)
     trajectory_pictures(runs, request.out, notes)
-    return Outcome([table], notes, runs)
+    return Findings([table], notes, runs)
 
 
 def trajectory_pictures(runs: Mapping[str, Mapping[str, Path]], out: Path, notes: list[str]) -> None:
@@ -115,5 +115,5 @@ def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array |
     return ways, truth
 
 
-KITTI = Experiment(USES, partial(_parts, paper=TESTED, settings=ORIGINAL_POSES), _kitti_outcome)
-KITTI_360 = Experiment(USES, partial(_parts, paper=TESTED_360), _kitti360_outcome)
+KITTI = Experiment(USES, partial(_parts, paper=TESTED, settings=ORIGINAL_POSES), _kitti_findings)
+KITTI_360 = Experiment(USES, partial(_parts, paper=TESTED_360), _kitti360_findings)

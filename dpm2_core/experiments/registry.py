@@ -14,7 +14,7 @@ from typing import Any
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import write_record
 from dpm2_core.evaluation.run_page import HtmlTable, runs_page
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Findings, Request
 from dpm2_core.experiments.table import html_table
 from dpm2_core.files import atomic_write
 from dpm2_core.fleet.part import Figures, Part, Progress, run_parts
@@ -104,7 +104,7 @@ def _tables_of(path: Path) -> list[HtmlTable]:
         raise UsageError(f"{path}: no record of an experiment: {error}") from None
 
 
-def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome:
+def carry_out(name: str, request: Request, progress: Progress | None) -> Findings:
     """Do all parts that are not done yet, and write OUT/NAME.json and OUT/NAME.html.
 
     Raises:
@@ -117,16 +117,16 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Outcome
     _check_names(name, [part for stage in stages for part in stage])
     for stage in stages:
         figures |= run_parts(stage, request.out, request.workers, progress)
-    outcome = experiment.outcome(request, figures)
+    findings = experiment.findings(request, figures)
     commits = sorted({str(part["part"]["commit"]) for part in figures.values()})
     if len(commits) > 1:
-        outcome.notes.append(f"parts were made at several commits: {', '.join(commits)}")
-    write_record(request.out / f"{name}.json", _record(request, outcome, figures), threads=request.workers)
-    tables = [html_table(table.record()) for table in outcome.tables]
-    runs = [(f"{row}, {sequence}", path) for sequence, of in outcome.runs.items() for row, path in of.items()]
+        findings.notes.append(f"parts were made at several commits: {', '.join(commits)}")
+    write_record(request.out / f"{name}.json", _record(request, findings, figures), threads=request.workers)
+    tables = [html_table(table.record()) for table in findings.tables]
+    runs = [(f"{row}, {sequence}", path) for sequence, of in findings.runs.items() for row, path in of.items()]
     with atomic_write(request.out / f"{name}.html") as file:
         file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", runs, tables))
-    return outcome
+    return findings
 
 
 def _check_options(name: str, request: Request, experiment: Experiment) -> None:
@@ -149,11 +149,11 @@ def _check_names(name: str, parts: Sequence[Part]) -> None:
         )
 
 
-def _record(request: Request, outcome: Outcome, figures: dict[str, Figures]) -> dict[str, Any]:
+def _record(request: Request, findings: Findings, figures: dict[str, Figures]) -> dict[str, Any]:
     return {
         "request": {field.name: getattr(request, field.name) for field in fields(request)},
-        "tables": [table.record() for table in outcome.tables],
-        "notes": outcome.notes,
-        **outcome.extra,
+        "tables": [table.record() for table in findings.tables],
+        "notes": findings.notes,
+        **findings.extra,
         "parts": figures,
     }

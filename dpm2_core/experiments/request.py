@@ -49,7 +49,7 @@ class Request:
 
 
 @dataclass
-class Outcome:
+class Findings:
     """What an experiment found.
 
     Attributes:
@@ -81,9 +81,9 @@ class Experiment:
         uses: the options of `Request` beside data, out, sequences, workers and overrides that have a meaning for it;
             any other one that is given is an error.
         parts: stages; the parts of one may read what those before have written.
-        outcome: the tables, from the figures of all parts by their names.
+        findings: the tables, from the figures of all parts by their names.
     """
 
     uses: frozenset[str]
     parts: Callable[[Request], Sequence[Sequence[Part]]]
-    outcome: Callable[[Request, Mapping[str, Figures]], Outcome]
+    findings: Callable[[Request, Mapping[str, Figures]], Findings]

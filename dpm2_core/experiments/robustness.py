@@ -11,7 +11,7 @@ from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source, frame_at
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
-from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
+from dpm2_core.experiments.request import Experiment, Findings, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
@@ -78,7 +78,7 @@ def _parts(request: Request) -> Sequence[Sequence[Part]]:
     ]
 
 
-def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
+def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     sequences = present(request, TESTED, ORIGINAL_POSES)
     caption = f"KITTI metric; change: of the mean t_err from the whole row. Hit frames are drawn with seed 0. {FAILED}"
     table = ResultTable("Failing sensors: t_err % / r_err deg per 100 m", [*sequences, MEAN], SHOWN, caption)
@@ -104,7 +104,7 @@ def _outcome(request: Request, figures: Mapping[str, Figures]) -> Outcome:
         notes.append("no rows with a black camera: there are no images, or this configuration makes no use of them")
     runs = run_folders([name for name, _, _ in variants], sequences, request.out)
     _picture(request, sequences[0], notes)
-    return Outcome([table], notes, runs, {"change_percent": changes})
+    return Findings([table], notes, runs, {"change_percent": changes})
 
 
 def _picture(request: Request, sequence: str, notes: list[str]) -> None:
@@ -118,4 +118,4 @@ def _picture(request: Request, sequence: str, notes: list[str]) -> None:
     drawn(path, notes, lambda to: corrupted_png(to, before, after, title))
 
 
-ROBUSTNESS = Experiment(frozenset({"weights", "registrations", "lengths", "frames"}), _parts, _outcome)
+ROBUSTNESS = Experiment(frozenset({"weights", "registrations", "lengths", "frames"}), _parts, _findings)

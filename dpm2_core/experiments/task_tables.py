@@ -14,7 +14,7 @@ from typing import Any
 from dpm2_core.errors import UsageError
 from dpm2_core.experiments.kitti import trajectory_pictures
 from dpm2_core.experiments.paired import paired_gain
-from dpm2_core.experiments.request import Experiment, Outcome, Request
+from dpm2_core.experiments.request import Experiment, Findings, Request
 from dpm2_core.experiments.sequences import learned_note
 from dpm2_core.experiments.table import Cells, ResultTable
 from dpm2_core.experiments.task_part import (
@@ -65,7 +65,7 @@ class TaskTable:
 
     def experiment(self) -> Experiment:
         """As the registry wants it."""
-        return Experiment(frozenset({"learn", "seeds", "config"}), self.parts, self.outcome)
+        return Experiment(frozenset({"learn", "seeds", "config"}), self.parts, self.findings)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
         """First epochs that the arms of a seed share, the arms, and their measuring.
@@ -110,7 +110,7 @@ class TaskTable:
                 " experiment's own values"
             )
 
-    def outcome(self, request: Request, figures: Mapping[str, Figures]) -> Outcome:
+    def findings(self, request: Request, figures: Mapping[str, Figures]) -> Findings:
         """The table, a row an arm, and what the SLAM loss gains."""
         seeds = range(request.seeds or SEEDS)
         table = ResultTable(self.title, list(self.figures), {"mean": ".4g"}, "Means over the seeds and the test scans.")
@@ -135,7 +135,7 @@ class TaskTable:
         notes = [*self.notes, *self._warnings(request, of, figures)]
         if self.measured == SLAM:
             self._pictures(request, figures, notes)
-        return Outcome([table, gain_table], notes, extra={"gains": gains})
+        return Findings([table, gain_table], notes, extra={"gains": gains})
 
     def _warnings(
         self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]

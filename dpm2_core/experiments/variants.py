@@ -12,7 +12,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
-from dpm2_core.experiments.request import Experiment, Outcome, Request, drawn
+from dpm2_core.experiments.request import Experiment, Findings, Request, drawn
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
@@ -73,7 +73,7 @@ class VariantTable:
     def experiment(self) -> Experiment:
         """As the registry wants it."""
         uses = {"learn", "weights", "config", *(("lengths", "frames") if self.judged else ())}
-        return Experiment(frozenset(uses), self.parts, self.outcome)
+        return Experiment(frozenset(uses), self.parts, self.findings)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
         """Packed drives, a training of each variant, and each on every sequence."""
@@ -102,7 +102,7 @@ class VariantTable:
             stages.append([self._run(request, v, sequence) for v in self.variants for sequence in sequences])
         return stages
 
-    def outcome(self, request: Request, figures: Mapping[str, Figures]) -> Outcome:
+    def findings(self, request: Request, figures: Mapping[str, Figures]) -> Findings:
         """The table, and the panel of attention maps."""
         sequences = present(request, TESTED, ORIGINAL_POSES)
         notes = learned_note(_learned(request), sequences)
@@ -124,7 +124,7 @@ class VariantTable:
         runs = run_folders(names, sequences, request.out)
         if self.variants is not TABLE_3:
             self._panel(request, sequences[0], notes)
-        return Outcome(tables, notes, runs)
+        return Findings(tables, notes, runs)
 
     def _run(self, request: Request, variant: str, sequence: str) -> Part:
         weights = request.out / self._training(variant) / WEIGHTS

@@ -180,11 +180,11 @@ def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_lef
     figures = {part.name: dict.fromkeys(GNDNET.figures, 0.5) for part in GNDNET.parts(request)[-1]}
     first = next(name for name in figures if "without" in name)
     figures[first] = {**figures[first], "recall": float("nan"), "precision": 0.7}
-    outcome = GNDNET.outcome(request, figures)
-    assert "tested on what was learned from: train/00" in outcome.notes
-    cells = outcome.tables[0].rows[0].cells
+    findings = GNDNET.findings(request, figures)
+    assert "tested on what was learned from: train/00" in findings.notes
+    cells = findings.tables[0].rows[0].cells
     assert (cells["recall"], cells["precision"]) == ({"mean": 0.5}, {"mean": pytest.approx(0.6)})
-    gains = outcome.extra["gains"]
+    gains = findings.extra["gains"]
     assert {name: gain["recall"]["seeds"] for name, gain in gains.items()} == {
         "with": 1, "placebo": 1, "with_over_placebo": 2,
     }  # fmt: skip
