@@ -20,7 +20,7 @@ class Health:
         self._latency: deque[float] = deque(maxlen=200)
         self._done: deque[float] = deque(maxlen=50)
         self._seconds: dict[str, deque[float]] = {}
-        self.processed = self.failed = self.errors = 0
+        self.processed = self.failed = 0
         self.last: OdometryResult | None = None
         self.scale = ""
         """What settings the odometry has chosen by its scans, if it chooses."""
@@ -48,7 +48,6 @@ class Health:
                 "state": self.last.state if self.last else "waiting",
                 "processed": self.processed,
                 "failed registrations": self.failed,
-                "internal errors": self.errors,
                 "rate (Hz)": f"{self._rate(now):.1f}",
             }
             if self.scale:

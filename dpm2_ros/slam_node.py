@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 import time
-import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
@@ -151,9 +150,9 @@ class SlamNode(ManagedNode):
                 continue
             try:
                 self._process(bundle)
-            except Exception:  # a bug; but the drive goes on, and /diagnostics counts it
-                self._health.errors += 1
-                self.get_logger().error(f"cloud at {bundle.stamp} ns: {traceback.format_exc()}")
+            except Exception as error:  # a bug; but the drive goes on, and /diagnostics counts it
+                error.add_note(f"of the cloud at {bundle.stamp} ns")
+                self.fail("cloud", error)
 
     def _end_drive(self, of_map: Callable[[MapperThread], None]) -> None:
         """The next cloud begins another drive; `of_map`: what becomes of the map, where it is here.
@@ -320,5 +319,4 @@ class SlamNode(ManagedNode):
 
     def _report(self, done: Future[Keyframe]) -> None:
         if (error := done.exception()) is not None:
-            self._health.errors += 1
-            self.get_logger().error(f"keyframe: {''.join(traceback.format_exception(error))}")
+            self.fail("keyframe", error)

@@ -17,6 +17,8 @@ from sensor_msgs.msg import Image, Imu, NavSatFix, PointCloud2, PointField
 from dpm2_core.data.messages import cloud_fields, decode_points
 from dpm2_core.data.topics import POINTS
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.estimates import OdometryResult
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg, header
 from dpm2_ros.slam_node import SlamNode
@@ -65,7 +67,27 @@ def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None
     assert len(r.odom) == drive.frames
     end = transform_matrix(r.odom[-1].pose.pose)[:3, 3]
     assert np.linalg.norm(end - drive.pose(drive.frames - 1)[:3, 3]) < 0.3
-    assert figures(r.processed(drive.frames))["internal errors"] == "0"
+    assert figures(r.status("messages", bool))["internal errors"] == "0"
+
+
+def test_a_bug_costs_its_cloud_and_is_a_warning(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bugs of the odometry were counted where nothing warned of them, and each was a page of the log."""
+    r = rig()
+    r.send_and_wait(0)
+    good = r.node.slam.odometry_step
+
+    def step(frame: Frame) -> OdometryResult:
+        if frame.stamp == drive.stamp(1):
+            raise RuntimeError("a bug")
+        return good(frame)
+
+    monkeypatch.setattr(r.node.slam, "odometry_step", step)
+    r.lidar.publish(drive.cloud(1))
+    assert r.status("messages", lambda s: "1 internal errors" in s.message).level == DiagnosticStatus.WARN
+    r.send_and_wait(2)
+    assert r.stamps() == [drive.stamp(0), drive.stamp(2)]
 
 
 def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Callable[..., Rig], drive: Any) -> None:
