@@ -20,6 +20,7 @@ from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
 
+_TIES = 100  # more loops are not found during a frame
 _LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
 
 
@@ -87,7 +88,8 @@ class Slam:
         self._pictured = pictured
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
-        self._tied: deque[tuple[int, int]] = deque()  # ids of keyframes of the odometry that loops have tied
+        # Ids of keyframes of the odometry that loops have tied since its last step; a mapper without one takes none.
+        self._tied: deque[tuple[int, int]] = deque(maxlen=_TIES)
 
     @property
     def uses_images(self) -> bool:
