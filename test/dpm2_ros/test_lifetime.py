@@ -32,7 +32,7 @@ from dpm2_ros.runtime import Stop, end_ros, ros_context
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
-from .conftest import Harness
+from ..helpers.harness import Harness
 
 QUICK = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
 """Neither camera nor network: it starts in half the time."""

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes in this process, beside a node of the test, over real DDS."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.srv import GetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from dpm2_ros.runtime import end_ros, ros_context
+from tools.replay import ros_environment, start
+
+
+class Harness:
+    """Nodes under test and a tester's node, spun by one thread."""
+
+    def __init__(self, parameters: Sequence[str], domain: int, namespace: str) -> None:
+        # Without the network, which takes most of the time, unless a test says otherwise: how a node handles scans and
+        # keyframes is the same. Drives through nodes as they are by default: test_replay.py and test_lockstep.py.
+        quick = ("ros.map_directory:=''", "slam.registration:=geometric", "slam.loops.descriptors:=false")
+        pairs = [part for pair in (*quick, *parameters) for part in ("-p", pair)]
+        remap = ["-r", f"__ns:={namespace}"] if namespace else []
+        ros_context(["--ros-args", *pairs, *remap], domain)
+        self.node = rclpy.create_node("tester", use_global_arguments=False)
+        self.received: dict[str, list[Any]] = {}
+        self._clients: dict[str, Any] = {}
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._closing: list[Any] = []
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._ended.is_set():
+            self._executor.spin_once(timeout_sec=1.0)  # what is added and the end wake it
+
+    def add(self, node: Node) -> Any:
+        """Spin and in the end close a node."""
+        self._executor.add_node(node)
+        self._executor.wake()
+        self._closing.append(node)
+        return node
+
+    def remove(self, node: Node) -> None:
+        """Close a node under test before the end."""
+        self._closing.remove(node)
+
+        def end() -> None:
+            self._executor.remove_node(node)
+            node.close()  # type: ignore[attr-defined]
+            node.destroy_node()
+
+        self._between_waits(end, f"the end of {node.get_name()}")
+
+    def start(self, name: str, arguments: Sequence[str], log: Path, **variables: str) -> subprocess.Popen[bytes]:
+        """One of the executables as a process that sees these nodes, and in the end is killed."""
+        environment = ros_environment(self.node.context.get_domain_id()) | variables
+        self._processes.append(start(name, arguments, environment, log))
+        return self._processes[-1]
+
+    def hear(self, kind: type, topic: str, qos: Any = 100) -> list[Any]:
+        """The messages of a topic, as they come."""
+        messages = self.received.setdefault(topic, [])
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        self._executor.wake()
+        return messages
+
+    def found_by(self, node: Node, topic: str) -> bool:
+        """Whether a node has found the tester's subscription; it may have one of its own."""
+        return any(one.node_name == self.node.get_name() for one in node.get_subscriptions_info_by_topic(topic))
+
+    def publisher(self, kind: type, topic: str, reliable: bool = True, latched: bool = False) -> Any:
+        """A publisher."""
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        return self.node.create_publisher(
+            kind, topic, QoSProfile(depth=50, reliability=reliability, durability=durability)
+        )
+
+    def call(self, kind: type, name: str, **fields: Any) -> Any:
+        """The reply of a node's service, of which the request goes out once: it need not be one that may come twice.
+
+        Fast DDS drops a reply where the server has not found the client's reader within 0.1 s, as may be on a busy
+        machine, and does not tell the client. Readers are announced in the order in which they were made: once the node
+        has replied to one that was made later, it knows the first.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+            probe = self.node.create_client(GetParameters, f"{name.rpartition('/')[0]}/get_parameters")
+            self._reply(probe, GetParameters.Request(), again=3.0)
+        return self._reply(self._clients[name], kind.Request(**fields))
+
+    def _reply(self, client: Any, request: Any, again: float = float("inf")) -> Any:
+        """`again`: s without a reply after which the request is sent once more."""
+        self.wait(client.service_is_ready, client.srv_name)
+        sent, futures = 0.0, list[Any]()
+
+        def replies() -> list[Any]:
+            nonlocal sent
+            if not futures or time.monotonic() - sent > again:
+                sent = time.monotonic()
+                futures.append(client.call_async(request))
+            return [future.result() for future in futures if future.done()]
+
+        self.wait(replies, f"the reply of {client.srv_name}")
+        return replies()[0]
+
+    @property
+    def diagnostics(self) -> list[DiagnosticArray]:
+        """What has come of /diagnostics, since this was asked for first."""
+        topic = "/diagnostics"
+        return self.received[topic] if topic in self.received else self.hear(DiagnosticArray, topic)
+
+    def status(
+        self, part: str, condition: Callable[[DiagnosticStatus], Any] = bool, since: int | None = None
+    ) -> DiagnosticStatus:
+        """The first status for which something holds, once there is one.
+
+        A message may tell of the time before what a test has just done: the condition says what is waited for.
+
+        Args:
+            part: how its name ends. since: number of the first message that counts; None: the last that has come.
+        """
+        heard = self.diagnostics
+        begin = max(len(heard) - 1, 0) if since is None else since
+        last, found = "none", list[DiagnosticStatus]()
+
+        def look() -> bool:
+            nonlocal begin, last
+            for message in heard[begin:]:
+                begin += 1
+                statuses = [status for status in message.status if status.name.endswith(part)]
+                found.extend(filter(condition, statuses))
+                last = repr(statuses[-1]) if statuses else last
+            return bool(found)
+
+        try:
+            self.wait(look, f"a status of {part}")
+        except AssertionError as error:
+            raise AssertionError(f"{error}; the last: {last}") from None
+        return found[0]
+
+    def find(self, name: str) -> None:
+        """Until a node elsewhere has found all that is heard here; what it sends before that is lost.
+
+        A reader that was announced after the others has its diagnostics.
+        """
+        told: list[str] = []
+        add = lambda message: told.extend(status.name for status in message.status)  # noqa: E731
+        reader = self.node.create_subscription(DiagnosticArray, "/diagnostics", add, 10)
+        self._executor.wake()
+        self.wait(lambda: any(one.startswith(f"{name}: ") for one in told), f"the diagnostics of {name}")
+        self.destroy(reader)
+
+    def destroy(self, entity: Any) -> None:
+        """A publisher or subscription of the tester."""
+        is_publisher = entity in list(self.node.publishers)
+        destroy = self.node.destroy_publisher if is_publisher else self.node.destroy_subscription
+        self._between_waits(partial(destroy, entity), "the end of a publisher or subscription")
+
+    def _between_waits(self, work: Callable[[], Any], what: str) -> None:
+        """In the thread that spins, between two of its waits: rclpy raises in that thread where it is about to wait for
+        something that another thread destroys, and no callback is to meet a node that another thread is closing."""
+        done = Future[Any]()
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except BaseException as error:
+                done.set_exception(error)
+
+        self._executor.create_task(run)
+        self.wait(done.done, what)
+        done.result()
+
+    @staticmethod
+    def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:
+        """Until it holds; fails saying what was waited for."""
+        end = time.monotonic() + timeout
+        while True:
+            began = time.thread_time()
+            if condition():
+                return
+            assert time.monotonic() < end, f"waited {timeout} s for {what}"
+            # A condition that reads a map leaves the processors to what is waited for.
+            time.sleep(max(0.01, 5 * (time.thread_time() - began)))
+
+    def close(self) -> None:
+        """Kill the processes, end the thread that spins, close the nodes under test, as programs do, and the rest."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+        self._ended.set()
+        self._executor.wake()
+        self._thread.join()
+        try:
+            for node in self._closing:
+                node.close()
+        finally:
+            self._executor.shutdown()
+            end_ros(*self._closing, self.node)
