@@ -64,7 +64,8 @@ class TopicChoice:
         depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
         if depth:
             self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
-        found = [topic for topic in found if topic not in depth]
+        compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same as the raw ones
+        found = [topic for topic in found if topic not in depth and (topic == asked or topic not in compressed)]
         usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
         return self._one_of(found, asked, usual, "image", "images")
 

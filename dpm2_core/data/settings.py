@@ -54,7 +54,7 @@ class InputSettings(Settings):
 
     image_topic: str = ""
     """Image or CompressedImage topic of a bag; empty takes /kitti/camera_color_left/image_raw, else the only one (those
-    of depth do not count)."""
+    of depth do not count, nor what is compressed beside the same, raw)."""
 
     camera_info_topic: str = ""
     """CameraInfo topic of that image; empty takes the camera_info beside it."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -51,6 +52,18 @@ def test_the_only_camera_is_taken_and_several_are_left(bags: Any, tmp_path: Path
     assert seen(BagSource(tmp_path / "two", InputSettings(image_topic="/other/image_raw"))) == [9]
     with pytest.raises(UsageError, match="no images on /absent; topics: "):
         BagSource(tmp_path / "two", InputSettings(image_topic="/absent"))
+
+
+def test_what_is_compressed_beside_the_raw_images_is_no_second_camera(bags: Any, tmp_path: Path) -> None:
+    """As image_transport publishes it, and `ros2 bag record -a` records it: no camera was used then."""
+    jpeg = cv2.imencode(".jpg", np.full((6, 8), 9, np.uint8))[1].ravel()
+    packed = bags.new("sensor_msgs/CompressedImage", header=bags.header(1, "cam"), format="jpeg", data=jpeg)
+    sent = [*clouds(bags, [1]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (1, f"{IMAGE}/compressed", packed)]
+    bag = bags.write(tmp_path / "b", sent)
+    source = BagSource(bag)
+    assert seen(source) == [7]
+    assert not any("image topics" in note for note in source.notes)
+    assert seen(BagSource(bag, InputSettings(image_topic=f"{IMAGE}/compressed"))) == [9]
 
 
 # --- camera
