@@ -13,10 +13,11 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import JUMP, SetBack
 from dpm2_core.frame import Array, Inertial
 
+KEPT = 11_000_000_000
+"""ns before a scan of which samples are of use: they tell the turn across a pause of up to 10 s."""
 _LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any sensor that is sold measures
 _CLOSEST = 400_000  # ns: no IMU is faster than 2500 Hz
 _MOST = 10_000  # samples kept; bounds memory where no cloud comes
-_RECENT = 1_000_000_000  # ns before a scan: what is older is of no use
 
 
 def decode_imu(message: Any) -> tuple[Array, Array]:
@@ -78,12 +79,12 @@ class ImuBuffer:
 
     def take(self, stamp: int, until: int) -> Inertial | None:
         """Those up to `until` (ns) that were not taken before, for a scan with that stamp (ns); None if there are none
-        of its last second."""
+        of the last `KEPT`."""
         with self._lock:
             taken = []
             while self._samples and self._samples[0][0] <= until:
                 taken.append(self._samples.popleft())
-        taken = [sample for sample in taken if sample[0] > stamp - _RECENT]
+        taken = [sample for sample in taken if sample[0] > stamp - KEPT]
         if not taken:
             return None
         stamps, rates, forces = zip(*taken, strict=True)

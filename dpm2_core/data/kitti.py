@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.cloud_folder import name_times
+from dpm2_core.data.imu import KEPT
 from dpm2_core.data.scan_file import KITTI, chosen, drives_below
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
@@ -86,11 +87,11 @@ class KittiSource(VelodyneDrive):
         return Inertial(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:]), R
 
     def _samples(self, before: int | None, stamp: int) -> Inertial | None:
-        """Those after the scan before (ns), of the first scan those of its last second, along the LiDAR's axes."""
+        """Those after the scan before (ns), those of the last `KEPT` alone, along the LiDAR's axes."""
         s, R = self.imu, self.R_lidar_imu
         if s is None:
             return None
-        since = stamp - 10**9 if before is None else max(before, stamp - 10**9)
+        since = stamp - KEPT if before is None else max(before, stamp - KEPT)
         first, last = np.searchsorted(s.stamps, [since, stamp], "right")
         return Inertial(s.stamps[first:last], s.rates[first:last] @ R.T, s.forces[first:last] @ R.T)
 

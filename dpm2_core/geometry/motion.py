@@ -36,6 +36,15 @@ def between(T: Array, before: Array, after: Array, seconds: float) -> Array:
     return T
 
 
+def turning(T: Array, before: Array, after: Array, seconds: float, turns: Array) -> Array:
+    """The pose (4, 4) after that time if the velocity along the sensor's axes changes evenly from that of one twist
+    (6,) to that of the other while it turns as measured: `turns` (K + 1, 3, 3) since T, in the middle of each of K even
+    parts of the time, and in the end."""
+    part = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
+    way = np.einsum("kij,kj->ki", turns[:-1], (1 - part) * before[3:] + part * after[3:]).mean(0) * seconds
+    return T @ se3.make(turns[-1], way)
+
+
 def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float, Array], steadiness: float) -> float:
     """Seconds that a period lasted of which the stamp is in doubt, by how far the LiDAR has moved in it.
 
@@ -55,16 +64,25 @@ def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float,
     return dt + float(np.clip(off @ way / (way @ way), 0.0, 1.0)) * (usual[0] - dt)
 
 
-def covariance(speed: float, seconds: float, acceleration: float, of_velocity: Array, turn: float = 0.0) -> Array:
+def covariance(
+    speed: float,
+    seconds: float,
+    acceleration: float,
+    of_velocity: Array,
+    turn: float = 0.0,
+    of_turn: Array | None = None,
+) -> Array:
     """Covariance (6, 6) [rad, m] of the pose that `predicted` gives, of a velocity with the covariance `of_velocity`
     (3, 3) [m/s] and a rate of turn that is off by `turn`, rad/s, about any axis; no heading is worse than any heading,
-    and no pause longer than an hour."""
+    and no pause longer than an hour. Where the turn was measured, `of_turn` (3, 3) [rad] is its covariance."""
     seconds = min(seconds, _LONGEST)
     meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
     swing, heading = (min(rate * seconds, _ANY_TURN) for rate in (turn, _TURN))
     result = np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
     result[:3, :3] += swing**2 * np.eye(3)
     result[3:, 3:] += of_velocity * seconds**2
+    if of_turn is not None:
+        result[:3, :3] = of_turn
     return result
 
 

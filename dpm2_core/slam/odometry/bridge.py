@@ -17,7 +17,8 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
+from dpm2_core.geometry.motion import between, covariance, predicted, spread, turning, velocity_change
+from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
@@ -80,16 +81,26 @@ class Bridge:
         self._limits = limits
         self._ties: list[_Tie] = []
 
-    def begin(self, seconds: float, T_other: Array | None = None, stepped: bool = False) -> Array:
-        """A new stretch, so long after the last pose before the pause: where it begins (4, 4); there, if another
-        odometry knows the way. `stepped`: so long by a clock that was set meanwhile."""
+    def begin(self, seconds: float, T_other: Array | None, imu: InertialMotion | None, stepped: bool) -> Array:
+        """A new stretch, so long after the last pose before the pause: where it begins (4, 4).
+
+        Args:
+            T_other: there, if another odometry knows the way. imu: it may know the turn since that pose.
+            stepped: it is so long by a clock that was set meanwhile.
+        """
         self._seconds = seconds
         self._stepped |= stepped
         self.held = self._stepped
         self._ties.clear()
         self._after: Array | None = None
-        self._T_other = T_other
-        self._T_begin = predicted(self._T, self._motion, seconds) if T_other is None else T_other
+        self._T_other, self._turning = T_other, None if imu is None else imu.turning
+        self._of_turn = None if imu is None or self._turning is None else imu.covariance(seconds)
+        if T_other is not None:
+            self._T_begin = T_other
+        elif self._turning is not None:
+            self._T_begin = turning(self._T, self._motion, self._motion, seconds, self._turning)
+        else:
+            self._T_begin = predicted(self._T, self._motion, seconds)
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
@@ -101,7 +112,8 @@ class Bridge:
     def covariance(self, T_stretch: Array) -> Array:
         """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last one before the pause."""
         A = se3.adjoint(se3.inverse(T_stretch) @ self._T_begin)
-        of_begin = covariance(self._speed, self._seconds, self._limits.acceleration, self._of_velocity)
+        acceleration, of_turn = self._limits.acceleration, self._of_turn
+        of_begin = covariance(self._speed, self._seconds, acceleration, self._of_velocity, of_turn=of_turn)
         return np.asarray(A @ of_begin @ A.T)
 
     def register(
@@ -144,12 +156,15 @@ class Bridge:
         left, up = np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])
         asides = _STEP * np.array([np.zeros(3), left, -left, up, -up])
         offsets = np.array([way * ahead + aside for aside in asides for way in _spread(far, _STEP / 2)])
-        rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
         ends = [] if self._T_other is None else [self._T_other]
-        ends += [between(self._T, before + rate, after + rate, seconds) for rate in rates]
         way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
         parts = [part for part in _PARTS if self.held or (1 - part) * way <= _STOPS * seconds**2 / 4]
-        ends += [between(self._T, part * before, part * after, seconds) for part in parts]
+        if self._turning is not None:
+            ends += [turning(self._T, part * before, part * after, seconds, self._turning) for part in (1.0, *parts)]
+        else:
+            rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
+            ends += [between(self._T, before + rate, after + rate, seconds) for rate in rates]
+            ends += [between(self._T, part * before, part * after, seconds) for part in parts]
         poses = np.repeat(ends, len(offsets), 0)
         poses[:, :3, 3] += np.concatenate([offsets @ T[:3, :3].T for T in ends])
         return poses

@@ -16,12 +16,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from dpm2_core.data.imu import KEPT
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.turning import leveled, turned
 
-_KEPT = 5_000_000_000  # ns of samples, and so many at most
-_MOST = 20_000
+_MOST = 25_000  # samples, at most
+_PARTS = 10  # of the time since the last registered frame
 
 # Gyroscope, standard deviations: a turn is off by so much, rad, and this fraction of it (scale, axes, time).
 _TURN, _SHARE = np.radians(0.1), 0.02
@@ -40,7 +41,7 @@ _POSSIBLE = 1.5  # m/s2 that a mean force without the changes of velocity may di
 _NO_GRAVITY = 0.5  # m/s2: forces that differ by less from the changes of velocity have none in them
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
 _SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
-_FEWEST = 5  # samples that show it
+_AT_REST, _FEWEST = 1_000_000_000, 5  # ns of samples that show it, and so many at least
 _WEIGHT = 5.0  # s that a start at rest counts as much as
 _MINUTE = 60.0  # s of which the mean force shows the vertical
 _FOLLOWS = np.radians(0.02)  # rad for each m or s: so fast is the frame turned
@@ -50,7 +51,8 @@ class InertialMotion:
     """The samples so far, and what they say.
 
     Attributes:
-        turn: R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed.
+        turning: R_before_t (K + 1, 3, 3) from the last registered frame to the middle of each of K even parts of the
+            time since then, and to now; None where it is not known, or not believed.
         turns: whether that is more than a bias could be; no scan has confirmed it yet.
         problem: why it is None, or why a start at rest is not level or may be upside down; else empty.
         T_level_odom: (4, 4), by which poses become level.
@@ -59,12 +61,12 @@ class InertialMotion:
     def __init__(self, starts: bool = True) -> None:
         """`starts`: the drive begins with the next frame; else an IMU has come to one that is under way."""
         self._starts = starts
-        self.turn: Array | None = None
+        self.turning: Array | None = None
         self.problem = ""
         self.T_level_odom = np.eye(4)
         self._samples = Inertial(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
         self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
-        self._measured: Array | None = None  # the turn, believed or not
+        self._measured: Array | None = None  # the same, believed or not
         self._before: int | None = None  # stamp of the last registered frame
         self.turns = False
         self._doubt = 1.0
@@ -76,7 +78,7 @@ class InertialMotion:
         if self.turns:  # the last frame was not registered
             self._remember(_UNSEEN)
         self._join(frame)
-        self.turn = self._measured = None
+        self.turning = self._measured = None
         if self._before is None:
             self.problem = "" if len(self._samples) else "no samples"
         else:
@@ -88,10 +90,15 @@ class InertialMotion:
             )
         if self.problem:
             return frame if frame.imu is None else replace(frame, imu=None)
-        self.turn = self._measured
+        self.turning = self._measured
         if self.turn is not None and self._before is not None:
             self.turns = _angle(self.turn) > _TURNING * (frame.stamp - self._before) * 1e-9
         return replace(frame, imu=replace(self._samples, rates=self._samples.rates - self._bias))
+
+    @property
+    def turn(self) -> Array | None:
+        """R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed."""
+        return None if self.turning is None else self.turning[-1]
 
     def covariance(self, seconds: float) -> Array:
         """(3, 3) rad2 of `turn` over that time."""
@@ -113,8 +120,8 @@ class InertialMotion:
             self._vertical.pause()
             return
         seconds = (stamp - before) * 1e-9
-        self._judge(measured, T_before[:3, :3].T @ T[:3, :3], seconds)
-        self._span.add(measured, seconds)
+        self._judge(measured[-1], T_before[:3, :3].T @ T[:3, :3], seconds)
+        self._span.add(measured[-1], seconds)
         self._variance += _BIAS_DRIFT**2 * seconds
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
@@ -128,7 +135,11 @@ class InertialMotion:
     def _start_at_rest(self, T: Array) -> None:
         """Where a drive begins at rest, the samples before the first frame show the bias and which way is up."""
         s, starts, self._starts = self._samples, self._starts, False
-        if not starts or len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
+        if not starts:
+            return
+        late = s.stamps > s.stamps.max(initial=0) - _AT_REST
+        s = replace(s, stamps=s.stamps[late], rates=s.rates[late], forces=s.forces[late])
+        if len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
             return
         self._bias, self._variance = s.rates.mean(0), _BIAS_AT_REST**2
         if s.up is None:
@@ -155,7 +166,7 @@ class InertialMotion:
             self._before, self._samples = None, new
             return
         new = replace(new, stamps=new.stamps[later], rates=new.rates[later], forces=new.forces[later])
-        keep = (old.stamps > new.stamps[-1] - _KEPT) & (np.arange(len(old), 0, -1) < _MOST)
+        keep = (old.stamps > new.stamps[-1] - KEPT) & (np.arange(len(old), 0, -1) < _MOST)
         stamps, rates, forces = (
             np.concatenate([before[keep], after])
             for before, after in ((old.stamps, new.stamps), (old.rates, new.rates), (old.forces, new.forces))
@@ -163,10 +174,9 @@ class InertialMotion:
         self._samples = Inertial(stamps, rates, forces, new.up)
 
     def _turned(self, stamp: int, before: int) -> Array | None:
-        """R_before_now (3, 3)."""
-        s = self._samples
-        found = turned((s.stamps - before) * 1e-9, s.rates - self._bias, [(stamp - before) * 1e-9])
-        return None if found is None else found[0]
+        """As `turning`."""
+        s, parts = self._samples, np.append((np.arange(_PARTS) + 0.5) / _PARTS, 1.0)
+        return turned((s.stamps - before) * 1e-9, s.rates - self._bias, parts * (stamp - before) * 1e-9)
 
     def _judge(self, measured: Array, scans: Array, seconds: float) -> None:
         """Compare two turns (3, 3)."""

@@ -8,7 +8,7 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Up
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open, turning
 from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.other import OtherMotion, Step
@@ -98,10 +98,15 @@ class MotionState:
         return np.concatenate([se3.rotation_vector(self.turn) / seconds, twist[3:]])
 
     def predicted(self, twist: Array, dt: float) -> Array:
-        """Pose (4, 4) of a frame, `dt` s after the one before, with a measured turn from the last registered one."""
-        if self.turn is None:
-            return predicted(self.T, twist, dt)
-        return predicted(self.T_registered, twist, self.seconds + dt)
+        """Pose (4, 4) of a frame, `dt` s after the one before; from the last registered one where an IMU has measured
+        how the LiDAR turned since then."""
+        return predicted(self.T, twist, dt) if self.turn is None else self._led(twist, self.seconds + dt)
+
+    def _led(self, twist: Array, seconds: float) -> Array:
+        """Pose (4, 4) so long after the last registered one."""
+        if self.inertial is None or self.inertial.turning is None:
+            return predicted(self.T_registered, twist, seconds)
+        return turning(self.T_registered, twist, twist, seconds, self.inertial.turning)
 
     def of_prediction(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
@@ -127,8 +132,11 @@ class MotionState:
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
         speed, swing = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
-        turn = swing if self.turn is None else 0.0  # a turn that has changed may change again
-        return covariance(speed, self.seconds + dt, self.settings.steadiness, self.of_velocity, turn)
+        seconds, of_turn = self.seconds + dt, None
+        if self.inertial is not None and self.inertial.turn is not None:
+            of_turn = self.inertial.covariance(seconds)
+        # A turn that has changed may change again.
+        return covariance(speed, seconds, self.settings.steadiness, self.of_velocity, swing, of_turn)
 
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
         """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
@@ -207,4 +215,4 @@ class MotionState:
         if (step := self.step) is not None:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
-            self.T = predicted(self.T_registered, self.turned(self.ahead, self.seconds), self.seconds)
+            self.T = self._led(self.ahead, self.seconds)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ import pytest
 from benchmarks.gaps import evaluated, gaps, summary
 from dpm2_core.data.open import open_source
 from dpm2_core.estimates import OdometryResult, State
-from dpm2_core.frame import Array, Frame, Points
+from dpm2_core.frame import Array, Frame, Inertial, Points
 from dpm2_core.geometry import se3
+from dpm2_core.sim.imu import Imu
 from dpm2_core.sim.lidar import Lidar
-from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.sim.settings import ImuConfig, LidarConfig
 from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.output import TrajectoryRecorder
 from dpm2_core.slam.settings import SlamSettings
@@ -70,6 +72,44 @@ def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: floa
     assert [t.state for t in tracked[13:]] == [State.TRACKING] * 3
     assert off(tracked, poses)[-3:].max() < 0.1  # as for a drive without a gap, twice: the counterparts are fewer
     assert tracked[-1].breaks == 0
+
+
+def round_a_corner(world: World) -> Pose:
+    """8 m/s straight on for a second, in a curve of 80 degrees for four, and straight on."""
+    ahead, curve = np.array([0, 0, 0, 8.0, 0, 0]), np.array([0, 0, np.radians(20.0), 8.0, 0, 0])
+
+    def pose(s: float) -> Array:
+        parts = min(s, 1.0) * ahead, min(max(s - 1.0, 0.0), 4.0) * curve, max(s - 5.0, 0.0) * ahead
+        return world.drive_pose(2.0) @ se3.exp(parts[0]) @ se3.exp(parts[1]) @ se3.exp(parts[2])
+
+    return pose
+
+
+def with_imu(frames: Sequence[Frame], pose: Pose) -> list[Frame]:
+    """An IMU goes on measuring in a gap: each frame has the samples since the one before."""
+    imu = Imu(ImuConfig(), np.random.default_rng(3))
+    times = imu.times(-0.5, frames[-1].stamp * 1e-9 + 0.05)
+    measured = imu.measure(times, lambda at: np.array([pose(s) for s in at]))
+    rates, forces = (values @ imu.R_lidar_imu.T for values in measured)
+    stamps, out = np.round(times * 1e9).astype(np.int64), []
+    for before, frame in pairwise([replace(frames[0], stamp=-(10**9)), *frames]):
+        new = (stamps > before.stamp) & (stamps <= frame.stamp)
+        out.append(replace(frame, imu=Inertial(stamps[new], rates[new], forces[new])))
+    return out
+
+
+@pytest.mark.slow
+def test_an_imu_knows_the_turn_across_a_gap(world: World) -> None:
+    """34 m on, nothing of the map is seen any more: the way is that of the motion before. Without the samples of the
+    gap, which were dropped but for its last second, it goes straight on."""
+    pose = round_a_corner(world)
+    frames, poses = scanned(world, pose, with_gap(10, 4.2, 4))
+    plain, inertial = run(frames), run(with_imu(frames, pose))
+    assert not any(t.state is State.TRACKING for t in (*plain[10:], *inertial[10:]))
+    assert off(inertial, poses)[10:].max() < 1.0 < 20.0 < off(plain, poses)[10:].min()
+    T_true, T = se3.inverse(poses[0]) @ poses[10], se3.inverse(inertial[0].T_odom_lidar) @ inertial[10].T_odom_lidar
+    sigma, unknown = (float(np.sqrt(tracked[10].covariance[2, 2])) for tracked in (inertial, plain))
+    assert abs(se3.log(se3.inverse(T_true) @ T)[2]) < 3 * sigma < 0.1 * unknown
 
 
 @pytest.mark.slow
