@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSet
     before = [odometry.process(frame) for frame in frames[max(gap.first - _WARM, 0) : gap.first]][-1]
     last, base, errors, states, uncovered = before, np.zeros((6, 6)), [], [], 0
     for i in range(gap.stop, min(gap.stop + _AFTER, len(frames))):
-        tracked = odometry.process(frames[i])
+        tracked = odometry.process(measured_on(frames[gap.first : i + 1]) if i == gap.stop else frames[i])
         T_true = se3.inverse(truth[gap.first - 1]) @ truth[i]
         error = se3.log(se3.inverse(T_true) @ se3.inverse(before.T_odom_lidar) @ tracked.T_odom_lidar)[3:]
         errors.append(float(np.linalg.norm(error)))
@@ -96,6 +96,15 @@ def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSet
         "breaks": tracked.breaks,
         "error_m": {"first": round(errors[0], 3), "last": round(errors[-1], 3)},
     }
+
+
+def measured_on(frames: Sequence[Frame]) -> Frame:
+    """The last frame with the samples of all: an IMU goes on in a gap."""
+    imus = [frame.imu for frame in frames if frame.imu is not None]
+    if not imus:
+        return frames[-1]
+    stamps, rates, forces = (np.concatenate([getattr(imu, k) for imu in imus]) for k in ("stamps", "rates", "forces"))
+    return replace(frames[-1], imu=replace(imus[-1], stamps=stamps, rates=rates, forces=forces))
 
 
 def _since(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:

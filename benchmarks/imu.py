@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an IMU is worth to a robot that turns at 100 deg/s: the same scans with it, without, and with one that stops."""
+"""What an IMU is worth to a robot that turns at 100 deg/s, and to a car whose LiDAR pauses: the same scans with it,
+without, and with one that stops."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Group
 from rich.progress import Progress
 
+from benchmarks.gaps import evaluated, gaps, summary
 from benchmarks.harness import Options, Report, settings_of
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.evaluation.metrics import evaluate, path_length
@@ -18,7 +21,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
-from dpm2_core.sim.simulated_drive import Ride, TurningRobot
+from dpm2_core.sim.simulated_drive import RIDES, Ride, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
@@ -40,6 +43,9 @@ WAYS: dict[str, Callable[[Frame], Frame]] = {
     "stops": lambda frame: frame if frame.index < FRAMES // 2 else replace(frame, imu=None),
 }
 """Of each frame, what the odometry is given."""
+CAR_FRAMES = 260
+CAR_LIDAR = LidarConfig()
+_OF_PAUSES = ("without", "with")
 
 
 def bench_imu(options: Options) -> Report:
@@ -61,8 +67,21 @@ def bench_imu(options: Options) -> Report:
             }
             results[name]["ratio"] = results[name]["with"]["ape_rmse_m"] / results[name]["without"]["ape_rmse_m"]
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
+        car = TurningRobot(build_world("loop", "suburb", 3), CAR_FRAMES, RIDES["car"], CAR_LIDAR, imu)
+        frames = list(progress.track(car.frames(), total=CAR_FRAMES, description="car"))
+        pauses = {way: _pauses([WAYS[way](frame) for frame in frames], car.poses, settings) for way in _OF_PAUSES}
     known = {"beams": LIDAR.beams, "imu": imu.model_dump(), "lengths_m": LENGTHS}
-    return Report({**known, "worlds": results}, _table(results))
+    return Report({**known, "worlds": results, "pauses": pauses}, Group(_table(results), _table_of_pauses(pauses)))
+
+
+def _pauses(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
+    """After each of many gaps: how it went, and the error up to 3 s later, over the gaps of each length."""
+    rows = [evaluated(frames, truth, gap, settings) for gap in gaps([frame.stamp for frame in frames])]
+    found = summary(rows)
+    for name, row in found.items():
+        errors = [r["error_m"]["last"] for r in rows if name in ("all", f"{r['seconds']:g} s")]
+        row |= {"median_error_m": float(np.median(errors)), "worst_error_m": max(errors)}
+    return found
 
 
 def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
@@ -95,3 +114,9 @@ def _table(worlds: dict[str, Any]) -> FigureTable:
     columns |= {f"worst tilt deg, {way}": f"{{{way}[worst_tilt_deg]:.3f}}" for way in WAYS}
     columns |= {"with / without": "{ratio:.2f}"}
     return record_table(f"{LIDAR.beams} beams, turns of 100 deg/s", ["world"], columns, worlds)
+
+
+def _table_of_pauses(pauses: dict[str, Any]) -> FigureTable:
+    columns = {"number": "{gaps}", "bridged": "{bridged}", "silently wrong": "{silently_wrong}",
+               "median error up to 3 s after, m": "{median_error_m:.2f}", "worst": "{worst_error_m:.2f}"}  # fmt: skip
+    return record_table(f"A car, {CAR_LIDAR.beams} beams, around a block", ["IMU", "pause"], columns, pauses)

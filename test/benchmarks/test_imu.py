@@ -18,6 +18,8 @@ def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkey
     monkeypatch.setattr(imu, "FRAMES", 44)
     monkeypatch.setattr(imu, "LENGTHS", (1.0,))
     monkeypatch.setattr(imu, "LIDAR", LidarConfig(beams=16, columns=360, height=0.8, car_body=False, min_range=0.4))
+    monkeypatch.setattr(imu, "CAR_FRAMES", 45)
+    monkeypatch.setattr(imu, "CAR_LIDAR", LidarConfig(beams=16, columns=360))
     results = imu.bench_imu(Options(threads=1, out=tmp_path)).results
     row = results["worlds"]["suburb"]
     assert row["frames"] == 44
@@ -29,3 +31,8 @@ def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkey
     assert row["with"]["ape_rmse_m"] < 0.1  # m, of a way of 5 m
     assert row["ratio"] == row["with"]["ape_rmse_m"] / row["without"]["ape_rmse_m"]
     assert row["with"]["worst_tilt_deg"] < 3
+    without, with_it = (results["pauses"][way] for way in ("without", "with"))
+    assert list(without) == list(with_it) == ["1 s", "2 s", "all"]  # what 4.5 s have room for, with what is around
+    assert without["all"]["gaps"] == 10
+    assert with_it["all"]["bridged"] >= without["all"]["bridged"]
+    assert with_it["all"]["median_error_m"] <= with_it["all"]["worst_error_m"] <= without["all"]["worst_error_m"] + 0.1
