@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from dpm2_core.estimates import OdometryResult, State
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
@@ -101,10 +102,7 @@ def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSet
 def measured_on(frames: Sequence[Frame]) -> Frame:
     """The last frame with the samples of all: an IMU goes on in a gap."""
     imus = [frame.imu for frame in frames if frame.imu is not None]
-    if not imus:
-        return frames[-1]
-    stamps, rates, forces = (np.concatenate([getattr(imu, k) for imu in imus]) for k in ("stamps", "rates", "forces"))
-    return replace(frames[-1], imu=replace(imus[-1], stamps=stamps, rates=rates, forces=forces))
+    return replace(frames[-1], imu=reduce(Inertial.then, imus) if imus else None)
 
 
 def _since(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:

@@ -127,6 +127,16 @@ class Inertial:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def __getitem__(self, which: NDArray[np.bool_]) -> Inertial:
+        """Those of its samples for which (K,) is true."""
+        return replace(self, stamps=self.stamps[which], rates=self.rates[which], forces=self.forces[which])
+
+    def then(self, later: Inertial) -> Inertial:
+        """Its samples, and those of a later one."""
+        stamps = np.concatenate([self.stamps, later.stamps])
+        rates, forces = np.concatenate([self.rates, later.rates]), np.concatenate([self.forces, later.forces])
+        return Inertial(stamps, rates, forces, later.up)
+
 
 @dataclass(frozen=True, eq=False)
 class Fix:

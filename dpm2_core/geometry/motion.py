@@ -22,27 +22,29 @@ _TILT = 0.1  # of the heading's: slopes
 _ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of a heading of which nothing is known
 
 
-def predicted(T: Array, twist: Array, seconds: float) -> Array:
-    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]."""
+def predicted(T: Array, twist: Array, seconds: float, turns: Array | None = None) -> Array:
+    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]; `turns` as of `between`."""
+    if turns is not None:
+        return between(T, twist, twist, seconds, turns)
     return T @ se3.exp(twist * min(seconds, _HORIZON))
 
 
-def between(T: Array, before: Array, after: Array, seconds: float) -> Array:
-    """The pose (4, 4) after that time if the motion changes evenly from one twist (6,) [rad/s, m/s] to the other."""
+def between(T: Array, before: Array, after: Array, seconds: float, turns: Array | None = None) -> Array:
+    """The pose (4, 4) after that time if the motion changes evenly from one twist (6,) [rad/s, m/s] to the other.
+
+    Args:
+        turns: rotations R_T_t (K + 1, 3, 3) in the middle of each of K even parts of the time, and in the end, where
+            they were measured: of the twists then the velocity counts alone.
+    """
+    if turns is not None:
+        parts = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
+        way = np.einsum("kij,kj->ki", turns[:-1], (1 - parts) * before[3:] + parts * after[3:]).mean(0) * seconds
+        return T @ se3.make(turns[-1], way)
     step = seconds / _STEPS
     for i in range(_STEPS):
         part = (i + 0.5) / _STEPS
         T = T @ se3.exp(((1 - part) * before + part * after) * step)
     return T
-
-
-def turning(T: Array, before: Array, after: Array, seconds: float, turns: Array) -> Array:
-    """The pose (4, 4) after that time if the velocity along the sensor's axes changes evenly from that of one twist
-    (6,) to that of the other while it turns as measured: `turns` (K + 1, 3, 3) since T, in the middle of each of K even
-    parts of the time, and in the end."""
-    part = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
-    way = np.einsum("kij,kj->ki", turns[:-1], (1 - part) * before[3:] + part * after[3:]).mean(0) * seconds
-    return T @ se3.make(turns[-1], way)
 
 
 def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float, Array], steadiness: float) -> float:

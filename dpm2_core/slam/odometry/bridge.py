@@ -17,7 +17,7 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, covariance, predicted, spread, turning, velocity_change
+from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
@@ -94,13 +94,9 @@ class Bridge:
         self._ties.clear()
         self._after: Array | None = None
         self._T_other, self._turning = T_other, None if imu is None else imu.turning
-        self._of_turn = None if imu is None or self._turning is None else imu.covariance(seconds)
-        if T_other is not None:
-            self._T_begin = T_other
-        elif self._turning is not None:
-            self._T_begin = turning(self._T, self._motion, self._motion, seconds, self._turning)
-        else:
-            self._T_begin = predicted(self._T, self._motion, seconds)
+        self._of_turn = None if imu is None else imu.covariance(seconds)
+        led = predicted(self._T, self._motion, seconds, self._turning)
+        self._T_begin = led if T_other is None else T_other
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
@@ -151,20 +147,17 @@ class Bridge:
         before, after = (_steered(twist) for twist in self._motions)
         seconds = self._seconds
         far = min(max(_BRAKES * seconds**2, _RIVALS), _FARTHEST)
-        wide = min(_STEERS * seconds**2, _WIDEST)
+        wide = min(_STEERS * seconds**2, _WIDEST) if self._turning is None else 0.0
         ahead = _direction(before, after)
         left, up = np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])
         asides = _STEP * np.array([np.zeros(3), left, -left, up, -up])
         offsets = np.array([way * ahead + aside for aside in asides for way in _spread(far, _STEP / 2)])
+        rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
         ends = [] if self._T_other is None else [self._T_other]
+        ends += [between(self._T, before + rate, after + rate, seconds, self._turning) for rate in rates]
         way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
         parts = [part for part in _PARTS if self.held or (1 - part) * way <= _STOPS * seconds**2 / 4]
-        if self._turning is not None:
-            ends += [turning(self._T, part * before, part * after, seconds, self._turning) for part in (1.0, *parts)]
-        else:
-            rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
-            ends += [between(self._T, before + rate, after + rate, seconds) for rate in rates]
-            ends += [between(self._T, part * before, part * after, seconds) for part in parts]
+        ends += [between(self._T, part * before, part * after, seconds, self._turning) for part in parts]
         poses = np.repeat(ends, len(offsets), 0)
         poses[:, :3, 3] += np.concatenate([offsets @ T[:3, :3].T for T in ends])
         return poses

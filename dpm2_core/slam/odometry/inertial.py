@@ -100,9 +100,11 @@ class InertialMotion:
         """R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed."""
         return None if self.turning is None else self.turning[-1]
 
-    def covariance(self, seconds: float) -> Array:
-        """(3, 3) rad2 of `turn` over that time."""
-        angle = 0.0 if self.turn is None else _angle(self.turn)
+    def covariance(self, seconds: float) -> Array | None:
+        """(3, 3) rad2 of `turn` over that time; None where it is."""
+        if self.turn is None:
+            return None
+        angle = _angle(self.turn)
         of_turn = _TURN**2 + (_SHARE * angle) ** 2
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
@@ -137,8 +139,7 @@ class InertialMotion:
         s, starts, self._starts = self._samples, self._starts, False
         if not starts:
             return
-        late = s.stamps > s.stamps.max(initial=0) - _AT_REST
-        s = replace(s, stamps=s.stamps[late], rates=s.rates[late], forces=s.forces[late])
+        s = s[s.stamps > s.stamps.max(initial=0) - _AT_REST]
         if len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
             return
         self._bias, self._variance = s.rates.mean(0), _BIAS_AT_REST**2
@@ -165,13 +166,9 @@ class InertialMotion:
         if not later.any():
             self._before, self._samples = None, new
             return
-        new = replace(new, stamps=new.stamps[later], rates=new.rates[later], forces=new.forces[later])
+        new = new[later]
         keep = (old.stamps > new.stamps[-1] - KEPT) & (np.arange(len(old), 0, -1) < _MOST)
-        stamps, rates, forces = (
-            np.concatenate([before[keep], after])
-            for before, after in ((old.stamps, new.stamps), (old.rates, new.rates), (old.forces, new.forces))
-        )
-        self._samples = Inertial(stamps, rates, forces, new.up)
+        self._samples = old[keep].then(new)
 
     def _turned(self, stamp: int, before: int) -> Array | None:
         """As `turning`."""

@@ -8,7 +8,7 @@ import numpy as np
 from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array, Up
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open, turning
+from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open
 from dpm2_core.geometry.turning import leveled
 from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.other import OtherMotion, Step
@@ -87,6 +87,15 @@ class MotionState:
         return None if self.inertial is None else self.inertial.turn
 
     @property
+    def turning(self) -> Array | None:
+        """The same on the way there: see `InertialMotion`."""
+        return None if self.inertial is None else self.inertial.turning
+
+    def _of_turn(self, seconds: float) -> Array | None:
+        """Covariance (3, 3) rad2 of `turn` over that time."""
+        return None if self.inertial is None else self.inertial.covariance(seconds)
+
+    @property
     def step(self) -> Step | None:
         """What another odometry says of the way since the last registered frame."""
         return None if self.other is None else self.other.step
@@ -100,19 +109,15 @@ class MotionState:
     def predicted(self, twist: Array, dt: float) -> Array:
         """Pose (4, 4) of a frame, `dt` s after the one before; from the last registered one where an IMU has measured
         how the LiDAR turned since then."""
-        return predicted(self.T, twist, dt) if self.turn is None else self._led(twist, self.seconds + dt)
-
-    def _led(self, twist: Array, seconds: float) -> Array:
-        """Pose (4, 4) so long after the last registered one."""
-        if self.inertial is None or self.inertial.turning is None:
-            return predicted(self.T_registered, twist, seconds)
-        return turning(self.T_registered, twist, twist, seconds, self.inertial.turning)
+        if self.turning is None:
+            return predicted(self.T, twist, dt)
+        return predicted(self.T_registered, twist, self.seconds + dt, self.turning)
 
     def of_prediction(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
         result = spread(self.settings.steadiness * seconds * seconds, seconds, self.of_velocity)
-        if self.inertial is not None and self.inertial.turn is not None:
-            result[:3, :3] = self.inertial.covariance(seconds)
+        if (of_turn := self._of_turn(seconds)) is not None:
+            result[:3, :3] = of_turn
         return result
 
     def information(self, seconds: float) -> Array:
@@ -132,11 +137,9 @@ class MotionState:
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
         speed, swing = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
-        seconds, of_turn = self.seconds + dt, None
-        if self.inertial is not None and self.inertial.turn is not None:
-            of_turn = self.inertial.covariance(seconds)
+        seconds = self.seconds + dt
         # A turn that has changed may change again.
-        return covariance(speed, seconds, self.settings.steadiness, self.of_velocity, swing, of_turn)
+        return covariance(speed, seconds, self.settings.steadiness, self.of_velocity, swing, self._of_turn(seconds))
 
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
         """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
@@ -215,4 +218,4 @@ class MotionState:
         if (step := self.step) is not None:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
-            self.T = self._led(self.ahead, self.seconds)
+            self.T = predicted(self.T_registered, self.ahead, self.seconds, self.turning)

@@ -289,7 +289,7 @@ class Odometry:
         usual, result = usual or NOMINAL, match.result
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return match, dt
-        T_usual = motion.predicted(motion.turned(motion.ahead, motion.seconds + usual), usual)
+        T_usual = motion.predicted(motion.ahead, usual)
         if dt < usual or not Prediction([T_predicted]).convinced(result):
             other = self._matcher.match(frame, scan, T_usual, usual)
             if fits_better(other.result, result):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.motion import between, combined, covariance, period_by_motion, predicted, turned_open, turning
+from dpm2_core.geometry.motion import between, combined, covariance, period_by_motion, predicted, turned_open
 
 TWIST = np.array([0.01, -0.02, 0.3, 15.0, 0.2, -0.1])
 OF_VELOCITY = np.diag([0.2, 0.2, 0.2]) ** 2
@@ -40,7 +40,7 @@ def test_an_even_turn_that_was_measured_is_one_motion(rate: float, seconds: floa
     midpoint rule errs by a fraction of (a / n)^2 / 24 of the way."""
     twist = np.array([0, 0, rate, 8.0, 0, 0])
     at = np.append((np.arange(10) + 0.5) / 10, 1.0) * seconds
-    T = turning(np.eye(4), twist, twist, seconds, se3.exp(at[:, None] * twist)[:, :3, :3])
+    T = predicted(np.eye(4), twist, seconds, se3.exp(at[:, None] * twist)[:, :3, :3])
     expected = predicted(np.eye(4), twist, seconds)
     np.testing.assert_allclose(T[:3, :3], expected[:3, :3], atol=1e-9)
     fraction = 1.1 * (rate * seconds / 10) ** 2 / 24
@@ -51,7 +51,7 @@ def test_a_turn_that_came_late_leads_less_far_aside() -> None:
     """From 10 to 5 m/s in two seconds, straight on in the first, across in the second."""
     turns = np.stack([np.eye(3)] * 5 + [se3.rotation(np.array([0, 0, np.pi / 2]))] * 6)
     before, after = np.array([0, 0, 0, 10.0, 0, 0]), np.array([0, 0, 0, 5.0, 0, 0])
-    T = turning(np.eye(4), before, after, 2.0, turns)
+    T = between(np.eye(4), before, after, 2.0, turns)
     np.testing.assert_allclose(T[:3, 3], [8.75, 6.25, 0], atol=1e-9)
 
 

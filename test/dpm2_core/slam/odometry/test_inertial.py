@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 
 import numpy as np
@@ -57,8 +57,7 @@ def every_third(frames: list[Frame]) -> list[Frame]:
     out = []
     for three in zip(frames[::3], frames[1::3], frames[2::3], strict=False):
         imus = [frame.imu for frame in three if frame.imu is not None]
-        parts = ([getattr(imu, name) for imu in imus] for name in ("stamps", "rates", "forces"))
-        out.append(replace(three[2], imu=Inertial(*(np.concatenate(part) for part in parts))))
+        out.append(replace(three[2], imu=reduce(Inertial.then, imus)))
     return out
 
 
