@@ -226,10 +226,10 @@ class Synchronizer:
         if now < head.arrival + self._timeout and any(sensor.waits(head.stamp) for sensor in missing):
             return None
         for topic, sensor in sensors.items():
-            sensor.matched += found[topic] is not None
-            sensor.missed = sensor.missed + 1 if found[topic] is None else 0
-            sensor.without = sensor.without + 1 if found[topic] is None else 0
-            sensor.unused *= found[topic] is None
+            if found[topic] is None:
+                sensor.missed, sensor.without = sensor.missed + 1, sensor.without + 1
+            else:
+                sensor.matched, sensor.missed, sensor.without, sensor.unused = sensor.matched + 1, 0, 0, 0
             sensor.messages.forget(head.stamp)
         head.beside = {topic: message for topic, message in found.items() if message is not None}
         self._queue.popleft()

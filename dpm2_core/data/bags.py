@@ -136,12 +136,11 @@ class BagSource:
         if known.gnss_topic and not found[known.gnss_topic] and count:  # fixes are rarer than clouds
             missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
-            details = [within] * (found[topic] < count) + [f"{unusable[topic]} have one of no use"] * bool(
-                unusable[topic]
-            )
-            if details:
-                lacking = count - found[topic] + unusable[topic]
-                note_once(self.notes, f"{lacking} of {count} frames have no {what} of {topic}", "; ".join(details))
+            absent, useless = count - found[topic], unusable[topic]
+            details = [(absent, within), (useless, f"{useless} have one of no use")]
+            if absent or useless:
+                text = f"{absent + useless} of {count} frames have no {what} of {topic}"
+                note_once(self.notes, text, "; ".join(detail for number, detail in details if number))
         if found[known.second_topic]:
             first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
             if abs(apart := (second - first) * 1e-9) > _CLOCKS:

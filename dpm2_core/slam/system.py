@@ -153,17 +153,16 @@ class Slam:
         if self.localizer is not None:
             return MapResult([], self.localizer.add(keyframe))
         loops = self.mapper.add(keyframe)
-        if any(loop.ok for loop in loops):
-            self._note_ties(keyframe, loops)
+        self._note_ties(keyframe, [loop for loop in loops if loop.ok])
         return MapResult(loops)
 
     def _note_ties(self, keyframe: Keyframe, loops: list[Edge]) -> None:
         """Loops of the last keyframe that the graph keeps, by ids as the odometry counts: below 0 before it began."""
-        keyframes, kept = self.mapper.keyframes, {(e.from_node, e.to_node) for e in self.mapper.graph.loops if e.ok}
-        offset = keyframes[-1].id - keyframe.id
-        for a, b in ((loop.from_node, loop.to_node) for loop in loops):
-            if (a, b) in kept and keyframes[a].robot == keyframes[b].robot == keyframe.robot:
-                self._tied.append((keyframes[b].id - offset, keyframes[a].id - offset))
+        offset = self.mapper.keyframes[-1].id - keyframe.id
+        for loop in self.mapper.kept(loops):
+            one, other = (self.mapper.keyframes[node] for node in (loop.from_node, loop.to_node))
+            if one.robot == other.robot == keyframe.robot:
+                self._tied.append((other.id - offset, one.id - offset))
 
     def use(self, mapper: Mapper, localizer: Localizer | None) -> None:
         """Go on in another map."""

@@ -205,7 +205,7 @@ class Mapper:
         """Give up the cloud of a keyframe that came back to an older one for that one's."""
         odometry = [edge for edge in to_before if edge.kind == "odometry"]
         again = odometry if node == self.session_start else []  # the frame with which the session before ended
-        loan = lender(node, [*again, *self._kept(loops)], self.clouds.loan, self._settings.redundancy)
+        loan = lender(node, [*again, *self.kept(loops)], self.clouds.loan, self._settings.redundancy)
         if loan is not None:
             self.clouds.borrow(node, loan)
             self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
@@ -215,6 +215,11 @@ class Mapper:
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail, edges)
             self._writer.sync(self.poses, self.graph.georeference)
+
+    def kept(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Those that the optimization has not rejected: for no other is a cloud given up, or a break crossed."""
+        rejected = {(loop.from_node, loop.to_node) for loop in self.graph.loops if not loop.ok}
+        return [loop for loop in loops if (loop.from_node, loop.to_node) not in rejected]
 
     def settle(self, wait: bool = False) -> bool:
         """Take in what another process has solved since the last keyframe: where the robot has stopped none follows.
@@ -335,11 +340,6 @@ class Mapper:
                 self.graph.optimize()
             except Dpm2Error as error:  # the drive goes on, with the poses as they were
                 self.graph.problem = str(error)
-
-    def _kept(self, loops: Sequence[Edge]) -> list[Edge]:
-        """Those that the optimization has not rejected either: for no other is a cloud given up."""
-        rejected = {(loop.from_node, loop.to_node) for loop in self.graph.loops if not loop.ok}
-        return [loop for loop in loops if (loop.from_node, loop.to_node) not in rejected]
 
     def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in checked:
