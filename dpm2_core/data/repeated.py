@@ -10,11 +10,13 @@ from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
+from numba import int64, types, uint32
 from numpy.typing import NDArray
 
 from dpm2_core.data.messages import returned
 from dpm2_core.frame import Array, Frame, Guess, Image, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.compiled import compiled
 
 PROBLEM = "the same cloud as before: the LiDAR or its driver repeats itself"
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
@@ -138,8 +140,18 @@ def _checksum(points: Points) -> int:
 
 def _some(points: Points) -> Points:
     """About one in 64 of those that have returned, by the bits of x: of each cloud the same ones."""
-    some = points[points[:, :1].view(np.uint32)[:, 0] * np.uint32(2654435761) < 2**26]
+    some = points[_chosen(np.ascontiguousarray(points).view(np.uint32))]
     return some[returned(some)]
+
+
+@compiled(int64[::1](types.Array(uint32, 2, "C", readonly=True)))
+def _chosen(bits: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Indices of the points, of which (N, 4) are the bits, for `_some`."""
+    which, count = np.empty(len(bits), np.int64), 0
+    for i in range(len(bits)):
+        which[count] = i
+        count += np.uint32(bits[i, 0] * np.uint32(2654435761)) < 2**26
+    return which[:count]
 
 
 def _marks(points: Points) -> NDArray[np.uint64]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import log, sqrt
 
 import numpy as np
-from numba import float32, int32, int64, types
+from numba import boolean, float32, int32, int64, types
 from numpy.typing import NDArray
 
 from dpm2_core.frame import Points
@@ -54,14 +54,21 @@ def scattered(points: Points, least: float = MANY) -> NDArray[np.bool_]:
     return alone if every == 1 else _alone(points, 1)[0]
 
 
-@compiled(types.Tuple((int32[::1], float32[::1], float32[::1], int32[::1]))(READ_F4, int64, int64))
+@compiled(
+    types.Tuple((int64[::1], int32[::1], float32[::1], float32[::1], int32[::1]))(READ_F4, int64, boolean[:, :, ::1])
+)
 def _in_cells(
-    points: Points, edge: int, every: int
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """The cells of directions of (N, 4) points, -1 of those that are passed over; their ranges; the ranges cell by
-    cell; and where those of each cell begin. Around each face of the cube are cells without points."""
-    side = edge + 2 * _LONGEST
-    cell, away = np.full(len(points), -1, np.int32), np.empty(len(points), np.float32)
+    points: Points, edge: int, looked: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """Of (N, 4) points those (M,) in the patches of directions (face, row, column) that are looked at; their cells of
+    directions and ranges (M,); the ranges cell by cell; and where those of each cell begin. Around each face of the cube
+    are cells without points."""
+    side, count = edge + 2 * _LONGEST, 0
+    which, cell, away = (
+        np.empty(len(points), np.int64),
+        np.empty(len(points), np.int32),
+        np.empty(len(points), np.float32),
+    )
     start = np.zeros(6 * side * side + 1, np.int32)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -73,29 +80,32 @@ def _in_cells(
             face, depth, u, v = (4 if y < 0 else 5), abs(y), x, z
         column = max(0, min(int((u / depth + 1) * (edge / 2)), edge - 1))  # 0 for NaN, too
         row = max(0, min(int((v / depth + 1) * (edge / 2)), edge - 1))
-        if (column // _PATCH + 7 * (row // _PATCH) + 3 * face) % every == 0:
-            cell[i], away[i] = (face * side + row + _LONGEST) * side + column + _LONGEST, sqrt(x * x + y * y + z * z)
-            start[cell[i] + 1] += 1
+        if looked[face, row // _PATCH, column // _PATCH]:
+            which[count], away[count] = i, sqrt(x * x + y * y + z * z)
+            cell[count] = (face * side + row + _LONGEST) * side + column + _LONGEST
+            start[cell[count] + 1] += 1
+            count += 1
     for c in range(1, len(start)):
         start[c] += start[c - 1]
-    of_cells, free = np.empty(start[-1], np.float32), start.copy()
-    for i in range(len(points)):
-        if cell[i] >= 0:
-            of_cells[free[cell[i]]] = away[i]
-            free[cell[i]] += 1
-    return cell, away, of_cells, start
+    of_cells, free = np.empty(count, np.float32), start.copy()
+    for k in range(count):
+        of_cells[free[cell[k]]] = away[k]
+        free[cell[k]] += 1
+    return which[:count], cell[:count], away[:count], of_cells, start
 
 
 def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
     """Which of (N, 4) points are near and unlike those around them, and how many are near; of all patches of directions
     one in `every` is looked at."""
     edge = max(1, int(_CELLS * min(1.0, sqrt(len(points) / _DENSE))))
-    cell, away, of_cells, start = _in_cells(points, edge, every)
-    near = np.flatnonzero((cell >= 0) & (away < _NEAR))
+    patches, faces = np.arange(edge // _PATCH + 1), np.arange(6)[:, None, None]
+    looked = (patches + 7 * patches[:, None] + 3 * faces) % every == 0
+    which, cell, away, of_cells, start = _in_cells(points, edge, looked)
+    near = np.flatnonzero(away < _NEAR)
     bins = (np.log((away[near] + _SHIFT) / _SHIFT) / _BIN).astype(np.int64)
     nearer = np.append(0, np.cumsum(np.bincount(bins, minlength=_BINS)))  # than each bin
     alone = np.zeros(len(points), np.bool_)
-    alone[near] = _unlike(near, cell, away, of_cells, start, (bins, nearer, edge + 2 * _LONGEST))
+    alone[which[near]] = _unlike(near, cell, away, of_cells, start, (bins, nearer, edge + 2 * _LONGEST))
     return alone, len(near)
 
 
