@@ -61,8 +61,8 @@ def _in_cells(
     points: Points, edge: int, looked: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """Of (N, 4) points those (M,) in the patches of directions (face, row, column) that are looked at; their cells of
-    directions and ranges (M,); the ranges cell by cell; and where those of each cell begin. Around each face of the cube
-    are cells without points."""
+    directions and ranges (M,); the ranges cell by cell; and where those of each cell begin. Around each face of the
+    cube are cells without points."""
     side, count = edge + 2 * _LONGEST, 0
     which, cell, away = (
         np.empty(len(points), np.int64),
