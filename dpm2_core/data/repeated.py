@@ -149,8 +149,9 @@ def _chosen(bits: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Indices of the points, of which (N, 4) are the bits, for `_some`."""
     which, count = np.empty(len(bits), np.int64), 0
     for i in range(len(bits)):
-        which[count] = i
-        count += np.uint32(bits[i, 0] * np.uint32(2654435761)) < 2**26
+        if np.uint32(bits[i, 0] * np.uint32(2654435761)) < 2**26:
+            which[count] = i
+            count += 1
     return which[:count]
 
 
