@@ -85,7 +85,7 @@ class Bridge:
         """A new stretch, so long after the last pose before the pause: where it begins (4, 4).
 
         Args:
-            T_other: there, if another odometry knows the way. imu: it may know the turn since that pose.
+            T_other: there, if another odometry knows the way. imu: it may know the turn since that pose, or the way.
             stepped: it is so long by a clock that was set meanwhile.
         """
         self._seconds = seconds
@@ -93,10 +93,18 @@ class Bridge:
         self.held = self._stepped
         self._ties.clear()
         self._after: Array | None = None
-        self._T_other, self._turning = T_other, None if imu is None else imu.turning
-        self._of_turn = None if imu is None else imu.covariance(seconds)
-        led = predicted(self._T, self._motion, seconds, self._turning)
-        self._T_begin = led if T_other is None else T_other
+        self._turning, of_turn, step = None, None, None
+        if imu is not None:
+            self._turning, of_turn = imu.turning, imu.covariance(seconds)
+            step = None if self.twist is None else imu.step(self._T[:3, :3], self.twist[3:], self._of_velocity)
+        self._ways = [] if T_other is None else [T_other]
+        self._ways += [] if step is None else [self._T @ step.T]
+        self._T_begin = self._ways[0] if self._ways else predicted(self._T, self._motion, seconds, self._turning)
+        if T_other is None and step is not None:
+            self._of_begin = step.covariance
+        else:
+            acceleration, of_velocity = self._limits.acceleration, self._of_velocity
+            self._of_begin = covariance(self._speed, seconds, acceleration, of_velocity, of_turn=of_turn)
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
@@ -108,9 +116,7 @@ class Bridge:
     def covariance(self, T_stretch: Array) -> Array:
         """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last one before the pause."""
         A = se3.adjoint(se3.inverse(T_stretch) @ self._T_begin)
-        acceleration, of_turn = self._limits.acceleration, self._of_turn
-        of_begin = covariance(self._speed, self._seconds, acceleration, self._of_velocity, of_turn=of_turn)
-        return np.asarray(A @ of_begin @ A.T)
+        return np.asarray(A @ self._of_begin @ A.T)
 
     def register(
         self, scan: Scan, T_stretch: Array, twist: Array | None, own: Registration
@@ -153,7 +159,7 @@ class Bridge:
         asides = _STEP * np.array([np.zeros(3), left, -left, up, -up])
         offsets = np.array([way * ahead + aside for aside in asides for way in _spread(far, _STEP / 2)])
         rates = [np.array([0, 0, turn / seconds, 0, 0, 0]) for turn in _spread(wide, _TURN)]
-        ends = [] if self._T_other is None else [self._T_other]
+        ends = list(self._ways)
         ends += [between(self._T, before + rate, after + rate, seconds, self._turning) for rate in rates]
         way = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
         parts = [part for part in _PARTS if self.held or (1 - part) * way <= _STOPS * seconds**2 / 4]

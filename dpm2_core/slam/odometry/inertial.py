@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An IMU beside the scans, loosely coupled: how the LiDAR turned, and which way is up.
+"""An IMU beside the scans, loosely coupled: how the LiDAR turned, which way is up, and where no scan fits the way.
 
-The turn between two scans, and during one, is measured instead of taken to be steady: all else of the motion model
-stays. The gyroscope's bias is what the scans say differently over a second or more: at rest, where they show no turn at
-all, as well as on the way, though there less surely. A gyroscope whose turns are not those of the scans, as with a
-wrong orientation in /tf_static, is left out until they agree for a while.
+The turn between two scans, and during one, is measured instead of taken to be steady, and so is the change of velocity
+since the last scan, as far as gravity is known; a scan that fits decides on the way. The gyroscope's bias is what the
+scans say differently over a second or more: at rest, where they show no turn at all, as well as on the way, though
+there less surely. A gyroscope whose turns are not those of the scans, as with a wrong orientation in /tf_static, is
+left out until they agree for a while.
 
 Forces, averaged over a minute from which the changes of velocity are taken out, show which way is up. By that the
-odometry's frame is level at a start at rest, and stays so: it follows no faster than the odometry may drift.
+odometry's frame is level at a start at rest, and stays so: it follows no faster than the odometry may drift. How far
+the accelerations are off is what the scans say differently, too.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ import numpy as np
 from dpm2_core.data.imu import KEPT
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
-from dpm2_core.geometry.turning import leveled, turned
+from dpm2_core.geometry.turning import turned
+from dpm2_core.slam.odometry.other import Step
+from dpm2_core.slam.odometry.vertical import Vertical, metric
 
 _MOST = 25_000  # samples, at most
 _PARTS = 10  # of the time since the last registered frame
@@ -36,14 +40,10 @@ _MEMORY = 0.15  # fraction of the newest turn in the doubt
 _WORST, _UNSEEN = 25.0, 10.0  # so much a turn counts at most, and one at whose end the scan fits nowhere
 _TURNING = 0.1  # rad/s: slower turns prove nothing
 
-_GRAVITY = 9.81
-_POSSIBLE = 1.5  # m/s2 that a mean force without the changes of velocity may differ from it
-_NO_GRAVITY = 0.5  # m/s2: forces that differ by less from the changes of velocity have none in them
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
 _SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
+_SHAKEN = 0.6  # m/s2 that accelerations may be off, to lead anywhere
 _AT_REST, _FEWEST = 1_000_000_000, 5  # ns of samples that show it, and so many at least
-_WEIGHT = 5.0  # s that a start at rest counts as much as
-_MINUTE = 60.0  # s of which the mean force shows the vertical
 _FOLLOWS = np.radians(0.02)  # rad for each m or s: so fast is the frame turned
 
 
@@ -68,16 +68,18 @@ class InertialMotion:
         self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
         self._measured: Array | None = None  # the same, believed or not
         self._before: int | None = None  # stamp of the last registered frame
+        self._now = 0  # that of the last frame
         self.turns = False
         self._doubt = 1.0
         self._span = _Span(np.eye(3))
-        self._vertical = _Vertical()
+        self._vertical = Vertical()
 
     def look(self, frame: Frame) -> Frame:
         """Take in a new frame's samples; returns the frame with those around its sweep, without their bias, or none."""
         if self.turns:  # the last frame was not registered
             self._remember(_UNSEEN)
         self._join(frame)
+        self._now = frame.stamp
         self.turning = self._measured = None
         if self._before is None:
             self.problem = "" if len(self._samples) else "no samples"
@@ -108,6 +110,30 @@ class InertialMotion:
         of_turn = _TURN**2 + (_SHARE * angle) ** 2
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
+    def step(self, R: Array, velocity: Array, of_velocity: Array) -> Step | None:
+        """The way since the last registered frame, from its velocity on by turns and forces; None where it is unknown.
+
+        Args:
+            R: (3, 3) of that frame in the odometry's frame. velocity: (3,) m/s there, along its axes, of the covariance
+                `of_velocity` (3, 3).
+        """
+        before, now = self._before, self._now
+        if before is None or self.turn is None or self._vertical.sigma > _SHAKEN:
+            return None
+        at, forces = self._forces(before, now)
+        found = self._vertical.accelerations(forces @ R.T) if len(at) else None
+        seconds = (now - before) * 1e-9
+        of_turn = self.covariance(seconds)
+        if found is None or of_turn is None:
+            return None
+        at, found = np.r_[0.0, at, seconds], np.r_[found[:1], found, found[-1:]]
+        way = velocity * seconds + R.T @ np.trapezoid((seconds - at)[:, None] * found, at, axis=0)
+        along = of_velocity * seconds**2 + (0.5 * self._vertical.sigma * seconds**2) ** 2 * np.eye(3)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = of_turn
+        covariance[3:, 3:] = self.turn.T @ along @ self.turn + 0.25 * (way @ way) * of_turn
+        return Step(se3.make(self.turn, way), covariance)
+
     def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None) -> None:
         """A frame was registered at T (4, 4), the last one at T_before.
 
@@ -127,11 +153,11 @@ class InertialMotion:
         self._variance += _BIAS_DRIFT**2 * seconds
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
-        force = self._force(before, stamp) if self._doubt <= _CREDIBLE else None
-        if force is None:
+        forces = self._forces(before, stamp)[1]
+        if not len(forces) or self._doubt > _CREDIBLE:
             self._vertical.pause()
             return
-        self._vertical.add(T_before[:3, :3] @ force, T[:3, :3] @ twist[3:], seconds)
+        self._vertical.add(T_before[:3, :3] @ forces.mean(0), T[:3, :3] @ twist[3:], seconds)
         self._level_frame(T_before, T, seconds)
 
     def _start_at_rest(self, T: Array) -> None:
@@ -197,15 +223,16 @@ class InertialMotion:
         self._bias = np.clip(self._bias + gain * off, -_LARGEST_BIAS, _LARGEST_BIAS)
         self._variance *= 1 - gain
 
-    def _force(self, before: int, stamp: int) -> Array | None:
-        """Mean force (3,) between two stamps along the axes at the first; None where it is not known."""
+    def _forces(self, before: int, stamp: int) -> tuple[Array, Array]:
+        """Times (N,) s since the first of two stamps, and forces (N, 3) there along the axes at the first; none where
+        they are not known."""
         s = self._samples
-        inside = (s.stamps > before) & (s.stamps <= stamp) & np.isfinite(s.forces).all(1)
-        if inside.sum() < 2:
-            return None
-        seconds = (s.stamps - before) * 1e-9
-        R = turned(seconds, s.rates - self._bias, seconds[inside])
-        return None if R is None else np.einsum("nij,nj->i", R, s.forces[inside]) / inside.sum()
+        s = s[(s.stamps > before) & (s.stamps <= stamp) & np.isfinite(s.forces).all(1)]
+        at = np.asarray((s.stamps - before) * 1e-9, np.float64)
+        R = turned(at, s.rates - self._bias, at) if len(s) > 1 else None
+        if R is None:
+            return np.zeros(0), np.zeros((0, 3))
+        return at, np.einsum("nij,nj->ni", R, s.forces)
 
     def _level_frame(self, T_before: Array, T: Array, seconds: float) -> None:
         """Turn the level frame a little about the LiDAR's position, so that no pose jumps."""
@@ -234,72 +261,11 @@ class _Span:
         )
 
 
-class _Vertical:
-    """Which way (3,) is up in the odometry's frame, of late, and which way it is to be."""
-
-    def __init__(self) -> None:
-        self._up = np.zeros(3)
-        self._axis: Array | None = None
-        self._seconds = 0.0  # that `_up` is the mean of
-        self._velocity: Array | None = None
-        self._without = False  # gravity, as a start at rest has shown
-        self.pause()
-
-    def start(self, force: Array, axis: Array) -> bool:
-        """At rest at the start; `axis` (3,) is to be up. False: the force is not gravity, and shows no vertical."""
-        up = _metric(force)
-        self._without = not _is_gravity(up)
-        if self._without:
-            return False
-        self._up, self._axis, self._seconds = up, axis, _WEIGHT
-        return True
-
-    def pause(self) -> None:
-        """What comes next does not follow on."""
-        self._velocity, self._sum, self._time = None, np.zeros(3), 0.0
-
-    def add(self, force: Array, velocity: Array, seconds: float) -> None:
-        """A step with its mean force (3,) m/s2, and the mean velocity (3,) m/s."""
-        if self._velocity is None:
-            self._velocity = velocity
-            return
-        self._sum, self._time = self._sum + force * seconds, self._time + seconds
-        if self._time < _SPAN:
-            return
-        mean, change, time = self._sum / self._time, (velocity - self._velocity) / self._time, self._time
-        self.pause()
-        self._velocity = velocity
-        up = _metric(mean) - change
-        # An acceleration of 1 m/s2 without gravity looks as gravity in g: then the forces are the change of velocity.
-        if self._without or not _is_gravity(up) or np.linalg.norm(mean - change) < _NO_GRAVITY:
-            return
-        self._seconds = min(self._seconds + time, _MINUTE)
-        self._up = self._up + time / self._seconds * (up - self._up)
-        if self._axis is None and self._seconds >= 2 * _WEIGHT:
-            self._axis = self._up / np.linalg.norm(self._up)  # however tilted the start was: it stays like that
-
-    @property
-    def turn(self) -> Array:
-        """(3, 3) that makes it so."""
-        return np.eye(3) if self._axis is None else leveled(self._up, self._axis)
-
-
 def _angle(R: Array) -> float:
     return float(np.linalg.norm(se3.rotation_vector(R)))
-
-
-def _metric(forces: Array) -> Array:
-    """Forces (N, 3), or a mean one (3,), in m/s2; some drivers count in g, in which their mean is 1 then."""
-    mean = np.atleast_2d(forces).mean(0)
-    return forces * _GRAVITY if _is_gravity(_GRAVITY * mean) else forces
-
-
-def _is_gravity(up: Array) -> bool:
-    """A mean force (3,) m/s2 without the changes of velocity."""
-    return bool(abs(np.linalg.norm(up) - _GRAVITY) <= _POSSIBLE)
 
 
 def _at_rest(rates: Array, forces: Array) -> bool:
     noise, mean, shaking = _STEADY
     still = rates.std(0).max() < noise and np.abs(rates.mean(0)).max() < mean
-    return bool(still and _metric(forces).std(0).max() < shaking)  # False where they are unknown
+    return bool(still and metric(forces).std(0).max() < shaking)  # False where they are unknown

@@ -97,8 +97,15 @@ class MotionState:
 
     @property
     def step(self) -> Step | None:
-        """What another odometry says of the way since the last registered frame."""
-        return None if self.other is None else self.other.step
+        """The way since the last registered frame, as another odometry or else an IMU knows it."""
+        step = None if self.other is None else self.other.step
+        return self._inertial_step if step is None else step
+
+    @property
+    def _inertial_step(self) -> Step | None:
+        if self.inertial is None or self.twist is None:
+            return None
+        return self.inertial.step(self.T_registered[:3, :3], self.twist[3:], self.of_velocity)
 
     def turned(self, twist: Array, seconds: float) -> Array:
         """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
@@ -107,8 +114,13 @@ class MotionState:
         return np.concatenate([se3.rotation_vector(self.turn) / seconds, twist[3:]])
 
     def predicted(self, twist: Array, dt: float) -> Array:
-        """Pose (4, 4) of a frame, `dt` s after the one before; from the last registered one where an IMU has measured
-        how the LiDAR turned since then."""
+        """Pose (4, 4) of a frame, `dt` s after the one before; where an IMU knows the way, that has led there."""
+        step = self._inertial_step
+        return self.steadily(twist, dt) if step is None else self.T_registered @ step.T
+
+    def steadily(self, twist: Array, dt: float) -> Array:
+        """The same at a constant velocity; from the last registered frame where an IMU has measured how the LiDAR
+        turned since then."""
         if self.turning is None:
             return predicted(self.T, twist, dt)
         return predicted(self.T_registered, twist, self.seconds + dt, self.turning)
@@ -176,7 +188,8 @@ class MotionState:
 
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""
-        of_prediction = self.step.covariance if led and self.step is not None else self.of_prediction(seconds)
+        step = self.other.step if led and self.other is not None else None
+        of_prediction = self.of_prediction(seconds) if step is None else step.covariance
         of_scene = turned_open(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
         of_motion = combined(of_scene, of_prediction[3:, 3:])
         self.of_velocity = of_motion / seconds**2

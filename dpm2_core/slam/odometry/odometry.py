@@ -230,14 +230,13 @@ class Odometry:
     def _begin_stretch(self, dt: float, stepped: bool) -> Array:
         """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns; `stepped` if
         the pause may be of the clock alone."""
-        motion, imu = self._motion, None
+        motion, imu, step = self._motion, None, self._motion.step
         if self._bridge is None:
-            imu = motion.inertial
+            imu, step = motion.inertial, None if motion.other is None else motion.other.step
             limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
             self._bridge = Bridge(self._registration, motion.T_registered, motion.twist, motion.of_velocity, limits)
             self._left = self._clock.now - motion.seconds - dt
         self._registration, self._first = self._registration.fresh(), None
-        step = motion.step
         T_other = None if step is None else motion.T_registered @ step.T
         motion.begin(self._bridge.begin(self._clock.now - self._left, T_other, imu, stepped))
         return motion.T
@@ -289,7 +288,7 @@ class Odometry:
         usual, result = usual or NOMINAL, match.result
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return match, dt
-        T_usual = motion.predicted(motion.ahead, usual)
+        T_usual = motion.steadily(motion.ahead, usual)
         if dt < usual or not Prediction([T_predicted]).convinced(result):
             other = self._matcher.match(frame, scan, T_usual, usual)
             if fits_better(other.result, result):

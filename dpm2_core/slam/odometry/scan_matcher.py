@@ -157,7 +157,7 @@ class ScanMatcher:
     def _led_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
         """From where another odometry leads, and whether the scan fits there; None without one, or far from there."""
         motion = self.motion
-        if motion.other is None or (step := motion.step) is None:
+        if motion.other is None or (step := motion.other.step) is None:
             return None, False
         T = motion.T_registered @ step.T
         information = np.linalg.inv(step.covariance).astype(np.float64)

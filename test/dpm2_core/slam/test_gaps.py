@@ -113,6 +113,22 @@ def test_an_imu_knows_the_turn_across_a_gap(world: World) -> None:
 
 
 @pytest.mark.slow
+def test_an_imu_knows_the_way_of_a_robot_that_sets_off_in_a_gap(world: World) -> None:
+    """At rest for a second, then 21 m on at 2.5 m/s2: nothing but the forces shows that it has moved at all."""
+
+    def pose(s: float) -> Array:
+        return world.drive_pose(2.0) @ se3.exp([0, 0, 0, 1.25 * max(s - 1.0, 0.0) ** 2, 0, 0])
+
+    frames, poses = scanned(world, pose, with_gap(10, 4.2, 4))
+    inertial = with_imu(frames, pose)
+    unknown = [replace(f, imu=replace(f.imu, forces=np.full_like(f.imu.forces, np.nan))) for f in inertial if f.imu]
+    known, turns_alone = run(inertial), run(unknown)
+    assert off(known, poses)[10] < 1.5 < 20.0 < off(turns_alone, poses)[10]
+    sigma, without = (float(np.sqrt(tracked[10].covariance[3, 3])) for tracked in (known, turns_alone))
+    assert off(known, poses)[10] < 3 * sigma < 0.5 * without
+
+
+@pytest.mark.slow
 def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
     frames, poses = scanned(world, lambda s: world.drive_pose(2.0), with_gap(6, 10.0, 5))
     tracked = run(frames)
