@@ -123,7 +123,7 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
     if not _shows(result, mapper.clouds[-1]):
         raise UsageError(f"--resume: frame {last.index} of {source.name} is not the one with which the map ends")
-    mapper.start_session(None, _SAME_FRAME, len(mapper.keyframes) - 1)
+    mapper.start_session(None, _SAME_FRAME)
     return position
 
 

@@ -66,7 +66,6 @@ class _Start(NamedTuple):
 
     T_map_odom: Array | None
     covariance: Array
-    node: int | None
 
 
 class Mapper:
@@ -118,8 +117,7 @@ class Mapper:
         if not self.keyframes:
             return np.eye(4)
         if len(self.keyframes) == self.session_start:
-            start = self._start
-            return start.T_map_odom if start and (start.node is None or self._is_placed(start.node)) else None
+            return None if self._start is None else self._start.T_map_odom
         return self.T_map_odom_of(self.keyframes[-1].robot)
 
     def T_map_odom_of(self, robot: str) -> Array | None:
@@ -150,15 +148,15 @@ class Mapper:
         """Width of the features that its network makes; None without a network."""
         return self._closer.channels
 
-    def start_session(self, T_map_odom: Array | None, covariance: Array, node: int | None = None) -> None:
+    def start_session(self, T_map_odom: Array | None, covariance: Array) -> None:
         """Before the first keyframe of a session in a loaded map: where its odometry begins. Else only a loop tells.
 
         Args:
-            T_map_odom: (4, 4); None: the first keyframe is where `node` is, whose frame it is of.
-            covariance: (6, 6) of the first keyframe's pose relative to that of `node`, to which an edge will tie it.
-            node: of the map, from which the odometry goes on; None: the nearest whose place is known.
+            T_map_odom: (4, 4), by which a loop ties the first keyframe to the nearest whose place is known; None: it is
+                where the last of the map is, whose frame it is of, and the odometry goes on from there.
+            covariance: (6, 6) of the first keyframe's pose relative to that one.
         """
-        self._start = _Start(T_map_odom, covariance, node)
+        self._start = _Start(T_map_odom, covariance)
 
     def forget_start(self) -> None:
         """The odometry that `start_session` has placed begins anew before its first keyframe: only a loop tells."""
@@ -295,23 +293,20 @@ class Mapper:
         return [edge]
 
     def _begin_session(self, start: _Start, keyframe: Keyframe, way: Registration | None) -> Edge:
-        """The first node of a session, and what ties it to the map: odometry from a node, or a loop to the nearest one.
+        """The first node of a session, and what ties it to the map: odometry from the last, or a loop to the nearest.
 
         `way`: to it from a keyframe before the session, if there is one: a break of the odometry may be in it.
         """
-        poses, other = self.poses, start.node
-        T = poses[other] if start.T_map_odom is None else start.T_map_odom @ keyframe.T_odom_kf
-        if other is None:
-            known = np.flatnonzero(self.placed)
-            other = int(known[np.linalg.norm(poses[known, :3, 3] - T[:3, 3], axis=1).argmin()])
+        node, poses = len(self.keyframes), self.poses
         covariance = start.covariance if way is None else start.covariance + way.covariance
-        tie = Registration(se3.inverse(poses[other]) @ T, covariance)
-        if start.node is not None:
-            edge = Edge("odometry", other, len(self.keyframes), tie)
-            self.graph.add_node(T, edge)
+        if start.T_map_odom is None:
+            edge = Edge("odometry", node - 1, node, Registration(np.eye(4), covariance))
+            self.graph.add_node(poses[-1], edge)
             return edge
+        T, known = start.T_map_odom @ keyframe.T_odom_kf, np.flatnonzero(self.placed)
+        other = int(known[np.linalg.norm(poses[known, :3, 3] - T[:3, 3], axis=1).argmin()])
         self.graph.add_node(T)
-        return self._tied(Edge("loop", other, len(self.keyframes), tie))
+        return self._tied(Edge("loop", other, node, Registration(se3.inverse(poses[other]) @ T, covariance)))
 
     def _close_loops(self, due: bool) -> None:
         """Loops of the last keyframe: into the graph, unless they were rejected there or before.

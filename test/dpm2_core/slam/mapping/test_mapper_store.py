@@ -166,20 +166,20 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
 
 def test_a_second_session_counts_on(tmp_path: Path) -> None:
     path, drive = tmp_path / "a.dpm2map", laps(1)
-    for part in (drive[:8], drive[8:]):
+    parts = drive[:8], drive[7:]  # it goes on with the frame of the last keyframe
+    for part in parts:
         with begun(path) as mapper:
             if mapper.keyframes:
-                T_map_odom = mapper.poses[-1] @ se3.inverse(drive[7].T_odom_kf)
-                mapper.start_session(T_map_odom, SIGMA, 7)
+                mapper.start_session(None, SIGMA)
             for number, keyframe in enumerate(part):
                 edge = keyframe.edge if number else None
                 mapper.add(Keyframe(number, keyframe.stamp, keyframe.index, keyframe.T_odom_kf, keyframe.cloud, edge))
     with MapStore.open(path) as store:
         data = load_map(store)
-        assert [k.id for k in data.keyframes] == list(range(LAP))
-        assert [k.session for k in data.keyframes] == [1] * 8 + [2] * 12
-        np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in drive], atol=1e-6)
-        assert len([e for e in data.edges if e.kind == "odometry"]) == LAP - 1
+        assert [k.id for k in data.keyframes] == list(range(LAP + 1))
+        assert [k.session for k in data.keyframes] == [1] * 8 + [2] * 13
+        np.testing.assert_allclose(data.poses, [k.T_odom_kf for part in parts for k in part], atol=1e-6)
+        assert len([e for e in data.edges if e.kind == "odometry"]) == LAP
 
 
 def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(
         for keyframe in drive[:8]:
             mapper.add(keyframe)
     with begun(path) as mapper:
-        mapper.start_session(None, SIGMA, 7)
+        mapper.start_session(None, SIGMA)
         assert mapper.T_map_odom is None
         T_odom_first = se3.exp([0, 0.1, 0, 0, 0, 0])
         mapper.add(replace(drive[7], id=0, T_odom_kf=T_odom_first, edge=None))
