@@ -106,10 +106,10 @@ def check(
     recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
 ) -> None:
     """Look for damage: database, checksum of every row, dangling edges, invalid poses."""
-    from dpm2_core.slam.mapping.parts import placed
+    from dpm2_core.slam.mapping.parts import georeferenced
     from dpm2_core.slam.store.check import check_map
 
-    result = check_map(path, recover, placed)
+    result = check_map(path, recover, georeferenced)
     console = Console(soft_wrap=True, highlight=False)
     for problem in result.problems:
         console.print(problem)

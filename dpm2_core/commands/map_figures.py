@@ -13,7 +13,7 @@ from dpm2_core.commands.options import note
 from dpm2_core.database import size_with_log
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
-from dpm2_core.slam.mapping.parts import parts_of
+from dpm2_core.slam.mapping.parts import placed
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.map_data import MapData, Way, load_map, ways
 from dpm2_core.slam.store.map_file import missing_log
@@ -60,8 +60,7 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
 
 def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
     loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
-    parts = parts_of(data)
-    placed, session = parts == parts[:1], np.array([k.session for k in data.keyframes], np.int64)
+    tied, session = placed(data), np.array([k.session for k in data.keyframes], np.int64)
     return {
         "map": str(path),
         "keyframes": len(data),
@@ -71,7 +70,7 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
         "pruned": len(data.trail),
         "robots": sorted({way.robot for way in drives}),
         "length_m": _length(drives),
-        "extent_m": np.ptp(data.poses[placed, :3, 3], axis=0).tolist() if len(data) else [],
+        "extent_m": np.ptp(data.poses[tied, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
         "georeference": _georeference_figures(data),
@@ -80,7 +79,7 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
             {
                 "session": s.number,
                 "keyframes": int((session == s.number).sum()),
-                "untied": int(((session == s.number) & ~placed).sum()),
+                "untied": int(((session == s.number) & ~tied).sum()),
                 "started": s.started,
                 "program": s.program,
                 "weights": s.weights,
@@ -114,8 +113,8 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
 
 def unplaced(data: MapData) -> str:
     """Why a map without a georeference has none, in words; empty where it has no fixes."""
-    parts, fixes = parts_of(data), np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
-    tied = int(fixes[parts == parts[:1]].sum())
+    fixes = np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
+    tied = int(fixes[placed(data)].sum())
     elsewhere = int(fixes.sum()) - tied
     why = "the way is too short or too straight, or half of them or more are off it, as by another clock"
     reasons = [f"{tied} fixes do not tell it: {why}"] if tied else []

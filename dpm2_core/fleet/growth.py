@@ -26,7 +26,7 @@ from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
-from dpm2_core.slam.mapping.parts import located, parts_of
+from dpm2_core.slam.mapping.parts import located, placed
 from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData, append_map, odometry_by_node
 from dpm2_core.slam.store.map_store import Change, MapStore
@@ -90,10 +90,7 @@ def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
 
 def _georeference(data: MapData) -> Georeference | None:
     """That of the map in which a drive has its poses, by the drive's fixes: its own is of the frame that it had."""
-    if data.georeference is None:
-        return None
-    parts = parts_of(data)
-    return located(data, parts == parts[0])
+    return None if data.georeference is None else located(data, placed(data))
 
 
 def _renamed(name: str, data: MapData) -> MapData:

@@ -58,20 +58,20 @@ class Fixes:
         self._fixes.append((node, fix))
         self._used.append(True)
 
-    def chosen(self, tied: NDArray[np.bool_]) -> list[int]:
-        """Positions of the fixes that enter, none before the georeference is known; `tied`: (N,) nodes that may."""
-        return [] if self.georeference is None else [k for k, (node, _) in enumerate(self._fixes) if tied[node]]
+    def chosen(self, placed: NDArray[np.bool_]) -> list[int]:
+        """Positions of the fixes that enter, none before the georeference is known; `placed`: (N,) nodes that may."""
+        return [] if self.georeference is None else [k for k, (node, _) in enumerate(self._fixes) if placed[node]]
 
     def kept(self, chosen: Sequence[int]) -> list[bool]:
         """Of the edges that `joined` adds, whether each constrains the poses."""
         return [*(self._used[k] for k in chosen), True] if chosen else []
 
-    def locate(self, poses: Array, tied: NDArray[np.bool_]) -> None:
+    def locate(self, poses: Array, placed: NDArray[np.bool_]) -> None:
         """Find where the map is, unless that is known and most fixes agree.
 
-        `poses`: (N, 4, 4). `tied`: as in `chosen`.
+        `poses`: (N, 4, 4). `placed`: as in `chosen`.
         """
-        known = [(node, fix) for node, fix in self._fixes if tied[node]]
+        known = [(node, fix) for node, fix in self._fixes if placed[node]]
         if len(known) < _FEWEST:
             return
         here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in known])[:, :3]
@@ -127,7 +127,7 @@ class Fixes:
             ends=np.concatenate([data.ends, [(last, place) for place in at], [(places[0], last)]]),
             T_from_to=np.concatenate([data.T_from_to, T, (se3.inverse(data.poses[places[0]]) @ level)[None]]),
             covariances=np.concatenate([data.covariances, covariances]),
-            placed=np.array([last], np.intp),
+            enu=np.array([last], np.intp),
         )
 
     def solved(self, chosen: Sequence[int], T_map_enu: Array, kept: NDArray[np.bool_]) -> None:

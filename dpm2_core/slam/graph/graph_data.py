@@ -29,7 +29,7 @@ class GraphData:
         T_from_to: (E, 4, 4) of each loop.
         covariances: (E, 6, 6) of each loop.
         fixed: nodes that keep their pose; the first of each trajectory that nothing ties to another does anyway.
-        placed: nodes whose trajectory starts well where it is.
+        enu: the node, if any, that is no keyframe but the local frame of fixes, which starts well where it is.
     """
 
     poses: Array
@@ -40,7 +40,7 @@ class GraphData:
     T_from_to: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     fixed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
-    placed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
+    enu: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -53,7 +53,8 @@ class GraphData:
 
 
 def components(count: int, ends: Index) -> NDArray[np.int32]:
-    """(N,) number of the part of the graph that each of `count` nodes is in, from 0, by edges (E, 2)."""
+    """(N,) number of the part of the graph that each of `count` nodes is in, by edges (E, 2): from 0, that of node 0,
+    in the order of their first nodes."""
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 

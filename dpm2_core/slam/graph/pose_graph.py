@@ -139,7 +139,7 @@ class PoseGraph:
         """A position by satellites at a node; returns whether so many have come that it is time to optimize."""
         self._fixes.add(node, fix)
         if self._fixes.georeference is None:
-            self._fixes.locate(self.poses, self._located())
+            self._fixes.locate(self.poses, self.placed)
             return self._fixes.georeference is not None
         least, share = _FIXES
         return self._fixes.due >= max(least, len(self._fixes) // share)
@@ -171,8 +171,14 @@ class PoseGraph:
 
     @property
     def parts(self) -> NDArray[np.int32]:
-        """(N,) the part of each node."""
+        """(N,) the part of each node; that of the first is 0."""
         return self._trajectories.parts(self._loops)
+
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """(N,) whether each node is in the part of the first: where any other is in its map, and on Earth, is not
+        known."""
+        return self.parts == 0
 
     def optimize(self) -> None:
         """Move the poses to the optimum and check the loops: here and now, or (`background`) in another process.
@@ -269,13 +275,9 @@ class PoseGraph:
         """(E,) which loops, and then which fixes, constrain the poses."""
         return np.array([*(loop.ok for loop in self._loops), *self._fixes.kept(self._chosen())], np.bool_)
 
-    def _located(self) -> NDArray[np.bool_]:
-        """(N,) whether each node is in the part whose place on Earth the georeference is."""
-        return self.parts == 0
-
     def _chosen(self) -> list[int]:
         """The fixes that count."""
-        return self._fixes.chosen(self._located()) if len(self._fixes) else []
+        return self._fixes.chosen(self.placed) if len(self._fixes) else []
 
     def _data(self) -> GraphData:
         order, places, steps = self._trajectories.order(), self._trajectories.places(), self._steps
@@ -296,7 +298,7 @@ class PoseGraph:
 
     def _sending(self) -> GraphData:
         """The graph that is about to be solved."""
-        self._fixes.locate(self.poses, self._located())
+        self._fixes.locate(self.poses, self.placed)
         self._sent, self._sent_fixes = len(self._loops), self._chosen()
         self._fixes.sent()
         return self._data()

@@ -169,7 +169,7 @@ def _factors(
     """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
-    by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.placed)).any(axis=1))
+    by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.enu)).any(axis=1))
     for k in np.flatnonzero(condensed.tied):
         noise = gaussian(condensed.covariances[k])
         factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
@@ -240,7 +240,7 @@ def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: fl
     if number[-1] == 0:
         return poses
     poses, ends_number = poses.copy(), number[graph.ends]
-    used = used & ~np.isin(ends_number, number[graph.placed]).any(1) & (ends_number[:, 0] != ends_number[:, 1])
+    used = used & ~np.isin(ends_number, number[graph.enu]).any(1) & (ends_number[:, 0] != ends_number[:, 1])
     known = np.isin(np.arange(number[-1] + 1), number[graph.fixed])
     while not known.all():
         new = used & (known[ends_number].sum(1) == 1)

@@ -123,15 +123,14 @@ class Mapper:
     def T_map_odom_of(self, robot: str) -> Array | None:
         """(4, 4) of a robot; None before it is known where in the map it is."""
         last = self._robots[robot].last if robot in self._robots else None
-        if last is None or not self._is_placed(last):
+        if last is None or self.graph.part(last) != 0:
             return None
         return se3.orthonormalized(self.graph.pose(last) @ se3.inverse(self.keyframes[last].T_odom_kf))
 
     @property
     def placed(self) -> NDArray[np.bool_]:
         """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
-        parts = self.graph.parts
-        return np.asarray(parts == parts[:1])
+        return self.graph.placed
 
     @property
     def robots(self) -> list[str]:
@@ -250,9 +249,6 @@ class Mapper:
         if not self.keyframes:
             return True
         return grid.update(self.clouds, self.poses, self.clouds.version, seconds, self.placed, self.clouds.origin)
-
-    def _is_placed(self, node: int) -> bool:
-        return self.graph.part(node) == self.graph.part(0)
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels

@@ -13,7 +13,7 @@ from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
-from dpm2_core.slam.mapping.parts import frame_of, parts_of
+from dpm2_core.slam.mapping.parts import frame_of, parts_of, placed
 from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData, numbered_behind
@@ -48,10 +48,8 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         lambda i: a.describe(i) if i < n else b.describe(i - n),
         a.georeference,
     )
-    if a.georeference is None and b.georeference is not None:
-        parts = parts_of(both)
-        if (parts[n : n + 1] == parts[:1]).any():
-            return replace(both, georeference=_seen_from(T_a_b, b.georeference))
+    if a.georeference is None and b.georeference is not None and placed(both)[n : n + 1].any():
+        return replace(both, georeference=_seen_from(T_a_b, b.georeference))
     return both
 
 

@@ -21,10 +21,14 @@ def parts_of(data: MapData) -> NDArray[np.int32]:
     return components(len(data), ends)
 
 
+def placed(data: MapData) -> NDArray[np.bool_]:
+    """(N,) whether each node is tied to the first: where any other is in its map, and on Earth, is not known."""
+    return parts_of(data) == 0
+
+
 def first_part(data: MapData) -> MapData:
-    """The map of the keyframes that are tied to the first one: of all others it is not known where in it they are."""
-    parts = parts_of(data)
-    own = parts == parts[0]
+    """The map of the keyframes that are tied to the first one."""
+    own = placed(data)
     if own.all():
         return data
     for node in np.flatnonzero(own).tolist():
@@ -43,12 +47,9 @@ def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
     return fixes.georeference
 
 
-def placed(data: MapData) -> MapData:
+def georeferenced(data: MapData) -> MapData:
     """The map, if it has no georeference, with that of its first part's fixes, where these tell."""
-    if data.georeference is not None:
-        return data
-    parts = parts_of(data)
-    return replace(data, georeference=located(data, parts == parts[:1]))
+    return replace(data, georeference=data.georeference or located(data, placed(data)))
 
 
 def frame_of(known: Georeference) -> Array:
