@@ -115,8 +115,8 @@ def _export_geojson(data: MapData, out: Path) -> None:
 def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     tied = _tied(data, out)
     settings = OccupancySettings(resolution=resolution)
-    write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings, tied.clouds.origin))
-    if (tilt := ground_tilt(tied.clouds, tied.poses, tied.clouds.origin)) > _STEEP:
+    write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings))
+    if (tilt := ground_tilt(tied.clouds, tied.poses)) > _STEEP:
         why = "as of a LiDAR mounted at an angle: an IMU, or its mounting in /tf_static, makes a level one"
         note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
     if why := why_of_no_use(tied.poses):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.frame import NO_POINTS, Fix, Georeference
+from dpm2_core.frame import NO_POINTS, Array, Fix, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
@@ -35,15 +36,21 @@ def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -
     radius = max(15.0, SPACING * count / (2 * np.pi))
     angles = 2 * np.pi * np.arange(count) / count
     poses = np.array([_pose(radius, angle) for angle in angles])
-    clouds = CloudStore()
-    for T in poses:
-        clouds.append(pack_cloud(_walls(rng, T, radius, points)))
+    clouds = stored(_walls(rng, T, radius, points) for T in poses)
     keyframes = [Keyframe(i, 10**9 * i, 10 * i, T, NO_POINTS, session=1) for i, T in enumerate(poses)]
     steps = [_edge("odometry", i, i + 1, poses) for i in range(count - 1)]
     loops = [_edge("loop", 0, count - 1, poses), _edge("loop", 0, count // 2, poses).rejected("<b>points</b> disagree")]
     session = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
     pictures = [None if image is None else _noise(rng, image) for _ in range(3)]
     return MapData(keyframes, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3])
+
+
+def stored(clouds: Iterable[Points], origin: Array | None = None) -> CloudStore:
+    """Keyframe clouds, each (M, 4), seen from where the LiDAR was (3,), m; from the origin where that is not given."""
+    store = CloudStore()
+    for cloud in clouds:
+        store.append(pack_cloud(cloud, origin))
+    return store
 
 
 def change(node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> Change:

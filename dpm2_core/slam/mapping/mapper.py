@@ -248,7 +248,7 @@ class Mapper:
         """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
         if not self.keyframes:
             return True
-        return grid.update(self.clouds, self.poses, self.clouds.version, seconds, self.placed, self.clouds.origin)
+        return grid.update(self.clouds, self.poses, seconds, self.placed)
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels

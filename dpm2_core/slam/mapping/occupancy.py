@@ -7,7 +7,6 @@ occupied where more keyframes see something standing in it than see through it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,8 @@ from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.tilt import up_of
-from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings, at_keyframes
+from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings
+from dpm2_core.slam.store.cloud_store import CloudStore
 
 _MOST = 400_000_000  # cells
 _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
@@ -28,15 +28,8 @@ _STOREY = 2.4  # m that keyframes may stand above each other: less than a floor,
 _OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
 
 
-def occupancy_grid(
-    clouds: Sequence[Points],
-    poses: Array,
-    settings: OccupancySettings,
-    origin: Callable[[int], Array] = at_keyframes,
-) -> Grid:
-    """The grid of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf.
-
-    `origin`: (3,) m, where in its own frame the LiDAR of each was.
+def occupancy_grid(clouds: CloudStore, poses: Array, settings: OccupancySettings) -> Grid:
+    """The grid of keyframe clouds at (N, 4, 4) T_map_kf.
 
     Raises:
         Dpm2Error: it would be too large.
@@ -45,18 +38,18 @@ def occupancy_grid(
     if shape.prod() > _MOST:
         raise Dpm2Error(f"an occupancy grid of {shape[0]:.0f} by {shape[1]:.0f} cells: choose a larger --resolution")
     whole = OccupancyMap(settings, 2 * _MOST)
-    whole.update(clouds, poses, origin=origin)
+    whole.update(clouds, poses)
     return whole.grid()
 
 
-def ground_tilt(clouds: Sequence[Points], poses: Array, origin: Callable[[int], Array] = at_keyframes) -> float:
+def ground_tilt(clouds: CloudStore, poses: Array) -> float:
     """How far the ground that keyframes show is tilted against the map's x and y, degrees; 0 where they show none.
 
-    Of keyframe clouds, each (M, 4) in its own frame, at (N, 4, 4) T_map_kf, some are looked at, as seen from `origin`
-    (3,), where the LiDAR of each was. Upside down is known outdoors only: rooms have ceilings.
+    Of keyframe clouds at (N, 4, 4) T_map_kf some are looked at, as seen from the LiDAR. Upside down is known outdoors
+    only: rooms have ceilings.
     """
     some = np.unique(np.linspace(0, len(poses) - 1, _LOOKED_AT).astype(int)).tolist()
-    seen = ((node, clouds[node][:, :3] - origin(node).astype(np.float32)) for node in some)
+    seen = ((node, clouds[node][:, :3] - clouds.origin(node).astype(np.float32)) for node in some)
     found = [(node, up) for node, cloud in seen if (up := _up(cloud)) is not None]
     if len(found) < _SHOW_GROUND * len(some):
         return 0.0

@@ -10,7 +10,6 @@ then: a robot that plans in it does not lose what it knew.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +21,7 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.ground import ground_below
+from dpm2_core.slam.store.cloud_store import CloudStore
 
 _DIRECTIONS = 720
 _MARGIN = 20.0  # m around what is needed: the next keyframes fit as well
@@ -55,11 +55,6 @@ class Grid:
     cells: NDArray[np.uint8]
     origin: tuple[float, float]
     resolution: float
-
-
-def at_keyframes(node: int) -> Array:
-    """(3,) m, where in its own frame the LiDAR of a keyframe was: at the origin, where nothing says otherwise."""
-    return np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,20 +122,16 @@ class OccupancyMap:
 
     def update(
         self,
-        clouds: Sequence[Points],
+        clouds: CloudStore,
         poses: Array,
-        version: Callable[[int], object] = lambda node: None,
         seconds: float = np.inf,
         placed: NDArray[np.bool_] | None = None,
-        origin: Callable[[int], Array] = at_keyframes,
     ) -> bool:
         """Bring it up to date, the newest keyframes first; False if there is more to do than `seconds` allow.
 
         Args:
-            clouds: (M, 4) each, in its own frame, at `poses` (N, 4, 4) T_map_kf.
-            version: another object once a cloud is another one.
+            clouds: at `poses` (N, 4, 4) T_map_kf.
             placed: (N,) which of them are drawn, at least one; None: all.
-            origin: (3,) m, where in its own frame the LiDAR of each was.
         """
         end = time.monotonic() + seconds
         placed = np.ones(len(poses), np.bool_) if placed is None else placed
@@ -148,14 +139,14 @@ class OccupancyMap:
         for node in np.flatnonzero(~placed).tolist():
             self._take_back(node)
         for node in np.flatnonzero(placed)[::-1].tolist():
-            entry, now = self._entries.get(node), version(node)
+            entry, now = self._entries.get(node), clouds.version(node)
             if entry is not None and entry.version is now and entry.T is not None and self._near(entry.T, poses[node]):
                 continue
             if time.monotonic() > end:
                 return False
             self._take_back(node)
             if entry is None or entry.version is not now:
-                fan = fan_of(clouds[node], poses[node], self._settings, origin(node))
+                fan = fan_of(clouds[node], poses[node], self._settings, clouds.origin(node))
                 entry = self._entries[node] = _Entry(fan, now)
             entry.T = poses[node].copy()
             self._draw(entry.fan, entry.T, 1)

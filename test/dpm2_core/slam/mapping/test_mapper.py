@@ -210,7 +210,7 @@ def test_where_the_lidar_was_stays_with_its_cloud(tmp_path: Path) -> None:
             data = load_map(store)
             for made in (data, merge_maps(data, data, np.eye(4)), subset(data, [0, 1, 2], data.edges, [])):
                 assert [made.clouds.origin(n).tolist() for n in range(3)] == [(n * mount).tolist() for n in range(3)]
-            seen = occupancy_grid(data.clouds, data.poses, OccupancySettings(), data.clouds.origin)
+            seen = occupancy_grid(data.clouds, data.poses, OccupancySettings())
             np.testing.assert_array_equal(seen.cells, drawn.cells)
 
 

@@ -10,10 +10,11 @@ import pytest
 import yaml
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Points
+from dpm2_core.frame import NO_POINTS, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.occupancy import occupancy_grid, write_grid
 from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancySettings
+from test.helpers.maps import stored
 
 SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
 
@@ -52,7 +53,7 @@ def test_each_value_is_to_nav2_what_it_is_here(tmp_path: Path) -> None:
 @pytest.mark.parametrize("slope", [0.0, 0.08])
 def test_a_wall_before_the_unknown(tmp_path: Path, slope: float) -> None:
     T = se3.make(np.eye(3), [100.0, -50.0, 3.0])
-    path = write_grid(tmp_path / "grid.yaml", occupancy_grid([room(slope)], T[None], SETTINGS))
+    path = write_grid(tmp_path / "grid.yaml", occupancy_grid(stored([room(slope)]), T[None], SETTINGS))
     cells, about = read_back(path)
     assert about["resolution"] == 0.25
     assert about["mode"] == "trinary"
@@ -74,14 +75,14 @@ def test_a_thing_that_most_keyframes_see_through_is_free() -> None:
     empty, thing = room(), np.concatenate([room(), np.float32([[5, 0, z, 0] for z in (-1.0, -0.5, 0.0)])])
     poses = np.repeat(np.eye(4)[None], 4, 0)
     for clouds, expected in (([thing, empty, empty, empty], 254), ([thing] * 4, 0)):
-        grid = occupancy_grid(clouds, poses, SETTINGS)
+        grid = occupancy_grid(stored(clouds), poses, SETTINGS)
         row = grid.cells.shape[0] - 1 - int((0.1 - grid.origin[1]) // 0.25)
         assert grid.cells[row, int((5.1 - grid.origin[0]) // 0.25)] == expected
 
 
 def test_nothing_and_too_much() -> None:
-    grid = occupancy_grid([np.zeros((0, 4), np.float32)], np.eye(4)[None], SETTINGS)
+    grid = occupancy_grid(stored([NO_POINTS]), np.eye(4)[None], SETTINGS)
     assert (grid.cells == 205).all()
     far = np.stack([np.eye(4), se3.make(np.eye(3), [1e6, 1e6, 0])])
     with pytest.raises(Dpm2Error, match="larger --resolution"):
-        occupancy_grid([room(), room()], far, SETTINGS)
+        occupancy_grid(stored([room()] * 2), far, SETTINGS)
