@@ -8,9 +8,8 @@ not know how far along a road one is, a picture may: see `pictures`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -26,8 +25,8 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
-from dpm2_core.slam.loops.verification import SAME_PLACE, Along, Verifier, looks_elsewhere, objection_of_others
-from dpm2_core.slam.registration.texture import VisualSettings
+from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, looks_elsewhere, objection_of_others
+from dpm2_core.slam.registration.texture import Texture, VisualSettings
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
@@ -116,19 +115,17 @@ class Relocalizer:
             return found
         if not place.ok:
             return nowhere(f"{found.reason}; {place.reason}", found.confidence)
-        return self._verified(cloud, place.T_target_source, partial(self._pictures.along, texture, _REACH))
+        return self._verified(cloud, place.T_target_source, texture, _REACH)
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """Verifies a pose in the map by the points, and the thumbnail where they leave a direction open: T_map_lidar,
         `ok` or not."""
-        texture = self._pictures.texture(keyframe)
-        along = None if texture is None else partial(self._pictures.along, texture, BETWEEN)
-        return self._verified(keyframe.cloud, T_map_lidar, along)
+        return self._verified(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), BETWEEN)
 
     def _verified(
-        self, cloud: Points, T_map_lidar: Array, along: Callable[[Sequence[int]], Along] | None = None
+        self, cloud: Points, T_map_lidar: Array, picture: Texture | None = None, reach: float = 0.0
     ) -> Registration:
-        """As `verify`; `along` gives, of the keyframes around, what finds the way along an open direction."""
+        """As `verify`; where the points leave a direction open a picture is compared up to `reach` m to either side."""
         distance = _distance(self._poses, T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
@@ -137,8 +134,8 @@ class Relocalizer:
         T_at_map = se3.inverse(self._poses[nodes[0]])
         verifier = self._verifiers.suited_to(cloud)
         around = verifier.surroundings([self._cloud(n) for n in nodes], T_at_map @ self._poses[nodes])
-        open_way = None if along is None else along(nodes)
-        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, along=open_way)
+        along = None if picture is None else self._pictures.along(picture, reach, nodes)
+        result = verifier.verify(cloud, around, T_at_map @ T_map_lidar, along=along)
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
 

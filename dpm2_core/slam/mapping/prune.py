@@ -101,9 +101,9 @@ def _with_fixes(data: MapData, parts: NDArray[np.int32], gone: Sequence[int], ke
         if fix is None:
             continue
         heir = int(near[np.argmin(np.linalg.norm(data.poses[near, :3, 3] - data.poses[node, :3, 3], axis=1))])
-        antenna = se3.transform(se3.inverse(data.poses[heir]) @ data.poses[node], fix.antenna[None])[0]
-        if (lever := float(np.linalg.norm(antenna))) <= _LEVER:
-            offered.append((float(np.trace(fix.covariance)), lever, heir, replace(fix, antenna=antenna)))
+        fix = fix.moved(se3.inverse(data.poses[heir]) @ data.poses[node])
+        if (lever := float(np.linalg.norm(fix.antenna))) <= _LEVER:
+            offered.append((float(np.trace(fix.covariance)), lever, heir, fix))
     for _, _, heir, fix in sorted(offered, key=lambda offer: offer[:2]):
         if keyframes[heir].fix is None:
             keyframes[heir] = replace(keyframes[heir], fix=fix)
