@@ -111,7 +111,7 @@ def calibration(rows: Sequence[tuple[Array, Registration]]) -> dict[str, Any]:
     """
     if not rows:
         return {"registered": 0, "median_m": None, "median_deg": None, "chi2_ratio": None}
-    xi = np.array([se3.log(se3.inverse(r.T_target_source) @ T) for T, r in rows])
+    xi = np.array([se3.way(r.T_target_source, T) for T, r in rows])
     S = np.array([r.covariance for _, r in rows])
     ratio = {}
     for name, span in _SPANS.items():

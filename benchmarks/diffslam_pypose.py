@@ -54,7 +54,7 @@ def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
         begin = time.perf_counter()
         result = run()
         seconds.append(time.perf_counter() - begin)
-    meters, degrees = se3.magnitude(se3.inverse(requested) @ result.detach().double().numpy())
+    meters, degrees = se3.apart(requested, result.detach().double().numpy())
     return {"mm": rounded(1e3 * meters), "deg": rounded(degrees), "ms": rounded(1e3 * float(np.median(seconds)))}
 
 

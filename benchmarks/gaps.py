@@ -85,7 +85,7 @@ def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSet
             last, base = tracked, covariance
     tracking = [i for i, state in enumerate(states) if state is State.TRACKING]
     wrong = sum(errors[i] > _WRONG for i in tracking)
-    meters, degrees = se3.magnitude(se3.inverse(truth[gap.first - 1]) @ truth[gap.stop])
+    meters, degrees = se3.apart(truth[gap.first - 1], truth[gap.stop])
     return {
         "first": gap.first,
         "seconds": gap.seconds,

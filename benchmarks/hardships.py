@@ -115,7 +115,7 @@ def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Ca
     room = len(frames) - _START
     if room < 1:
         return
-    motion = np.array([se3.log(se3.inverse(a) @ b) / period for a, b in pairwise(truth)])
+    motion = np.array([se3.way(a, b) / period for a, b in pairwise(truth)])
     fast, turning = np.linalg.norm(motion[:room, 3:], axis=1), np.abs(motion[:room, 2])
     for name, rate, least in (("start at speed", fast, _STILL), ("start in a curve", turning, _TURNING)):
         i = int(rate.argmax())

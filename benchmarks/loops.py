@@ -60,7 +60,7 @@ def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
 def error_of(loop: Edge, truth: Array) -> tuple[float, float]:
     """How far a loop is off, m and degrees; (N, 4, 4) true poses of the keyframes."""
     T_from_to = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
-    return se3.magnitude(se3.inverse(T_from_to) @ loop.T_from_to)
+    return se3.apart(T_from_to, loop.T_from_to)
 
 
 def revisits(truth: Array) -> dict[str, set[int]]:

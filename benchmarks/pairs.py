@@ -126,7 +126,7 @@ def fitted_poses(registration: ScanRegistration, frames: Sequence[Frame], pairs:
     for a, b in pairs:
         T = se3.inverse(poses[a]) @ poses[b]
         found = register(frames[a], frames[b], T)
-        near = found is not None and bool((np.array(se3.magnitude(se3.inverse(T) @ found)) < _MOVED).all())
+        near = found is not None and bool((np.array(se3.apart(T, found)) < _MOVED).all())
         out.append(found if found is not None and near else T)
     return out
 
@@ -136,7 +136,7 @@ def pair_errors(found: Sequence[Array | None], truth: Sequence[Array | None]) ->
     errors = np.full((len(found), 2), np.inf)
     for row, T, other in zip(errors, found, truth, strict=True):
         if T is not None and other is not None:
-            row[:] = se3.magnitude(se3.inverse(other) @ T)
+            row[:] = se3.apart(other, T)
     return errors
 
 

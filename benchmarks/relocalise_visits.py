@@ -53,7 +53,7 @@ def looked_for(
     started = perf_counter()
     result = find(visit)
     seconds = perf_counter() - started
-    return result.ok, *se3.magnitude(se3.inverse(result.T_target_source) @ truth), seconds
+    return result.ok, *se3.apart(result.T_target_source, truth), seconds
 
 
 def measured(frame: Frame, settings: SlamSettings) -> Points:

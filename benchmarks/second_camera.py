@@ -76,7 +76,7 @@ def errors(network: DeepPointMap2, kind: PresetName, seed: int) -> Array:
     for way in range(len(WAYS)):
         for number, (a, b) in enumerate(pairs):
             found = network.register(described[b][way], described[a][way]).T_target_source
-            out[way, number] = se3.magnitude(se3.inverse(se3.inverse(poses[a]) @ poses[b]) @ found)
+            out[way, number] = se3.apart(se3.inverse(poses[a]) @ poses[b], found)
     return out
 
 

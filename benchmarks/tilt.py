@@ -62,7 +62,7 @@ def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, An
             for a, b in pairs:
                 T_true = mounts[a] @ se3.inverse(poses[a]) @ poses[b] @ se3.inverse(others[b])
                 T = network.register(seen[b], target[a]).T_target_source
-                errors[b - a].append(se3.magnitude(se3.inverse(T_true) @ T))
+                errors[b - a].append(se3.apart(T_true, T))
             row[axes] = {f"{n} apart": summarized(np.array(rows).reshape(-1, 2)) for n, rows in errors.items()}
     return out
 

@@ -148,7 +148,7 @@ def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
     rows = []
     for source, target, T, distance in pairs.pairs:
         found = register(frames[target], frames[source]) if distance <= NEAR else None
-        error = (np.inf, np.inf) if found is None else se3.magnitude(se3.inverse(T) @ found)
+        error = (np.inf, np.inf) if found is None else se3.apart(T, found)
         rows.append((distance, *error))
     return np.array(rows)
 

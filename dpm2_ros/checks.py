@@ -94,6 +94,6 @@ def replaced(before: TransformTree, after: TransformTree) -> str:
         if old[0] != new[0]:
             said.append(f"{frame} is below {new[0]}, no longer below {old[0]}")
         elif not np.allclose(old[1], new[1], atol=_SAME):
-            meters, degrees = se3.magnitude(se3.inverse(old[1]) @ new[1])
+            meters, degrees = se3.apart(old[1], new[1])
             said.append(f"{frame} is {meters:.2f} m and {degrees:.1f} deg from where it was in {old[0]}")
     return "; ".join(said)

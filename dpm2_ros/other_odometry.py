@@ -107,7 +107,7 @@ class OtherOdometry:
             self._ways = (1 - _MEMORY) * self._ways + _MEMORY * np.array(ways)
             return ""
         self.outweighed += 1
-        meters, degrees = se3.magnitude(se3.inverse(comparison.T_other) @ comparison.T_scans)
+        meters, degrees = se3.apart(comparison.T_other, comparison.T_scans)
         text = f"outweighed: {meters:.2f} m, {degrees:.1f} deg from what the scans show"
         self._struck = time.monotonic(), text
         return text

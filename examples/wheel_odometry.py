@@ -23,7 +23,7 @@ def wheels_of(poses: np.ndarray, noise: np.random.Generator) -> np.ndarray:
     """(N, 4, 4) true poses as wheels measure them: each step is 2 % off, and each turn 0.05 degrees."""
     measured = [poses[0]]
     for before, now in itertools.pairwise(poses):
-        step = se3.log(se3.inverse(before) @ now)
+        step = se3.way(before, now)
         step[3:] *= 1 + noise.normal(0, 0.02)
         step[2] += noise.normal(0, np.radians(0.05))
         measured.append(measured[-1] @ se3.exp(step))

@@ -95,7 +95,7 @@ class PairSet:
             chunk = self.pairs[begin : begin + 16]
             results = model.register_many([descriptors[p[0]] for p in chunk], [descriptors[p[1]] for p in chunk])
             for i, ((_, _, T, distance), result) in enumerate(zip(chunk, results, strict=True), begin):
-                xi = se3.log(se3.inverse(result.T_target_source) @ T)
+                xi = se3.way(result.T_target_source, T)
                 error = np.linalg.norm(result.T_target_source[:3, 3] - T[:3, 3])
                 squared = xi @ np.linalg.solve(result.covariance, xi)
                 rows.append((distance, i % 4 >= 2, error, np.degrees(np.linalg.norm(xi[:3])), squared))

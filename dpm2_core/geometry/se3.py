@@ -147,13 +147,23 @@ def angle(T: Array) -> Array:
 
 
 def magnitude(T: Array) -> tuple[float, float]:
-    """How far (4, 4) moves, m, and how far it turns, degrees: of `inverse(a) @ b` the distance of two poses."""
+    """How far (4, 4) moves, m, and how far it turns, degrees."""
     return float(np.linalg.norm(T[:3, 3])), float(np.degrees(angle(T)))
+
+
+def apart(T: Array, T_other: Array) -> tuple[float, float]:
+    """How far two poses (4, 4) are from each other, m and degrees."""
+    return magnitude(inverse(T) @ T_other)
+
+
+def way(T: Array, T_other: Array) -> Array:
+    """(..., 6) tangent from one pose (..., 4, 4) to another: T @ exp(xi) = T_other."""
+    return log(inverse(T) @ T_other)
 
 
 def squared_sigmas(T: Array, T_other: Array, covariance: Array) -> float:
     """Squared distance of two poses (4, 4), in standard deviations of a covariance (6, 6) on the right of the first."""
-    xi = log(inverse(T) @ T_other)
+    xi = way(T, T_other)
     return float(xi @ np.linalg.solve(covariance, xi))
 
 

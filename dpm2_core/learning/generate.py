@@ -259,4 +259,4 @@ def _sample(points: Points, pose: Array, images: tuple[Image, ...], network: Net
 def _twist(before: tuple[Frame, Array], after: tuple[Frame, Array]) -> Array:
     """(6,) [rad/s, m/s] from one stamped pose to the next."""
     seconds = max(1e-3, (after[0].stamp - before[0].stamp) * 1e-9)
-    return se3.log(se3.inverse(before[1]) @ after[1]) / seconds
+    return se3.way(before[1], after[1]) / seconds

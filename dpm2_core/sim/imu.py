@@ -44,7 +44,7 @@ class Imu:
         """
         c, period, count = self.config, 1 / self.config.rate, len(times)
         T = poses(np.concatenate([times[:1] - period, times, times[-1:] + period]))
-        rates = se3.log(se3.inverse(T[:-2]) @ T[2:])[:, :3] / (2 * period)
+        rates = se3.way(T[:-2], T[2:])[:, :3] / (2 * period)
         accelerations = (T[2:, :3, 3] - 2 * T[1:-1, :3, 3] + T[:-2, :3, 3]) / period**2
         forces = np.einsum("nji,nj->ni", T[1:-1, :3, :3], accelerations + np.array([0, 0, GRAVITY]))
         drift = np.cumsum(self._rng.standard_normal((count, 3)), 0) * 0.01 * c.gyro_bias * period**0.5

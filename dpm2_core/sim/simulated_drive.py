@@ -185,7 +185,7 @@ def wheel_odometry(T_world_base: Array, slip: float = 0.0, jump: float = 0.0) ->
     by `jump` m more."""
     poses = [se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])]
     for n, (before, now) in enumerate(pairwise(T_world_base), 1):
-        step = se3.log(se3.inverse(before) @ now)
+        step = se3.way(before, now)
         step[3:] *= 1 + slip
         step[3] += jump * (n == len(T_world_base) // 2)
         poses.append(poses[-1] @ se3.exp(step))

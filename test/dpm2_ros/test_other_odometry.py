@@ -47,7 +47,7 @@ class Robot(Rig):
     def base(self, t: float) -> Array:
         """Truth, T_start_base at a cloud's number."""
         begin, end = self.drive.pose(int(t)), self.drive.pose(int(t) + 1)
-        T = begin @ se3.exp((t - int(t)) * se3.log(se3.inverse(begin) @ end))
+        T = begin @ se3.exp((t - int(t)) * se3.way(begin, end))
         return T_BASE_LIDAR @ T @ se3.inverse(T_BASE_LIDAR)
 
     def turn_wheels(self, n: int) -> None:
@@ -55,7 +55,7 @@ class Robot(Rig):
         for step in range(1 if n else 0, STEPS + 1):
             t = n - 1 + step / STEPS if n else 0.0
             if n:
-                way = se3.log(se3.inverse(self.base(t - 1 / STEPS)) @ self.base(t))
+                way = se3.way(self.base(t - 1 / STEPS), self.base(t))
                 way[3:] *= 1 + SLIP
                 way[3] += 0.5 * (n == JUMP and step == 3)
                 self._T = self._T @ se3.exp(way)

@@ -56,7 +56,7 @@ def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start:
         twist = None
         if not deskewed:
             after = world.drive_pose(start + 0.1 * i + 0.01)
-            twist = se3.log(se3.inverse(T) @ after) / 0.01
+            twist = se3.way(T, after) / 0.01
         scan = lidar.scan(world, T, start + 0.1 * i, rng, twist=twist)
         out.append(Frame(i * 10**8, scan.points, None if deskewed else scan.time_offset, index=i))
     return out, se3.inverse(poses[0]) @ poses

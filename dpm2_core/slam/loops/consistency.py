@@ -156,7 +156,7 @@ class Consistency:
         s = settings
         since = self._path.between(loop.from_node, loop.to_node)
         T_expected = self._T_in_map(loop.from_node, loop.to_node)
-        meters, degrees = se3.magnitude(se3.inverse(T_expected) @ loop.T_from_to)
+        meters, degrees = se3.apart(T_expected, loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
             if meters > margin(since, s) or degrees > _TURN[0] + _TURN[1] * since:

@@ -133,7 +133,7 @@ class Localizer:
             near = tracking and self._says_same(T_predicted, result)
             if near or not (tracking or self._alike) or self._found_again(keyframe, result):
                 return self._located(keyframe, result, State.TRACKING if near else State.RELOCALIZED)
-            meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
+            meters, degrees = se3.apart(T_predicted, result.T_target_source)
             where = f"{meters:.1f} m, {degrees:.0f} deg away" if tracking else "where places look alike"
             result = result.rejected(f"found {where}, not confirmed yet")
         else:
@@ -155,7 +155,7 @@ class Localizer:
 
     def _says_same(self, T_map_lidar: Array, result: Registration) -> bool:
         """Whether a result is no farther from a pose (4, 4) than the odometry may drift since the map confirmed it."""
-        meters, _ = se3.magnitude(se3.inverse(T_map_lidar) @ result.T_target_source)
+        meters, _ = se3.apart(T_map_lidar, result.T_target_source)
         return meters <= 2.0 + 0.02 * self._distrust and not looks_elsewhere(T_map_lidar, result.T_target_source)
 
     def _doubt(self) -> None:

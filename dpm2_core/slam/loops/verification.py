@@ -87,7 +87,7 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
 
 def looks_elsewhere(one: Array, other: Array) -> bool:
     """Whether two poses (4, 4) are turned so far from each other that they are two answers, not one less exact."""
-    return se3.magnitude(se3.inverse(one) @ other)[1] > _SAME_HEADING
+    return se3.apart(one, other)[1] > _SAME_HEADING
 
 
 class Verifier:

@@ -137,7 +137,7 @@ class KeyframeSelector:
 
     def _is_known(self, T_odom_lidar: Array) -> bool:
         """Whether a keyframe shows what is seen there: one that turns on the spot sees the same with each turn."""
-        moved = [(T, *se3.magnitude(se3.inverse(T) @ T_odom_lidar)) for T in self._near]
+        moved = [(T, *se3.apart(T, T_odom_lidar)) for T in self._near]
         near = [(T, degrees) for T, meters, degrees in moved if meters < self._spacing.meters]
         self._near = [T for T, _ in near]
         return any(degrees < self._settings.angle for _, degrees in near)

@@ -117,7 +117,7 @@ class ScanMatcher:
         """As `straightened`, by the average motion of the `seconds` since the last scan, where the points of the sweep
         do not show it."""
         motion, T = self.motion, match.result.T_target_source
-        average = se3.log(se3.inverse(motion.T_registered) @ T) / seconds
+        average = se3.way(motion.T_registered, T) / seconds
         prepared = partial(curve.poses, motion=twist)
         if not match.result.ok or _bent(match.scan, prepared, average, half) < _BENT_ON_AVERAGE:
             return match
@@ -186,6 +186,6 @@ def _bent(scan: Scan, prepared: Callable[[Array], Array], motion: Array, half: f
     """How far the ends of a scan, m, that was prepared for poses at times are from where a motion has them, (6,) or
     (K, 6), `half` s from its middle."""
     times = np.array([-half, 0.0, half])
-    off = se3.log(se3.inverse(prepared(times)) @ curve.poses(times, motion))[[0, 2]]
+    off = se3.way(prepared(times), curve.poses(times, motion))[[0, 2]]
     reach = float(np.median(np.linalg.norm(scan.points[:, :3], axis=1)))
     return float((np.linalg.norm(off.reshape(2, 2, 3), axis=2) @ [reach, 1.0]).max())

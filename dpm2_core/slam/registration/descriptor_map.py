@@ -39,7 +39,7 @@ class DescriptorMap:
         """Whether a frame taken at that pose would show enough that is new."""
         if not self._places:
             return True
-        meters, degrees = se3.magnitude(se3.inverse(self._places[-1].T_odom_kf) @ T_odom_lidar)
+        meters, degrees = se3.apart(self._places[-1].T_odom_kf, T_odom_lidar)
         return meters >= self._spacing.meters or degrees >= 15
 
     def insert(self, description: LazyDescriptors, T_odom_lidar: Array) -> None:

@@ -157,7 +157,7 @@ def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
     if of_motion is None or not prediction.known or near(T_predicted, T):
         return neural
     between = neural.covariance + np.linalg.inv(of_motion)
-    xi = neural.covariance @ np.linalg.solve(between, se3.log(se3.inverse(T) @ T_predicted))
+    xi = neural.covariance @ np.linalg.solve(between, se3.way(T, T_predicted))
     return replace(neural, T_target_source=se3.orthonormalized(T @ se3.exp(xi)))
 
 
@@ -177,11 +177,6 @@ def _sure(points: Registration, prediction: Prediction) -> bool:
     return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 
-def _difference(a: Registration, b: Registration) -> Array:
-    """xi (6,) [rad, m] that leads from one result to the other."""
-    return se3.log(se3.inverse(a.T_target_source) @ b.T_target_source)
-
-
 def _outvoting(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
     """The points, that exclude the network: where they fit well by themselves they know it."""
     if prediction.convinced(points):
@@ -191,9 +186,10 @@ def _outvoting(points: Registration, neural: Registration, prediction: Predictio
 
 def _instead(result: Registration, other: Registration) -> Registration:
     """One of two that exclude each other, as uncertain as they are apart: which of them is right nothing has shown."""
-    return result.doubted(_difference(result, other)).because(_apart(result, other))
+    way = se3.way(result.T_target_source, other.T_target_source)
+    return result.doubted(way).because(_apart(result, other))
 
 
 def _apart(a: Registration, b: Registration) -> str:
-    xi = _difference(a, b)
+    xi = se3.way(a.T_target_source, b.T_target_source)
     return f"neural and points {np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg apart"

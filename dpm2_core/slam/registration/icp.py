@@ -110,7 +110,7 @@ class GeometricRegistration:
             H, gradient, inliers, rmse = linearize(points, np.ascontiguousarray(T[:3, :3]), *matched)
             if inliers < s.min_points / 4:
                 return Registration.failed("geometric", f"{inliers} of {len(points)} points near the map", T_guess)
-            pull = prior @ se3.log(se3.inverse(T_guess) @ T)
+            pull = prior @ se3.way(T_guess, T)
             step = np.linalg.solve(H + prior, -gradient - pull)
             T = T @ se3.exp(step)
             gate = max(0.7 * gate, s.final_gate)
@@ -255,7 +255,7 @@ class GeometricScanRegistration:
         self._T_second = T_expected if second is None else second.T_target_source
         if self._T_second is None:
             return result
-        way = se3.log(se3.inverse(T) @ self._T_second)
+        way = se3.way(T, self._T_second)
         doubt = f"many points have moved otherwise, by {np.linalg.norm(way[3:]):.1f} m"
         return result.doubted(way).because(doubt)
 
@@ -289,7 +289,7 @@ class GeometricScanRegistration:
             return replace(result, ok=False)
         if rival is not None:
             other, its_likelihood = self._fitted(source, rival)
-            meters, _ = se3.magnitude(se3.inverse(result.T_target_source) @ other.T_target_source)
+            meters, _ = se3.apart(result.T_target_source, other.T_target_source)
             one = near(other.T_target_source, result.T_target_source, _NEAR)
             if its_likelihood > likelihood - DISTINCT and not one:
                 return result.rejected(f"a place {meters:.1f} m away fits as well")
@@ -307,7 +307,7 @@ class GeometricScanRegistration:
             self._forget_second()
         else:
             self._scans += 1
-            self._way = None if self._T_second is None else se3.log(se3.inverse(T_odom_lidar) @ self._T_second)
+            self._way = None if self._T_second is None else se3.way(T_odom_lidar, self._T_second)
             if self._way is not None and np.linalg.norm(self._way[3:]) < _APART:
                 self._way = None  # of two trials of a scan the pose that was taken
         return wanted

@@ -63,7 +63,7 @@ class LocalMap:
         """Whether a scan taken at that pose would show enough that is new."""
         if self._T_last is None:
             return True
-        meters, degrees = se3.magnitude(se3.inverse(self._T_last) @ T_odom_lidar)
+        meters, degrees = se3.apart(self._T_last, T_odom_lidar)
         return meters > self._settings.spacing or degrees > 10
 
     def in_sight(self, source: Array) -> Array:

@@ -39,7 +39,7 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
 def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> bool:
     """Whether two poses (4, 4) are at most so far apart, m and degrees: by default, as a vehicle's motion changes from
     scan to scan."""
-    meters, degrees = se3.magnitude(se3.inverse(T) @ T_other)
+    meters, degrees = se3.apart(T, T_other)
     return meters <= most[0] and degrees <= most[1]
 
 
@@ -80,7 +80,7 @@ class Prediction:
         """Whether the motion so far leads to that pose (4, 4) itself: to one standard deviation, at most `_EXACT`."""
         if self.information is None or not self.known or not near(self.starts[0], T_odom_lidar):
             return False
-        xi = se3.log(se3.inverse(self.starts[0]) @ T_odom_lidar)
+        xi = se3.way(self.starts[0], T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT)
 
     def convinced(self, points: Registration) -> bool:

@@ -78,7 +78,7 @@ class Swept:
     def placed(self, result: Registration) -> Swept:
         """With the pose of a result, which may rest on more than the points: what differs was motion, too."""
         T = result.T_target_source
-        off = se3.log(se3.inverse(self.T) @ T)
+        off = se3.way(self.T, T)
         gain = np.linalg.solve(self.covariance[:6, :6] + result.of_scene, self.covariance[:6]).T
         motion = self.motion + (gain @ off)[6:].reshape(ORDER, 6)
         return replace(self, T=T, motion=motion, covariance=self.covariance - gain @ self.covariance[:6])
@@ -123,7 +123,7 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
         points = curve.moved(scan.seen, scan.times, partial(curve.poses, motion=motion))
         H, gradient = _normal_equations(points, scan.times, T, matched(points, T), shared)
         T_start = T @ curve.poses(-beginning.half, motion)
-        off = np.concatenate([se3.log(se3.inverse(beginning.T) @ T_start), _twist(start, motion) - beginning.twist])
+        off = np.concatenate([se3.way(beginning.T, T_start), _twist(start, motion) - beginning.twist])
         H += start.T @ information @ start + np.diag(alone + 1e-9)
         gradient += start.T @ information @ off + alone * (np.concatenate([np.zeros(6), motion.ravel()]) - expected)
         step = np.linalg.solve(H, -gradient)

@@ -85,7 +85,7 @@ class VisualScanRegistration:
         if by_intensity.method != "intensity":
             return by_image if seen else by_intensity
         if seen and not agree(by_intensity, by_image):
-            way = se3.log(se3.inverse(by_intensity.T_target_source) @ by_image.T_target_source)
+            way = se3.way(by_intensity.T_target_source, by_image.T_target_source)
             return by_intensity.doubted(way).because(f"image and intensities {np.linalg.norm(way[3:]):.2f} m apart")
         return by_intensity
 

@@ -54,7 +54,7 @@ def sequence(recording: Path, tmp_path: Path) -> Path:
 def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
     """Its samples stop 0.05 s before the ninth frame, which still has some; the drive goes on, and both are said."""
     poses, imu = KittiSource(sequence).poses, Imu(ImuConfig(), np.random.default_rng(0))
-    steps, times = se3.log(se3.inverse(poses[:-1]) @ poses[1:]), imu.times(0.0, 0.75)
+    steps, times = se3.way(poses[:-1], poses[1:]), imu.times(0.0, 0.75)
 
     def pose(t: np.ndarray) -> np.ndarray:
         k = np.clip(np.floor(t / 0.1).astype(int), 0, len(steps) - 1)

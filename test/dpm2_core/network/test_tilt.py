@@ -42,7 +42,7 @@ def pair_errors(root: Path, number: int, T_first: Array, T_second: Array) -> lis
     for a in (0, 8, 16):
         target, scan = (network.describe(mounted(frames[i], T)) for i, T in ((a, T_first), (a + number, T_second)))
         T = T_first @ se3.inverse(poses[a]) @ poses[a + number] @ se3.inverse(T_second)
-        errors.append(se3.magnitude(se3.inverse(T) @ network.register(scan, target).T_target_source))
+        errors.append(se3.apart(T, network.register(scan, target).T_target_source))
     return errors
 
 

@@ -67,10 +67,10 @@ def test_a_right_pose_is_accepted_and_improved(suburb_scans: tuple[list[Points],
     T_proposed = T @ se3.exp(np.array([0, 0, 0.02, 0.4, -0.3, 0.1]))
     found = v.verify(clouds[6], around, T_proposed)
     assert found.ok, found.reason
-    off = se3.log(se3.inverse(T) @ found.T_target_source)
+    off = se3.way(T, found.T_target_source)
     assert np.linalg.norm(off[3:]) < 0.05  # twice the noise of the range
     assert found.confidence > 0.8  # the share of what stands above the ground, if that is less than of all points
-    assert 0.3 < se3.magnitude(se3.inverse(T_proposed) @ found.T_target_source)[0] < 0.8
+    assert 0.3 < se3.apart(T_proposed, found.T_target_source)[0] < 0.8
 
 
 @pytest.mark.slow

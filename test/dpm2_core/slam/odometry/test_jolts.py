@@ -39,7 +39,7 @@ def errors(world: World, motions: Array, registration: str) -> Array:
         truth = truth @ se3.exp(motion)
         scan = lidar.scan(world, truth, 5.0, rng)
         T_found = odometry.process(Frame(i * 2 * 10**8, scan.points, index=i)).T_odom_lidar
-        off.append(se3.magnitude(se3.inverse(se3.inverse(T) @ truth) @ T_found))
+        off.append(se3.apart(se3.inverse(T) @ truth, T_found))
     return np.array(off)
 
 

@@ -53,7 +53,7 @@ def test_follows_a_drive_to_centimeters(suburb_drive: Drive, suburb_tracked: lis
 @pytest.mark.slow
 def test_velocity_is_measured(suburb_drive: Drive, suburb_tracked: list[OdometryResult]) -> None:
     truth, last = suburb_drive[1], suburb_tracked[-1]
-    true = se3.log(se3.inverse(truth[-2]) @ truth[-1]) / 0.1
+    true = se3.way(truth[-2], truth[-1]) / 0.1
     np.testing.assert_allclose(last.twist[3:], true[3:], atol=0.15)  # two errors of 5 mm over 0.1 s
 
 
@@ -63,7 +63,7 @@ def test_covariance_covers_the_error_of_a_frame(suburb_drive: Drive, suburb_trac
     steps = [se3.inverse(a.T_odom_lidar) @ b.T_odom_lidar for a, b in pairwise(tracked[1:])]
     true = [se3.inverse(a) @ b for a, b in pairwise(truth[1:])]
     for T, T_true, t in zip(steps, true, tracked[2:], strict=True):
-        off = se3.log(se3.inverse(T_true) @ T)
+        off = se3.way(T_true, T)
         assert off @ np.linalg.solve(2 * t.covariance, off) < 30  # chi2 of 6: 22.5 at 99.9 %
 
 
@@ -81,7 +81,7 @@ def test_a_tunnel_is_never_reported_as_tracking(tunnel_drive: Drive) -> None:
     assert State.TRACKING not in {t.state for t in tracked}
     for i in (1, 2, 3):
         step = se3.inverse(tracked[i - 1].T_odom_lidar) @ tracked[i].T_odom_lidar
-        off = se3.log(se3.inverse(se3.inverse(truth[i - 1]) @ truth[i]) @ step)[3]
+        off = se3.way(se3.inverse(truth[i - 1]) @ truth[i], step)[3]
         assert abs(off) < 3 * np.sqrt(tracked[i].covariance[3, 3])
     # and of its poses: each follows from the one before, so that the doubt grows with the way
     sigmas = [float(np.sqrt(t.covariance[3, 3])) for t in tracked[1:]]
@@ -128,7 +128,7 @@ def test_a_bump_is_forgotten_whatever_moment_of_a_sweep_is_stamped(stamp_at: flo
 
     odometry, truth, tracked = make_odometry(SlamSettings()), [], []
     for i in range(20):
-        T, twist = pose(0.1 * i), se3.log(se3.inverse(pose(0.1 * i - 0.05)) @ pose(0.1 * i + 0.05)) / 0.1
+        T, twist = pose(0.1 * i), se3.way(pose(0.1 * i - 0.05), pose(0.1 * i + 0.05)) / 0.1
         scan = lidar.scan(world, T, 2 + 0.1 * i, rng, twist=twist)
         tracked.append(odometry.process(Frame(i * 10**8, scan.points, scan.time_offset, index=i).later(stamp_at)))
         truth.append(T @ se3.exp(stamp_at * twist))
@@ -151,7 +151,7 @@ def test_a_turn_that_begins_bends_no_scan() -> None:
 
     odometry, off = make_odometry(SlamSettings(registration="geometric")), []
     for i in range(11):
-        twist = se3.log(se3.inverse(pose(0.1 * i - 0.05)) @ pose(0.1 * i + 0.05)) / 0.1
+        twist = se3.way(pose(0.1 * i - 0.05), pose(0.1 * i + 0.05)) / 0.1
         scan = lidar.scan(world, pose(0.1 * i), 2 + 0.1 * i, rng, twist=twist)
         tracked = odometry.process(Frame(i * 10**8, scan.points, scan.time_offset, index=i))
         off.append(np.linalg.norm((se3.inverse(pose(0)) @ pose(0.1 * i))[:3, 3] - tracked.T_odom_lidar[:3, 3]))
@@ -466,7 +466,7 @@ def test_velocity_after_a_gap_is_that_since_the_last_registered_scan(suburb_driv
     gap = [Frame((8 + i) * 10**8, np.zeros((0, 4), np.float32)) for i in range(5)]
     last = track([*frames[:8], *gap, replace(frames[12], stamp=13 * 10**8)])[-1]
     assert last.registration.ok
-    true = se3.log(se3.inverse(truth[7]) @ truth[12]) / 0.6
+    true = se3.way(truth[7], truth[12]) / 0.6
     np.testing.assert_allclose(last.twist[3:], true[3:], atol=0.1)  # two errors of 3 cm over 0.6 s
 
 

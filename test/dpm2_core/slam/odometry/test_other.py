@@ -123,7 +123,7 @@ def test_one_that_jumps_while_no_scan_can_be_read_is_not_followed(suburb_drive: 
     blind = [f if f.index < 8 else replace(f, points=f.points[:0], problem="unreadable") for f in frames]
     led = run([replace(f, guess=guess) for f, guess in zip(blind, guesses, strict=True)])
     for result, T in list(zip(led, truth, strict=True))[8:]:
-        error = se3.log(se3.inverse(T) @ result.T_odom_lidar)
+        error = se3.way(T, result.T_odom_lidar)
         assert error @ np.linalg.solve(result.covariance, error) < 20  # of 6 degrees of freedom
 
 
@@ -191,6 +191,6 @@ def test_a_cloud_that_is_sent_again_to_a_slow_robot_is_no_halt(
     for result in results[12:]:  # after 0.3 m or 3 deg
         assert "same cloud as before" in result.registration.reason
         assert result.state is not State.TRACKING
-    meters, degrees = se3.magnitude(se3.inverse(truth[-1]) @ results[-1].T_odom_lidar)
+    meters, degrees = se3.apart(truth[-1], results[-1].T_odom_lidar)
     assert meters < 0.35  # what it takes to be seen; 1.1 m or 11 deg if the robot were to stand
     assert degrees < (3.5 if sensor == "wheels" else 6)  # until then the halt passes for a bias of the gyroscope

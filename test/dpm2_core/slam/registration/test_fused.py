@@ -287,7 +287,7 @@ def test_along_a_tunnel_the_network_by_its_images_counts_little_where_the_motion
     case = Case(tunnel_drive, images=True)
     result, _ = case.register([0, 0, 0, 1.0, 0.03, 0])
     assert (result.ok, result.method) == (True, "refined")
-    off = se3.log(se3.inverse(case.truth) @ result.T_target_source)
+    off = se3.way(case.truth, result.T_target_source)
     assert abs(off[3]) < 0.3
     assert abs(off[4]) < 0.02
     assert result.worst_sigma > 0.5
@@ -312,5 +312,5 @@ def test_along_a_tunnel_a_network_without_images_is_not_believed(tunnel_drive: D
     result, _ = case.register([0, 0, 0, 1.0, 0, 0])
     assert result.ok
     assert result.worst_sigma > 0.5
-    off = se3.log(se3.inverse(case.truth) @ result.T_target_source)
+    off = se3.way(case.truth, result.T_target_source)
     assert abs(off[3]) < 0.3  # that of the prediction and of the points
