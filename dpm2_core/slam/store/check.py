@@ -27,8 +27,8 @@ def check_map(
         complete: is given that part, and gives it back with what can be made anew of what was lost.
 
     Raises:
-        UsageError: no map at all, or a later dpm2's. Dpm2Error: nothing can be read, `recover` cannot be written, or
-            there is no room for a copy in the folder for temporary files.
+        UsageError: no map at all, or one of another version. Dpm2Error: nothing can be read, `recover` cannot be
+            written, or there is no room for a copy in the folder for temporary files.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
@@ -70,19 +70,13 @@ def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
     """The copy of the map as a database; with a new first page where the old one makes no sense."""
     try:
         sql: sqlite3.Connection = connect(copy, "rw")
-        version = schema.version_of(sql, path)
-        schema.check(sql, version)
+        schema.check(sql, path)
     except sqlite3.DatabaseError as error:
         findings.problems.append(f"header: {error}")
         sql = _with_new_header(copy)
-        version = schema.VERSION
     with suppress(sqlite3.DatabaseError):
         info = [row[0] for row in sql.execute("PRAGMA integrity_check(20)")]
         findings.problems += [f"database: {' '.join(line.split())}" for line in info if line != "ok"]
-    try:
-        schema.migrate(sql, version)
-    except sqlite3.DatabaseError as error:
-        raise Dpm2Error(f"{path}: a damaged map of version {version}, which cannot be read: {error}") from None
     return sql
 
 

@@ -54,10 +54,10 @@ def create_map(path: Path) -> MapConnection:
 
 
 def open_map(path: Path, read_only: bool) -> MapConnection:
-    """Open a map file. Read-only, no byte of it changes; else an older one is brought up to date.
+    """Open a map file. Read-only, no byte of it changes.
 
     Raises:
-        UsageError: no map, or one of a later dpm2. Dpm2Error: it cannot be read, or written, or is damaged.
+        UsageError: no map, or one of another version. Dpm2Error: it cannot be read, or written, or is damaged.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
@@ -66,12 +66,7 @@ def open_map(path: Path, read_only: bool) -> MapConnection:
             raise UsageError(f"{path}: not a dpm2 map")
         opened = _open_to_read(path) if read_only else MapConnection(_connect(path, "rw"))
         try:
-            version = schema.version_of(opened.sql, path)
-            schema.check(opened.sql, version)
-            if version < schema.VERSION and not read_only:
-                schema.migrate(opened.sql, version)
-            elif version < schema.TABLES:
-                return _migrated_copy(opened, path, version)
+            schema.check(opened.sql, path)
             if not read_only:
                 opened.sql.execute("PRAGMA journal_mode = WAL")
                 opened.sql.execute("PRAGMA synchronous = NORMAL")
@@ -108,15 +103,6 @@ def _head(path: Path) -> bytes:
     """The first 100 bytes, zeros where the file is shorter; see the SQLite file format."""
     with path.open("rb") as file:
         return file.read(100).ljust(100, b"\0")
-
-
-def _migrated_copy(opened: MapConnection, path: Path, version: int) -> MapConnection:
-    """An older map, read-only: brought up to date in memory."""
-    memory = Connection(":memory:", isolation_level=None, check_same_thread=False, size=path.stat().st_size)
-    opened.sql.backup(memory)
-    opened.close()
-    schema.migrate(memory, version)
-    return MapConnection(memory)
 
 
 @contextmanager

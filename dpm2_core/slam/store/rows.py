@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dpm2_core.descriptors import Descriptors, quantized
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import NO_POINTS, Array, Fix, Georeference
 from dpm2_core.geometry import se3
@@ -27,7 +27,7 @@ MAX_ID = 2**31 - 1
 """Of a keyframe, and of anything else that is counted: the next one still fits everywhere."""
 _LONGEST_NAME = 255
 _DESCRIPTORS = struct.Struct("<IIB")  # number, channels, the sum of what follows
-_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # without steps, as in maps of version 3: features are float16
+_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # steps there always are
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,17 +102,14 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     if len(data) < _DESCRIPTORS.size:
         raise ValueError("no descriptors: too few bytes")
     n, channels, parts = _DESCRIPTORS.unpack_from(data)
-    axes, tilted, scaled, steps = (bool(parts & bit) for bit in (_AXES, _UP, _SCALE, _STEPS))
-    sizes = 12 * n, (2 - steps) * n * channels, 4 * n * steps, 8 * n * axes, 12 * tilted, 4 * scaled
+    axes, tilted, scaled = (bool(parts & bit) for bit in (_AXES, _UP, _SCALE))
+    sizes = 12 * n, n * channels, 4 * n, 8 * n * axes, 12 * tilted, 4 * scaled
     end = list(accumulate(sizes, initial=_DESCRIPTORS.size))
-    if len(data) != end[-1] or not n or not channels or parts > _AXES + _UP + _SCALE + _STEPS:
+    if len(data) != end[-1] or not n or not channels or not _STEPS <= parts <= _STEPS + _SCALE + _UP + _AXES:
         raise ValueError(f"no descriptors: {len(data)} bytes for {n} of {channels}")
     xyz = np.frombuffer(data, "<f4", 3 * n, end[0]).reshape(n, 3).copy()
-    features = np.frombuffer(data, "i1" if steps else "<f2", n * channels, end[1]).reshape(n, channels).copy()
-    if steps:
-        step = np.frombuffer(data, "<f4", n, end[2]).copy()
-    else:
-        features, step = quantized(features)
+    features = np.frombuffer(data, "i1", n * channels, end[1]).reshape(n, channels).copy()
+    step = np.frombuffer(data, "<f4", n, end[2]).copy()
     axis = np.frombuffer(data, "<f4", 2 * n, end[3]).reshape(n, 2).copy() if axes else None
     up = np.frombuffer(data, "<f4", 3, end[4]).copy() if tilted else None
     scale = float(np.frombuffer(data, "<f4", 1, end[5])[0]) if scaled else 1.0

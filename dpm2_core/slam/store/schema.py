@@ -18,12 +18,9 @@ from dpm2_core.errors import UsageError
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
 VERSION = 5
-"""In SQLite's user_version. Since 4 the features of descriptors are int8 (rows.py), since 5 a cloud may say where the
-LiDAR was (cloud_codec.py); the tables are those of 3."""
-TABLES = 3
-"""Version that introduced the tables as they are."""
+"""In SQLite's user_version: that of the first release. None before it is read."""
 
-_SCHEMA_2 = """
+SCHEMA = """
 CREATE TABLE sessions (          -- every time that a program wrote to the map
   session  INTEGER PRIMARY KEY,  -- from 1
   program  TEXT NOT NULL,        -- version of dpm2
@@ -83,8 +80,6 @@ CREATE TABLE trail (             -- keyframes that were pruned: where they were,
   T_node_kf BLOB NOT NULL,
   crc      INTEGER NOT NULL
 );
-"""
-_ADDED_3 = """
 CREATE TABLE fixes (             -- of satellites (GNSS), WGS84
   node     INTEGER PRIMARY KEY,  -- the keyframe that it was measured near
   stamp    INTEGER NOT NULL,     -- ns
@@ -106,7 +101,6 @@ CREATE TABLE georeference (      -- one row, once it is known where on Earth the
   crc      INTEGER NOT NULL
 );
 """
-SCHEMA = _SCHEMA_2 + _ADDED_3
 
 CONTENT = {
     "keyframes": ("node", "id", "robot", "session", "stamp", "frame", "T_odom_kf", "lender", "T_kf_lender"),
@@ -123,29 +117,6 @@ CONTENT = {
     "georeference": ("id", "latitude", "longitude", "altitude", "T_enu_map"),
 }  # fmt: skip
 """Columns of the tables with checksums, in the order in which the checksum takes them."""
-
-_SCHEMA_1 = """
-CREATE TABLE about (program TEXT, created TEXT, config TEXT, weights TEXT);
-CREATE TABLE keyframes (node INTEGER PRIMARY KEY, robot TEXT, stamp INTEGER, frame INTEGER, T_odom_kf BLOB,
-  T_map_kf BLOB, cloud BLOB, descriptors BLOB);
-CREATE TABLE edges (kind TEXT, from_node INTEGER, to_node INTEGER, T_from_to BLOB, covariance BLOB);
-"""
-# Version 1 kept payloads beside the keyframes, without checksums, masks or rejected loops.
-_TO_2 = """
-ALTER TABLE keyframes RENAME TO keyframes_1;
-ALTER TABLE edges RENAME TO edges_1;
-{schema}
-INSERT INTO sessions SELECT 1, program, created, config, weights FROM about;
-INSERT INTO keyframes SELECT node, node, robot, 1, stamp, frame, T_odom_kf, NULL, NULL,
-  row_crc(node, node, robot, 1, stamp, frame, T_odom_kf, NULL, NULL) FROM keyframes_1;
-INSERT INTO payloads SELECT node, cloud, descriptors, NULL, row_crc(node, cloud, descriptors, NULL) FROM keyframes_1;
-INSERT INTO poses SELECT node, T_map_kf, row_crc(node, T_map_kf) FROM keyframes_1;
-INSERT INTO edges SELECT rowid, kind, from_node, to_node, T_from_to, covariance, 1, 1.0, 0.0, '', '',
-  row_crc(rowid, kind, from_node, to_node, T_from_to, covariance, 1, 1.0, 0.0, '', '') FROM edges_1;
-DROP TABLE keyframes_1;
-DROP TABLE edges_1;
-DROP TABLE about;
-"""
 
 
 def row_crc(*values: bytes | str | int | float | None) -> int:
@@ -172,34 +143,17 @@ def create(connection: sqlite3.Connection) -> None:
     connection.executescript(f"BEGIN; {SCHEMA} {about} COMMIT;")
 
 
-def version_of(connection: sqlite3.Connection, path: Path) -> int:
-    """Version of the schema.
+def check(connection: sqlite3.Connection, path: Path) -> None:
+    """Whether a database is a map of this version: it has its tables and nothing else.
 
     Raises:
-        UsageError: the file is no map, or one of a later dpm2.
+        UsageError: the file is no map, or one of another version.
+        sqlite3.DatabaseError: it has other tables, or cannot be read.
     """
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise UsageError(f"{path}: an SQLite database, but no dpm2 map")
     version = int(connection.execute("PRAGMA user_version").fetchone()[0])
-    if version > VERSION:
-        raise UsageError(f"{path}: written by a later dpm2 (map version {version}, this one reads up to {VERSION})")
-    return version
-
-
-def check(connection: sqlite3.Connection, version: int) -> None:
-    """Whether the database has the tables of that version and nothing else.
-
-    Raises:
-        sqlite3.DatabaseError: it has not, or cannot be read.
-    """
-    check_schema(connection, statements({1: _SCHEMA_1, 2: _SCHEMA_2}.get(version, SCHEMA)))
-
-
-def migrate(connection: sqlite3.Connection, version: int) -> None:
-    """Bring an older map to `VERSION`; each step whole or not at all."""
-    if version < 2:
-        connection.create_function("row_crc", -1, row_crc, deterministic=True)
-        connection.executescript(f"BEGIN IMMEDIATE; {_TO_2.format(schema=_SCHEMA_2)} PRAGMA user_version = 2; COMMIT;")
-    if version < 3:
-        connection.executescript(f"BEGIN IMMEDIATE; {_ADDED_3} PRAGMA user_version = 3; COMMIT;")
-    connection.execute(f"PRAGMA user_version = {VERSION}")
+    if version != VERSION:
+        when = "a later dpm2" if version > VERSION else "a dpm2 from before the first release"
+        raise UsageError(f"{path}: written by {when} (map version {version}, this one reads {VERSION})")
+    check_schema(connection, statements(SCHEMA))

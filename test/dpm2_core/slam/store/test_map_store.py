@@ -222,11 +222,18 @@ os._exit(0)
 
 
 def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) -> None:
-    text, other, later = tmp_path / "a.txt", tmp_path / "other.db", map_file
+    text, other, later, earlier = tmp_path / "a.txt", tmp_path / "other.db", map_file, tmp_path / "earlier"
     text.write_text("no map at all, but long enough to look like something")
     execute(other, "CREATE TABLE t (x)")
+    shutil.copyfile(map_file, earlier)
+    execute(earlier, "PRAGMA user_version = 4")
     execute(later, "PRAGMA user_version = 99")
-    for path, words in ((text, "not a dpm2 map"), (other, "no dpm2 map"), (later, "later dpm2"), (tmp_path, "no such")):
+    words_of = {text: "not a dpm2 map", other: "no dpm2 map", tmp_path: "no such"}
+    words_of |= {
+        later: r"later dpm2 \(map version 99, this",
+        earlier: r"before the first release \(map version 4, this",
+    }
+    for path, words in words_of.items():
         for read_only in (True, False):
             with pytest.raises(UsageError, match=words) as caught:
                 MapStore.open(path, read_only=read_only)

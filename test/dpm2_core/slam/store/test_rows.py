@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sqlite3
-import struct
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -62,17 +61,6 @@ def test_descriptors_with_parts_that_nobody_knows_are_rejected(noise: np.random.
     packed[8] = parts
     with pytest.raises(ValueError, match="no descriptors"):
         unpack_descriptors(bytes(packed))
-
-
-def test_descriptors_of_an_earlier_map_are_float16(noise: np.random.Generator) -> None:
-    """As `pack_descriptors` wrote them before version 4 of the map."""
-    xyz, features = noise.normal(size=(9, 3)).astype("<f4"), noise.normal(size=(9, 8)).astype("<f2")
-    back = unpack_descriptors(struct.pack("<IIB", 9, 8, 0) + xyz.tobytes() + features.tobytes())
-    np.testing.assert_array_equal(back.xyz, xyz)
-    np.testing.assert_allclose(back.values, features, atol=np.abs(features).max() / 254 + 1e-6)
-    features[3, 2] = np.nan
-    with pytest.raises(ValueError, match="not finite"):
-        unpack_descriptors(struct.pack("<IIB", 9, 8, 0) + xyz.tobytes() + features.tobytes())
 
 
 def test_fixes_and_georeference_come_back(tmp_path: Path, keyframes: list[Keyframe]) -> None:
