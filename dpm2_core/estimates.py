@@ -13,6 +13,11 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Fix, Points, Up
 
 
+def isotropic(rad: float, m: float) -> Array:
+    """(6, 6) covariance of a pose with these standard deviations in every direction."""
+    return np.diag(np.repeat([rad, m], 3) ** 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """The result of every registration, geometric or neural.
@@ -62,7 +67,7 @@ class Registration:
     @property
     def of_scene(self) -> Array:
         """(6, 6) `covariance` without `floor`: how well the scans determine the pose."""
-        return self.covariance - np.diag(np.repeat(self.floor, 3) ** 2)
+        return self.covariance - isotropic(*self.floor)
 
     @property
     def worst_sigma(self) -> float:

@@ -7,11 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dpm2_core.config import dump_settings
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Edge, Keyframe, State
+from dpm2_core.estimates import Edge, Keyframe, State, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.slam.build import make_map, make_slam
 from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
@@ -24,7 +22,7 @@ from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"
-_FOUND = np.diag([0.01] * 3 + [0.1] * 3) ** 2  # rad, m: how far the map itself may be off around a robot found in it
+_FOUND = isotropic(0.01, 0.1)  # how far the map itself may be off around a robot found in it
 
 
 class ActiveMap:

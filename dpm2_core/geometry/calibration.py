@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
@@ -33,4 +33,4 @@ def with_calibration(result: Registration, T_near_source: Array) -> Registration
     """
     meters, degrees = se3.magnitude(T_near_source)
     floor = _SWEEP * float(np.sin(np.radians(degrees))), _AXES * meters
-    return replace(result, covariance=result.covariance + np.diag(np.repeat(floor, 3) ** 2), floor=floor)
+    return replace(result, covariance=result.covariance + isotropic(*floor), floor=floor)

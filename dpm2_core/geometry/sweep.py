@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dpm2_core.estimates import isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.deskew import measured_turn
@@ -81,4 +82,4 @@ class Sweep:
     def covariance(self, change: Array) -> Array:
         """(6, 6) [rad, m] of that way, where the twist changes by so much (6,) from one scan to the next."""
         off = self.middle * change
-        return np.diag(np.repeat([np.linalg.norm(off[:3]), np.linalg.norm(off[3:])], 3)) ** 2
+        return isotropic(float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])))

@@ -15,6 +15,7 @@ from dpm2_core.data.messages import returned
 from dpm2_core.data.source import Source, frame_at
 from dpm2_core.data.time_order import frames_in_order
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import isotropic
 from dpm2_core.frame import Frame, Points
 from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -28,7 +29,7 @@ MapMode = Literal["create", "resume", "extend", "localize"]
 _COMPARED = 500  # points of a cloud
 _APART = 0.75
 """m, of three in four of them: its own frame is at 0.01, or as far as it was de-skewed; another one from 1.1 on."""
-_SAME_FRAME = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # rad, m: the rounding of what is the same frame
+_SAME_FRAME = isotropic(1e-4, 1e-3)  # the rounding of what is the same frame
 
 
 def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.estimates import Keyframe, Registration, State
+from dpm2_core.estimates import Keyframe, Registration, State, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
 from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
 from dpm2_core.slam.loops.verification import looks_elsewhere
 
-LOST = np.diag([1.0, 1.0, 1.0, 100.0, 100.0, 100.0]) ** 2
-"""(6, 6) [rad, m] covariance of an uninformative prior."""
+LOST = isotropic(1.0, 100.0)
+"""Covariance of an uninformative prior."""
 _PATIENCE = 1_000_000_000  # ns
 _MOVED = 1.0  # m: nearer to each other, scans show the same
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.estimates import Edge, Registration
+from dpm2_core.estimates import Edge, Registration, isotropic
 from dpm2_core.frame import Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -18,7 +18,7 @@ from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData, numbered_behind
 
-_GIVEN_COVARIANCE = np.diag([0.05] * 3 + [1.0] * 3) ** 2  # of a transform by hand, rad and m: any loop is surer
+_GIVEN_COVARIANCE = isotropic(0.05, 1.0)  # of a transform by hand: any loop is surer
 FindLoops = Callable[[MapData, MapData], list[Edge]]
 """Accepted loops from a node of one map to a node of another, each in its own numbers."""
 

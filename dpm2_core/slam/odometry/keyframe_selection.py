@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from dpm2_core.config import Settings
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration, isotropic
 from dpm2_core.frame import Array, Fix, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
@@ -114,8 +114,8 @@ class KeyframeSelector:
                 return None
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
             way = max(se3.magnitude(T_last_this)[0], 1.0)
-            sigma = np.repeat([np.radians(s.drift_rotation), s.drift_translation], 3) * way
-            covariance = self._weakest.covariance + np.diag(sigma**2) + self._uncertainty
+            drift = isotropic(np.radians(s.drift_rotation) * way, s.drift_translation * way)
+            covariance = self._weakest.covariance + drift + self._uncertainty
             covariance[3:, 3:] += self._left_open @ self._left_open
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpm2_core.estimates import Comparison, Registration
+from dpm2_core.estimates import Comparison, Registration, isotropic
 from dpm2_core.frame import Array, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import predicted
@@ -149,7 +149,7 @@ class OtherMotion:
 def _spread(T: Array) -> Array:
     """Covariance (6, 6) of a step (4, 4)."""
     meters, degrees = se3.magnitude(T)
-    return np.diag(np.repeat(_STANDING + _SHARE * np.array([np.radians(degrees), meters]), 3) ** 2)
+    return isotropic(*(_STANDING + _SHARE * np.array([np.radians(degrees), meters])))
 
 
 def _grown(before: Guess, now: Guess) -> Array:

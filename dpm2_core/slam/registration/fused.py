@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from dpm2_core.descriptors import LazyDescriptors
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -21,7 +21,7 @@ from dpm2_core.slam.registration.swept import Beginning, Swept
 _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
-_UNCONFIRMED = np.diag(np.repeat([np.radians(1), 0.3], 3) ** 2.0)
+_UNCONFIRMED = isotropic(np.radians(1), 0.3)
 """Covariance that a network pose has besides its own where the points fit nowhere near it: above a town, hovering, such
 poses err by 0.27 m and claim 0.06 m."""
 _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open

@@ -9,7 +9,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -24,7 +24,7 @@ CHI2, CHI2_95 = 22.46, 12.59
 each other, farther than the second hardly agree."""
 
 # What the covariances of two registrations leave out, rad and m: the poses of the frames that make up the maps.
-MAP_NOISE = np.diag(np.repeat([np.radians(0.1), 0.03], 3) ** 2)
+MAP_NOISE = isotropic(np.radians(0.1), 0.03)
 
 
 def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:

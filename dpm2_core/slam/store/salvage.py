@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.thumbnail import image_of
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.frame import NO_POINTS, Array, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store import rows, schema
@@ -23,7 +23,7 @@ from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
 _HIDDEN = 30_000  # rows in succession that one damaged page of a tree can hide
-_BRIDGE_COVARIANCE = np.diag([0.05] * 3 + [0.5] * 3) ** 2  # of an edge that bridges a lost keyframe, rad and m
+_BRIDGE_COVARIANCE = isotropic(0.05, 0.5)  # of an edge that bridges a lost keyframe
 
 
 @dataclass
