@@ -10,11 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpm2_core.data.scan_file import KITTI_360, chosen
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.text import date_ns, parse_row, read_lines, read_numbers
+from dpm2_core.data.text import read_keyed, read_numbers, required
 from dpm2_core.data.velodyne import VelodyneDrive
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera
@@ -39,7 +38,7 @@ class Kitti360Source(VelodyneDrive):
         images = self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect"
         super().__init__(self.drive, scans / "data", images, settings)
         self.vertical_angle_correction_deg = settings.angle_correction(0.0)
-        self.stamps = read_timestamps(scans / "timestamps.txt", self.numbers, settings, self.notes)
+        self.stamps = self._read_stamps(scans / "timestamps.txt")
         calibration = self.root / "calibration"
         T_lidar_cam = se3.from_rows(_only_row(calibration / "calib_cam_to_velo.txt"))
         self._intrinsics = read_keyed(calibration / "perspective.txt")
@@ -84,62 +83,11 @@ class Kitti360Source(VelodyneDrive):
         return Camera(P.reshape(3, 4)[:, :3], se3.inverse(self.T_cam_lidar), size, name="image_00")
 
 
-def read_keyed(path: Path) -> dict[str, Array]:
-    """The `name: numbers` lines of a calibration file, as float64 of any length; other lines are left out.
-
-    Raises:
-        UsageError: there is no such file.
-    """
-    found: dict[str, Array] = {}
-    if not path.is_file():
-        raise UsageError(f"{path}: no such file, and the calibration is needed")
-    for number, line in enumerate(read_lines(path), 1):
-        name, colon, text = line.partition(":")
-        words = text.split()
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            continue  # dates
-        if colon and values:
-            found[name.strip()] = parse_row(text, len(words), f"{path}:{number}: {name}")
-    return found
-
-
-def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array:
-    """(count,) numbers of a name in a file that `read_keyed` has read.
-
-    Raises:
-        UsageError: they are missing.
-    """
-    row = rows.get(name)
-    if row is None or len(row) != count:
-        raise UsageError(f"{path}: no {name} of {count} numbers")
-    return row
-
-
 def _only_row(path: Path) -> Array:
     rows = read_numbers(path, 12)
     if len(rows) != 1:
         raise UsageError(f"{path}: want one line of 12 numbers, found {len(rows)}")
     return rows[0]
-
-
-def read_timestamps(
-    path: Path, numbers: NDArray[np.int64], settings: InputSettings, notes: list[str]
-) -> NDArray[np.int64]:
-    """(len,) ns of scans by their numbers; line k of timestamps.txt is of scan k.
-
-    Raises:
-        UsageError: a line is no time.
-    """
-    lines = read_lines(path)
-    if len(lines) <= numbers[-1]:
-        return settings.steady_stamps(numbers, f"{path}: missing or too short", notes)
-    stamps = [date_ns(lines[number].strip()) for number in numbers]
-    if None in stamps:
-        number = numbers[stamps.index(None)]
-        raise UsageError(f"{path}:{number + 1}: {lines[number].strip()!r} is no time")
-    return np.array(stamps, np.int64)
 
 
 def _find(path: Path, sequence: str) -> tuple[Path, str]:

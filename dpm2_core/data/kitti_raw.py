@@ -13,10 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kitti import ROUNDED, left_color_camera
-from dpm2_core.data.kitti360 import read_keyed, read_timestamps, required
 from dpm2_core.data.scan_file import KITTI_RAW, chosen
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.text import read_numbers
+from dpm2_core.data.text import read_keyed, read_numbers, required
 from dpm2_core.data.velodyne import VelodyneDrive
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
@@ -44,7 +43,7 @@ class KittiRawSource(VelodyneDrive):
         scans = self.path / "velodyne_points"
         super().__init__(self.path.absolute().name, scans / "data", self.path / "image_02" / "data", settings)
         self.vertical_angle_correction_deg = settings.angle_correction(HDL64_CORRECTION_DEG)
-        self.stamps = read_timestamps(scans / "timestamps.txt", self.numbers, settings, self.notes)
+        self.stamps = self._read_stamps(scans / "timestamps.txt")
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
         date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
         if date is None:

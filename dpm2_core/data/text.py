@@ -30,6 +30,39 @@ def read_numbers(path: Path, columns: int) -> Array:
     return np.array(rows).reshape(-1, columns)
 
 
+def read_keyed(path: Path) -> dict[str, Array]:
+    """The `name: numbers` lines of a calibration file, as float64 of any length; other lines are left out.
+
+    Raises:
+        UsageError: there is no such file.
+    """
+    found: dict[str, Array] = {}
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file, and the calibration is needed")
+    for number, line in enumerate(read_lines(path), 1):
+        name, colon, text = line.partition(":")
+        words = text.split()
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            continue  # dates
+        if colon and values:
+            found[name.strip()] = parse_row(text, len(words), f"{path}:{number}: {name}")
+    return found
+
+
+def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array:
+    """(count,) numbers of a name in a file that `read_keyed` has read.
+
+    Raises:
+        UsageError: they are missing.
+    """
+    row = rows.get(name)
+    if row is None or len(row) != count:
+        raise UsageError(f"{path}: no {name} of {count} numbers")
+    return row
+
+
 def read_lines(path: Path, missing_ok: bool = True) -> list[str]:
     """Lines of a text file; none if there is no such file, or that is an error."""
     try:

@@ -12,6 +12,7 @@ from dpm2_core.data.messages import scale_intensity
 from dpm2_core.data.scan_file import image_of, image_size, images_of, numbered_scans, read_scan
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource
+from dpm2_core.data.text import date_ns, read_lines
 from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Frame, Points
@@ -57,6 +58,21 @@ class VelodyneDrive(IndexedSource):
         images = images_of(image_of(scan, self._images), self.camera, self.notes)
         offset = azimuth_time(points) if self.swept else None
         return Frame(stamp, points, offset, images, index=int(scan.stem), problem=problem)
+
+    def _read_stamps(self, path: Path) -> NDArray[np.int64]:
+        """(len,) ns by a file whose line k is the time of scan k; at a steady pace where it is missing or too short.
+
+        Raises:
+            UsageError: a line is no time.
+        """
+        lines = read_lines(path)
+        if len(lines) <= self.numbers[-1]:
+            return self._settings.steady_stamps(self.numbers, f"{path}: missing or too short", self.notes)
+        stamps = [date_ns(lines[number].strip()) for number in self.numbers]
+        if None in stamps:
+            number = self.numbers[stamps.index(None)]
+            raise UsageError(f"{path}:{number + 1}: {lines[number].strip()!r} is no time")
+        return np.array(stamps, np.int64)
 
     def _image_size(self) -> tuple[int, int] | None:
         """None without images, or where none are wanted."""
