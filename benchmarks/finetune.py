@@ -111,9 +111,9 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 def _run(settings: FinetuneSettings, data: Path, out: Path, validations: dict[str, PairSet]) -> dict[str, Any]:
     """One training, what it cost, and the errors that are left; one that was stopped goes on with the same settings."""
-    resume = begin_training(out, settings, [weights_path(settings.weights)])
+    begin_training(out, settings, [weights_path(settings.weights)])
     cpu = process_time()
-    weights = finetune(settings, out, resume=resume, data=data)
+    weights = finetune(settings, out, data=data)
     seconds = process_time() - cpu
     model = load_model(weights)
     after = {name: errors(pairs, model) for name, pairs in validations.items()}

@@ -50,7 +50,7 @@ def finetune(
             console.print(text, soft_wrap=True)
         status.update("measuring")
         before = work.measure(start, chosen, out)
-    written = work.finetune(chosen, out, resume)
+    written = work.finetune(chosen, out)
     with console.status("measuring"):
         after = work.measure(written, chosen, out)
     title = "Held-out parts: against the SLAM's trajectory"

@@ -111,7 +111,7 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
         places = sequence_places(*val)
         same = measured.digest() == data["content"]  # as of a copy
         say_learned(f"--val {val[0]} is what the task", places, places if same else sequence_places(src, sequences))
-    train_task(new_task(name, settings), scans, out, resume, measured)
+    train_task(new_task(name, settings), scans, out, measured)
     note(f"{out / WEIGHTS}: written")
 
 

@@ -120,7 +120,7 @@ def image(
 
     chosen = load_settings(ImageTrainingSettings, config, settings or [])
     _begin(out, resume, chosen)
-    train_image(chosen, out, resume)
+    train_image(chosen, out)
 
 
 @train.command()
@@ -135,7 +135,7 @@ def phase1(
 
     chosen = load_settings(RegistrationTrainingSettings, config, settings or [])
     _begin(out, resume, chosen)
-    train_registration(chosen, out, resume)
+    train_registration(chosen, out)
 
 
 @train.command()
@@ -150,7 +150,7 @@ def phase2(
 
     chosen = load_settings(OverlapTrainingSettings, config, settings or [])
     _begin(out, resume, chosen)
-    train_overlap(chosen, out, resume)
+    train_overlap(chosen, out)
 
 
 @train.command()

@@ -89,12 +89,12 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     weights, known = folder / WEIGHTS, folder / "figures.json"
     asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
     read = [weights_path(training.start)] if training.start else []
-    resume = begin_training(folder, training, read, {"content": _content(training.data.packed)})
+    begin_training(folder, training, read, {"content": _content(training.data.packed)})
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():
         known.unlink(missing_ok=True)  # of weights before: what is stopped while it measures is measured again
-        train_registration(training, folder, resume=resume)
+        train_registration(training, folder)
     model = load_model(weights)
     images = training.data.images and model.encoder.image is not None
     figures = {

@@ -78,9 +78,9 @@ def train(
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     asked = {"training": training, "until": until, "content": scans.digest()}
-    resume = begin_training(folder, settings, data=asked, start=start)
+    begin_training(folder, settings, data=asked, start=start)
     task = new_task(training["task"], settings)
-    train_task(task, scans, folder, resume, until=until)
+    train_task(task, scans, folder, until=until)
     advance(1, 1)
     epochs = until or settings.epochs
     return {"scans": len(scans), "epochs": epochs, **_logged(folder, epochs, settings.slam.gamma)}

@@ -74,8 +74,8 @@ def train(
     """
     chosen = training_of(**training, network=network, packed=packed)
     content = packed_digest(map(PackedDrive, packed))
-    resume = begin_training(folder, chosen, [Path(chosen.start)], {"content": content})
-    weights = train_registration(chosen, folder, resume=resume)
+    begin_training(folder, chosen, [Path(chosen.start)], {"content": content})
+    weights = train_registration(chosen, folder)
     steps = chosen.optimiser.steps
     advance(steps, steps)
     losses = [json.loads(line).get("loss") for line in (folder / LOG).read_text().splitlines()]

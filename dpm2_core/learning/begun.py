@@ -27,10 +27,8 @@ def begin_training(
     read: Sequence[Path] = (),
     data: dict[str, Any] | None = None,
     start: Path | None = None,
-) -> bool:
-    """Ready a folder for a training; whether there is a checkpoint of this very one to go on from.
-
-    What a training that was asked for otherwise has left there is removed.
+) -> None:
+    """Ready a folder for a training: what one that was asked for otherwise has left there is removed.
 
     Args:
         read, data: as of `begin_or_resume`.
@@ -45,7 +43,6 @@ def begin_training(
             for kept in (CHECKPOINT, LOG):
                 shutil.copy(start / kept, folder / kept)
         write_json(asked, now)  # the last: what is killed before is begun anew
-    return (folder / CHECKPOINT).exists()
 
 
 def begin_or_resume(

@@ -91,15 +91,13 @@ def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, rad
     return chosen[np.argsort(at @ along, kind="stable")]
 
 
-def finetune(
-    settings: FinetuneSettings, out: Path, resume: bool = False, until: int | None = None, data: Path | None = None
-) -> Path:
+def finetune(settings: FinetuneSettings, out: Path, until: int | None = None, data: Path | None = None) -> Path:
     """Train on what `prepare` left below `data`; checkpoint, log and `weights.safetensors` go to `out`.
 
-    until: stop after this step, with a checkpoint; `resume` goes on from there. data: `out`, if None.
+    until: stop after this step, with a checkpoint; the next call goes on from there. data: `out`, if None.
 
     Raises:
-        UsageError: no such weights, no drives, or nothing to resume.
+        UsageError: no such weights, or no drives.
     """
     start_from, optimizer, weights = weights_path(settings.weights), settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
@@ -120,7 +118,7 @@ def finetune(
         about |= {"finetuned_from": start_from.stem, "finetuned_steps": str(optimizer.steps)}
         save_weights(averaged.model, weights, about)
 
-    Trainer(module, batches, optimizer, out, save).run(resume, until)
+    Trainer(module, batches, optimizer, out, save).run(until)
     return weights
 
 

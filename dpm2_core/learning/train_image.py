@@ -154,7 +154,7 @@ class ImageTraining(nn.Module):
         return loss, {"loss": loss.detach(), "right": right}
 
 
-def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False, until: int | None = None) -> Path:
+def train_image(settings: ImageTrainingSettings, out: Path, until: int | None = None) -> Path:
     """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
@@ -170,5 +170,5 @@ def train_image(settings: ImageTrainingSettings, out: Path, resume: bool = False
     def save(averaged: ImageTraining) -> None:
         save_weights(averaged.model, weights, {"phase": "image", "steps": str(optimizer.steps)})
 
-    Trainer(module, batches, optimizer, out, save).run(resume, until)
+    Trainer(module, batches, optimizer, out, save).run(until)
     return weights

@@ -140,7 +140,7 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
     return float(precision[hits].mean()) if hits.any() else float("nan")
 
 
-def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = False) -> Path:
+def train_overlap(settings: OverlapTrainingSettings, out: Path) -> Path:
     """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new heads, to
     `out`."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
@@ -159,7 +159,7 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path, resume: bool = F
         save_weights(averaged.model, weights, {**about, "phase": "2"})
 
     validate = validator(settings, network) if settings.validation else None
-    Trainer(module, batches, optimizer, out, save, validate).run(resume)
+    Trainer(module, batches, optimizer, out, save, validate).run()
     return weights
 
 

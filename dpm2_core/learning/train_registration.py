@@ -135,12 +135,10 @@ def set_pairs_of(poses: Tensor, settings: RegistrationTrainingSettings, step: in
     return tuple(plans)
 
 
-def train_registration(
-    settings: RegistrationTrainingSettings, out: Path, resume: bool = False, until: int | None = None
-) -> Path:
+def train_registration(settings: RegistrationTrainingSettings, out: Path, until: int | None = None) -> Path:
     """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`.
 
-    until: stop after this step; `resume` continues from there.
+    until: stop after this step; the next call goes on from there.
     """
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
@@ -164,7 +162,7 @@ def train_registration(
         save_weights(averaged.model, weights, about)
 
     validate = validator(settings, network) if settings.validation else None
-    Trainer(module, batches, optimizer, out, save, validate).run(resume, until)
+    Trainer(module, batches, optimizer, out, save, validate).run(until)
     return weights
 
 

@@ -164,11 +164,11 @@ class Trainer(Generic[M]):
     save: Callable[[M], None]
     validate: Callable[[M], dict[str, float]] | None = None
 
-    def run(self, resume: bool = False, until: int | None = None) -> None:
-        """Train, with `resume` on from the checkpoint; `until`: stop after this step, with a checkpoint.
+    def run(self, until: int | None = None) -> None:
+        """Train, from the checkpoint on if there is one; `until`: stop after this step, with a checkpoint.
 
         Raises:
-            UsageError: nothing to resume, or it has more steps than are wanted.
+            UsageError: a checkpoint of another training, or of more steps than are wanted.
             Dpm2Error: no step had a finite gradient, or none of the last hundred.
         """
         keep_memory()
@@ -176,7 +176,8 @@ class Trainer(Generic[M]):
             module = self.module.to(device)
             ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
             optimizer = make_optimizer(module, self.settings)
-            start = load_checkpoint(self.out / CHECKPOINT, module, ema, optimizer) if resume else 0
+            checkpoint = self.out / CHECKPOINT
+            start = load_checkpoint(checkpoint, module, ema, optimizer) if checkpoint.exists() else 0
             if start > self.settings.steps:
                 raise UsageError(f"{self.out}: has {start} steps, optimiser.steps wants {self.settings.steps}")
             steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))

@@ -31,7 +31,6 @@ def train_task(
     task: Task,
     scans: TaskScans,
     out: Path,
-    resume: bool = False,
     val: TaskScans | None = None,
     until: int | None = None,
 ) -> Task:
@@ -40,10 +39,10 @@ def train_task(
 
     Args:
         val: scans to measure on as the training goes on.
-        until: stop after this epoch, with a checkpoint; `resume` goes on from there as if nothing had been.
+        until: stop after this epoch, with a checkpoint; the next call goes on from there as if nothing had been.
 
     Raises:
-        UsageError: no window fits into the scans, or there is nothing to resume.
+        UsageError: no window fits into the scans, or a checkpoint of another training.
     """
     settings = task.settings
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.optimiser.seed)
@@ -63,7 +62,7 @@ def train_task(
         save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
 
     validate = None if val is None else partial(measure, scans=val)
-    Trainer(task, batches, optimizer, out, save, validate).run(resume, None if until is None else until * epoch)
+    Trainer(task, batches, optimizer, out, save, validate).run(None if until is None else until * epoch)
     return task.eval()
 
 

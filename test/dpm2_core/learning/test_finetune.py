@@ -203,7 +203,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
         prepare([], settings, network, SlamSettings(threads=1), data)  # it was learned from, too
     whole = finetune(settings, tmp_path / "whole", data=data)
     finetune(settings, tmp_path / "parts", until=2, data=data)
-    parts = finetune(settings, tmp_path / "parts", resume=True, data=data)
+    parts = finetune(settings, tmp_path / "parts", data=data)
     one, other, start = (load_model(path).state_dict() for path in (whole, parts, Path(settings.weights)))
     for name, value in one.items():
         torch.testing.assert_close(value, other[name], atol=1e-6, rtol=0)

@@ -53,7 +53,7 @@ def test_it_changes_the_image_branch_alone(settings: ImageTrainingSettings, tmp_
     assert changed
     assert all(name.startswith(("encoder.image.", "encoder.fusion.pixel.")) for name in changed)
     train_image(settings, tmp_path / "halves", until=2)
-    halves = load_file(train_image(settings, tmp_path / "halves", resume=True))
+    halves = load_file(train_image(settings, tmp_path / "halves"))
     assert all(torch.equal(whole[name], halves[name]) for name in whole)
     rows = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
     assert all(np.isfinite(row["loss"]) and 0 <= row["right"] <= 1 for row in rows)

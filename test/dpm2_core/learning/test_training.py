@@ -75,7 +75,7 @@ def test_resumed_equals_uninterrupted(settings: RegistrationTrainingSettings, tm
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     train_registration(settings, whole)
     train_registration(settings, halves, until=2)
-    train_registration(settings, halves, resume=True)
+    train_registration(settings, halves)
     assert losses(halves) == losses(whole)
     assert len(losses(whole)) == 4
     one, other = (load_file(out / "weights.safetensors") for out in (whole, halves))
@@ -112,10 +112,10 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
     train_registration(settings, tmp_path / "out")
     other = settings.model_copy(update={"network": {"image": {"size": tiny().image.size}}})  # that of the packed images
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        train_registration(other, tmp_path / "out", resume=True)
+        train_registration(other, tmp_path / "out")
     (tmp_path / "out" / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(UsageError, match="not a checkpoint"):
-        train_registration(settings, tmp_path / "out", resume=True)
+        train_registration(settings, tmp_path / "out")
 
 
 def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTra
     train_registration(settings, tmp_path / "out")
     fewer = settings.model_copy(update={"optimiser": settings.optimiser.model_copy(update={"steps": 2})})
     with pytest.raises(UsageError, match=r"has 4 steps, optimiser\.steps wants 2"):
-        train_registration(fewer, tmp_path / "out", resume=True)
+        train_registration(fewer, tmp_path / "out")
 
 
 class Toy(torch.nn.Module):
@@ -212,7 +212,7 @@ def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
     training = trainer(line(), tmp_path, steps=4, save_every=2, validate_every=2)
     with pytest.raises(KeyboardInterrupt):
         replace(training, validate=validate).run()
-    replace(training, module=line(), validate=validate).run(resume=True)
+    replace(training, module=line(), validate=validate).run()
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(row["step"], row["figure"]) for row in rows if "figure" in row] == [(1, 1.0), (3, 2.0)]
     assert list(losses(tmp_path)) == [0, 1, 2, 3]

@@ -145,7 +145,7 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
     assert log[51]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [76, 77, 78, 79]
     train_task(new_task("dslr", settings), scans, tmp_path / "parts", until=18)
-    train_task(new_task("dslr", settings), scans, tmp_path / "parts", resume=True)
+    train_task(new_task("dslr", settings), scans, tmp_path / "parts")
     weights = (tmp_path / "whole" / WEIGHTS, tmp_path / "parts" / WEIGHTS)
     (whole, _), (parts, _) = (read_tensors(path) for path in weights)
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())

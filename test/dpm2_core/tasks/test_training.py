@@ -111,7 +111,7 @@ def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path, placebo:
     train_task(new_task("gndnet", chosen), scans, whole)
     train_task(new_task("gndnet", chosen), scans, halves, until=2)
     assert len(rows(halves)) == 4
-    train_task(new_task("gndnet", chosen), scans, halves, resume=True)
+    train_task(new_task("gndnet", chosen), scans, halves)
     curve = [[(row["step"], row["loss"], row["norm"]) for row in rows(out)] for out in (whole, halves)]
     assert curve[0] == curve[1]
     one, other = (load_file(out / WEIGHTS) for out in (whole, halves))
@@ -231,11 +231,9 @@ def test_wrong_weights_are_rejected(tmp_path: Path, name: str, load: Callable[[P
 
 
 def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:
-    """Longer than any sequence; nothing to resume; a checkpoint of another network."""
+    """Longer than any sequence; a checkpoint of another network."""
     with pytest.raises(UsageError, match="no sequence has the 13 scans"):
         train_task(new_task("gndnet", settings(window=7, every=2)), scans, tmp_path / "out")
-    with pytest.raises(UsageError, match="no checkpoint"):
-        train_task(new_task("gndnet", settings()), scans, tmp_path / "out", resume=True)
     train_task(new_task("gndnet", settings()), scans, tmp_path / "out", until=1)
     with pytest.raises(UsageError, match="checkpoint of another network"):
-        train_task(new_task("gndnet", settings(network={**TINY, "channels": 8})), scans, tmp_path / "out", resume=True)
+        train_task(new_task("gndnet", settings(network={**TINY, "channels": 8})), scans, tmp_path / "out")
