@@ -25,6 +25,9 @@ class FigureTable:
     Text is wrapped, names and figures are not, and nothing is cut. In a turned table a row is a column, and as many
     rows of a section as fit are beside each other. Cells are printed as they are: what looks like rich's markup comes
     from a file or a topic.
+
+    Attributes:
+        title, caption: what stands above and below. headings: of the columns. rows: of cells.
     """
 
     def __init__(
@@ -38,11 +41,11 @@ class FigureTable:
         header: bool = True,
     ) -> None:
         """Headings of the columns of each kind; `header` False leaves them out."""
-        self._title, self._caption, self._header = lines(title), caption, header
-        self._headings = [*names, *figures, *text]
+        self.title, self.caption, self._header = lines(title), caption, header
+        self.headings = [*names, *figures, *text]
         self._text = len(names) + len(figures)  # the first column of text
         self._names = len(names)
-        self._rows: list[list[str]] = []
+        self.rows: list[list[str]] = []
         self._sections: set[int] = set()
 
     def add_row(self, *cells: str) -> None:
@@ -51,51 +54,51 @@ class FigureTable:
         Raises:
             ValueError: more or fewer cells than columns.
         """
-        if len(cells) != len(self._headings):
-            raise ValueError(f"{len(cells)} cells for {len(self._headings)} columns")
-        self._rows.append([lines(cell) for cell in cells])
+        if len(cells) != len(self.headings):
+            raise ValueError(f"{len(cells)} cells for {len(self.headings)} columns")
+        self.rows.append([lines(cell) for cell in cells])
 
     def add_section(self) -> None:
         """A gap after the last row."""
-        self._sections.add(len(self._rows))
+        self._sections.add(len(self.rows))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(self._title, style="italic")
-        columns = [*zip(self._headings, *self._rows, strict=True)]
+        yield Text(self.title, style="italic")
+        columns = [*zip(self.headings, *self.rows, strict=True)]
         widths = [max(map(cell_len, column if self._header else column[1:]), default=0) for column in columns]
         least = [*widths[: self._text], *(min(width, _PROSE) for width in widths[self._text :])]
-        if _total(least) <= options.max_width or not self._rows:
+        if _total(least) <= options.max_width or not self.rows:
             yield self._upright()
         else:
             yield from self._turned(options.max_width)
-        if self._caption:
-            yield Text(self._caption, style="dim italic")
+        if self.caption:
+            yield Text(self.caption, style="dim italic")
 
     def _upright(self) -> Table:
         table = Table(box=SIMPLE, show_header=self._header)
-        for number, heading in enumerate(self._headings):
+        for number, heading in enumerate(self.headings):
             figure = self._names <= number < self._text
             prose = number >= self._text
             table.add_column(Text(heading), justify="right" if figure else "left", no_wrap=not prose, overflow="fold")
-        for number, row in enumerate(self._rows, 1):
+        for number, row in enumerate(self.rows, 1):
             table.add_row(*map(Text, row), end_section=number in self._sections)
         return table
 
     def _turned(self, width: int) -> Iterator[Table]:
-        label = max(map(cell_len, self._headings))
+        label = max(map(cell_len, self.headings))
         first = 0
-        while first < len(self._rows):
+        while first < len(self.rows):
             last = first + 1
-            while last < len(self._rows) and last not in self._sections:
-                if _total([label, *(max(map(cell_len, row)) for row in self._rows[first : last + 1])]) > width:
+            while last < len(self.rows) and last not in self._sections:
+                if _total([label, *(max(map(cell_len, row)) for row in self.rows[first : last + 1])]) > width:
                     break
                 last += 1
             table = Table(box=SIMPLE, show_header=False)
             table.add_column(no_wrap=True)
             for _ in range(first, last):
                 table.add_column(justify="right", overflow="fold")
-            for number, heading in enumerate(self._headings):
-                cells = (Text(row[number]) for row in self._rows[first:last])
+            for number, heading in enumerate(self.headings):
+                cells = (Text(row[number]) for row in self.rows[first:last])
                 table.add_row(Text(heading, style="bold"), *cells, end_section=number == self._names - 1)
             yield table
             first = last

@@ -51,6 +51,7 @@ def experiment(
     """
     from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
     from dpm2_core.experiments.request import Request
+    from dpm2_core.experiments.table import shown
     from dpm2_core.fleet.part import Progress
     from dpm2_core.learning.begun import check_one_process
 
@@ -89,8 +90,8 @@ def experiment(
             bar.console.print(f"{part}: done", soft_wrap=True)
 
         findings = carry_out(name, request, Progress(frames_done, part_done))
-    views = Group(*(table_of.view() for table_of in findings.tables))
-    show(views, {"tables": [table_of.record() for table_of in findings.tables], "notes": findings.notes}, json_file)
+    tables = [table_of.record() for table_of in findings.tables]
+    show(Group(*map(shown, tables)), {"tables": tables, "notes": findings.notes}, json_file)
     for text in findings.notes:
         note(text, "yellow")
     note(f"Results in {out / name}.json and .html")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from dpm2_core.evaluation.metrics import align
 from dpm2_core.evaluation.page import asset, escape, page
 from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
 from dpm2_core.frame import Array
-from dpm2_core.tables import cells_of
+from dpm2_core.tables import FigureTable, cells_of
 
 _BINS = 300  # of the time along a drive
 _FIGURES = {
@@ -27,16 +26,6 @@ _FIGURES = {
     "APE mean m": "{ape_mean_m:.3f}", "RPE m": "{rpe_trans_m:.4f}", "drift %": "{final_drift_percent:.3f}",
     "failed": "{failed_frames:d}", "breaks": "{breaks:d}", "frames/s": "{timing[fps]:.1f}",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class HtmlTable:
-    """A table on the page: its title, headings, rows of text, and what stands below."""
-
-    title: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
 
 
 def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -61,7 +50,7 @@ def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
     return [("/".join(parts), path) for path, parts in reversed(runs.items())]
 
 
-def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[HtmlTable] = ()) -> str:
+def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[FigureTable] = ()) -> str:
     """The page of such runs; those with the same truth are drawn in one frame.
 
     Raises:
@@ -148,17 +137,18 @@ def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
     return [[row[name] for name in names] for row in rows if all(row.get(name) is not None for name in names)]
 
 
-def _figures(runs: Sequence[tuple[str, RunFolder]]) -> HtmlTable:
-    headings = ["run", "frames", *_FIGURES, "loops", "rejected"]
-    rows = []
+def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
+    headings = ["frames", *_FIGURES, "loops", "rejected"]
+    caption = "APE after SE(3) alignment, RPE and the KITTI metric unaligned."
+    table = FigureTable("Runs", names=["run"], figures=headings, caption=caption)
     for name, run in runs:
         figures = cells_of({**run.metrics, "timing": run.timing}, _FIGURES.values())
         accepted = sum(loop.accepted for loop in run.loops)
-        rows.append([name, str(len(run.trajectory)), *figures, str(accepted), str(len(run.loops) - accepted)])
-    return HtmlTable("Runs", headings, rows, "APE after SE(3) alignment, RPE and the KITTI metric unaligned.")
+        table.add_row(name, str(len(run.trajectory)), *figures, str(accepted), str(len(run.loops) - accepted))
+    return table
 
 
-def _table(table: HtmlTable) -> str:
+def _table(table: FigureTable) -> str:
     head = "".join(f"<th>{escape(text)}</th>" for text in table.headings)
     body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>\n" for row in table.rows)
     caption = f"<p>{escape(table.caption)}</p>" if table.caption else ""

@@ -6,18 +6,19 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import write_record
-from dpm2_core.evaluation.run_page import HtmlTable, runs_page
+from dpm2_core.evaluation.run_page import runs_page
 from dpm2_core.experiments.request import Experiment, Findings, Request
-from dpm2_core.experiments.table import html_table
+from dpm2_core.experiments.table import shown
 from dpm2_core.files import atomic_write
 from dpm2_core.fleet.part import Figures, Part, Progress, run_parts
+from dpm2_core.tables import FigureTable
 
 _ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 
@@ -79,7 +80,7 @@ def load(name: str) -> Experiment:
     return found
 
 
-def tables_in(folder: Path) -> list[HtmlTable]:
+def tables_in(folder: Path) -> list[FigureTable]:
     """The tables of the experiments whose results are in a folder or below it, these with the folder in their titles.
 
     Raises:
@@ -90,16 +91,16 @@ def tables_in(folder: Path) -> list[HtmlTable]:
         below = (page.with_suffix(".json") for page in sorted(folder.rglob(f"{name}.html")))  # `carry_out` leaves both
         for path in dict.fromkeys([folder / f"{name}.json", *below]):
             where = "" if path.parent == folder else f"{path.parent.relative_to(folder)}: "
-            tables += [replace(table, title=f"{where}{table.title}") for table in _tables_of(path)]
+            tables += _tables_of(path, where)
     return tables
 
 
-def _tables_of(path: Path) -> list[HtmlTable]:
-    """Those of an experiment's JSON; none where there is no such file."""
+def _tables_of(path: Path, where: str) -> list[FigureTable]:
+    """Those of an experiment's JSON, `where` before their titles; none where there is no such file."""
     if not path.is_file():
         return []
     try:
-        return [html_table(record) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
+        return [shown(record, where) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no record of an experiment: {error}") from None
 
@@ -122,7 +123,7 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Finding
     if len(commits) > 1:
         findings.notes.append(f"parts were made at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", _record(request, findings, figures), threads=request.workers)
-    tables = [html_table(table.record()) for table in findings.tables]
+    tables = [shown(table.record()) for table in findings.tables]
     runs = [(f"{row}, {sequence}", path) for sequence, of in findings.runs.items() for row, path in of.items()]
     with atomic_write(request.out / f"{name}.html") as file:
         file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", runs, tables))

@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dpm2_core.evaluation.run_page import HtmlTable
 from dpm2_core.tables import FigureTable
 
 MEAN = "mean"
@@ -54,33 +53,17 @@ class ResultTable:
         return row.cells.get(column, {}).get(figure)
 
     def record(self) -> dict[str, Any]:
-        """For JSON."""
-        rows = [
-            {"name": r.name, "origin": r.origin, "note": r.note, "cells": r.cells, "texts": texts}
-            for r, texts in self.texts()
-        ]
+        """For JSON, the cells of each row also as text; see `shown`."""
+        rows = [{**asdict(row), "texts": [self._text(row, column) for column in self.columns]} for row in self.rows]
         return {"title": self.title, "columns": list(self.columns), "caption": self.caption, "rows": rows}
 
-    def texts(self) -> list[tuple[Row, list[str]]]:
-        """Each row with its cells as text: the figures of a column with slashes between, "-" for what is not there."""
-        return [(row, [self._text(row, column) for column in self.columns]) for row in self.rows]
-
-    def view(self) -> FigureTable:
-        """For the terminal."""
-        notes = ["note"] if any(row.note for row in self.rows) else []
-        table = FigureTable(
-            self.title, names=["method", "figures of"], figures=list(self.columns), text=notes, caption=self.caption
-        )
-        for row, cells in self.texts():
-            table.add_row(row.name, row.origin, *cells, *([row.note] if notes else []))
-        return table
-
     def _text(self, row: Row, column: str) -> str:
+        """The figures of a column with slashes between, "-" for what is not there."""
         values = [self.value(row, column, figure) for figure in self.figures]
         if all(value is None for value in values):
             return "-"
-        shown = zip(values, self.figures.values(), strict=True)
-        return " / ".join("-" if value is None else format(value, form) for value, form in shown)
+        both = zip(values, self.figures.values(), strict=True)
+        return " / ".join("-" if value is None else format(value, form) for value, form in both)
 
 
 def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:
@@ -89,12 +72,15 @@ def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:
     return sum(there) / len(there) if there and len(there) == len(values) else None
 
 
-def html_table(record: Mapping[str, Any]) -> HtmlTable:
-    """A table that `ResultTable.record` has written, for a page.
+def shown(record: Mapping[str, Any], where: str = "") -> FigureTable:
+    """A table that `ResultTable.record` has written, for people; `where`: before its title.
 
     Raises:
-        KeyError, TypeError: it is none.
+        KeyError, TypeError, ValueError: it is none.
     """
-    headings = ["method", "figures of", *record["columns"], "note"]
-    rows = [[row["name"], row["origin"], *row["texts"], row["note"]] for row in record["rows"]]
-    return HtmlTable(record["title"], headings, rows, record["caption"])
+    notes = ["note"] if any(row["note"] for row in record["rows"]) else []
+    title, caption = f"{where}{record['title']}", str(record["caption"])
+    table = FigureTable(title, names=["method", "figures of"], figures=record["columns"], text=notes, caption=caption)
+    for row in record["rows"]:
+        table.add_row(*map(str, (row["name"], row["origin"], *row["texts"], *(row[name] for name in notes))))
+    return table

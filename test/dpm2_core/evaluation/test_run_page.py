@@ -16,8 +16,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.evaluation.run_folder import write_frames, write_loops, write_truth
-from dpm2_core.evaluation.run_page import HtmlTable, find_runs, runs_page
+from dpm2_core.evaluation.run_page import find_runs, runs_page
 from dpm2_core.geometry import se3
+from dpm2_core.tables import FigureTable
 
 from ...helpers.command import dpm2
 
@@ -62,7 +63,9 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
         write_run(tmp_path / name, frames, scale)
     runs = find_runs([tmp_path])
     assert [name for name, _ in runs] == ["another", "ours", "theirs"]
-    text = runs_page("A report", runs, [HtmlTable("T", ["a"], [[EVIL]])])
+    table = FigureTable("T", names=["a"])
+    table.add_row(EVIL)
+    text = runs_page("A report", runs, [table])
     groups = data_of(text)
     assert [[run["name"] for run in group["runs"]] for group in groups] in (
         [["another"], ["ours", "theirs"]], [["ours", "theirs"], ["another"]]

@@ -11,5 +11,6 @@ def test_a_mean_is_of_all_columns_or_there_is_none() -> None:
     table = ResultTable("t", ["06", "07", MEAN], {"a": ".1f", "b": ".2f"})
     table.add("ours", {"06": {"a": 1.0, "b": None}, "07": {"a": 2.0, "b": 1.0}})
     table.add("theirs", {"06": {"a": 1.0}}, "the paper")
-    assert [cells for _, cells in table.texts()] == [["1.0 / -", "2.0 / 1.00", "1.5 / -"], ["1.0 / -", "-", "-"]]
-    assert table.record()["rows"][1]["origin"] == "the paper"
+    rows = table.record()["rows"]
+    assert [row["texts"] for row in rows] == [["1.0 / -", "2.0 / 1.00", "1.5 / -"], ["1.0 / -", "-", "-"]]
+    assert rows[1]["origin"] == "the paper"
