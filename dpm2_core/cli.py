@@ -11,7 +11,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Annotated, Any
 
 import typer
@@ -102,9 +102,8 @@ class Commands(TyperGroup):
 
 def load_command(name: str) -> TyperCommand | TyperGroup:
     """Import a command of `COMMANDS`; it and its subcommands take `--quiet`."""
-    module, attribute = COMMANDS[name][0].split(":")
     with importing():
-        found = getattr(import_module(f"dpm2_core.commands.{module}"), attribute)
+        found = resolve_name(f"dpm2_core.commands.{COMMANDS[name][0]}")
     command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _command(name, found)
     for single in command.commands.values() if isinstance(command, TyperGroup) else (command,):
         single.params.extend(_command("quiet", _quiet).params)

@@ -7,8 +7,8 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from dpm2_core.errors import UsageError
@@ -75,8 +75,7 @@ def load(name: str) -> Experiment:
     """
     if name not in EXPERIMENTS:
         raise UsageError(f"{name}: no such experiment; choose from {', '.join(EXPERIMENTS)}")
-    module, _, attribute = EXPERIMENTS[name].where.partition(":")
-    found: Experiment = getattr(import_module(f"dpm2_core.experiments.{module}"), attribute)
+    found: Experiment = resolve_name(f"dpm2_core.experiments.{EXPERIMENTS[name].where}")
     return found
 
 

@@ -14,9 +14,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from importlib import import_module
 from itertools import count
 from pathlib import Path
+from pkgutil import resolve_name
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
@@ -137,11 +137,9 @@ def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) 
     Raises:
         Dpm2Error: it failed, or its results could not be written. Of a fresh part nothing is left then.
     """
-    module, _, name = part.work.partition(":")
-    work = getattr(import_module(module), name)
     began = perf_counter()
     with _folder(part, out) as folder:
-        figures: Figures = work(folder, advance, **part.arguments)
+        figures: Figures = resolve_name(part.work)(folder, advance, **part.arguments)
         record = {
             **_asked(part),
             "commit": git_commit(),

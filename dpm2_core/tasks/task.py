@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import ClassVar
 
 import torch
@@ -160,6 +160,5 @@ def task_type(name: str) -> type[Task]:
     """
     if name not in TASKS:
         raise UsageError(f"{name}: no such task; choose from {', '.join(TASKS)}")
-    module, _, kind = TASKS[name].partition(":")
-    found: type[Task] = getattr(import_module(module), kind)
+    found: type[Task] = resolve_name(TASKS[name])
     return found
