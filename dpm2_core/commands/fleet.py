@@ -118,9 +118,8 @@ def _carry_out(
     Raises:
         Dpm2Error: some failed.
     """
-    cores = max(part.cores for part in parts)
     with TerminalView(Console(stderr=True)) as view:
-        outcomes = carry_out(parts, out, Cluster(*where, cores), view)
+        outcomes = carry_out(parts, out, Cluster(*where), view)
     show(table(outcomes), {"drives": [outcome._asdict() for outcome in outcomes]}, json_file)
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise typer.Abort

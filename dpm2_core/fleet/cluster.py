@@ -53,15 +53,14 @@ class Cluster:
     In a program that is connected to Ray already that connection serves, and stays.
     """
 
-    def __init__(self, address: str | None = None, workers: int | None = None, cores: int = 1) -> None:
+    def __init__(self, address: str | None = None, workers: int | None = None) -> None:
         """Nothing is started yet.
 
         Args:
             address: of a cluster, as `ray.init` takes it; None starts one on this machine.
             workers: at most so many parts at a time; None: as many as there are processors for.
-            cores: of a part, for a cluster that is started here.
         """
-        self._address, self._workers, self._cores = address, workers, cores
+        self._address, self._workers = address, workers
         self._folder: Path | None = None
         self._connected = False
         self._ray: Any = None  # the package, once it is imported
@@ -70,8 +69,11 @@ class Cluster:
     def __enter__(self) -> Cluster:
         return self
 
-    def start(self) -> None:
+    def start(self, cores: int = 1) -> None:
         """Connect to Ray, or start it; `run` does so with the first part.
+
+        Args:
+            cores: of a part, for a cluster that is started here.
 
         Raises:
             UsageError: it is not installed, does not start, or nobody answers at that address.
@@ -86,14 +88,14 @@ class Cluster:
         self._ray = ray
         if not ray.is_initialized():
             try:
-                self._connect(ray)
+                self._connect(ray, cores)
             except Exception as error:  # Ray raises that very class where it does not start in time
                 self.__exit__()
                 where = "Ray" if self._address is None else f"--ray {self._address}"
                 raise UsageError(f"{where}: {one_line(error)}") from None
         self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
 
-    def _connect(self, ray: Any) -> None:
+    def _connect(self, ray: Any, cores: int) -> None:
         _keep_private(Path.home() / ".ray")
         quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         self._connected = True
@@ -103,9 +105,9 @@ class Cluster:
             return
         temporary = tempfile.gettempdir()
         self._folder = Path(tempfile.mkdtemp(prefix="ray_", dir=temporary if len(temporary) < _LONGEST else "/tmp"))
-        workers = self._workers or max(processors() // self._cores, 1)
+        workers = self._workers or max(processors() // cores, 1)
         ray.init(
-            "local", num_cpus=workers * self._cores, include_dashboard=False, object_store_memory=_STORE,
+            "local", num_cpus=workers * cores, include_dashboard=False, object_store_memory=_STORE,
             _temp_dir=str(self._folder), **quiet,
         )  # fmt: skip
 
@@ -127,7 +129,7 @@ class Cluster:
         waiting = deque(parts)
         if not waiting:
             return
-        self.start()
+        self.start(max(part.cores for part in waiting))
         ray = self._ray
         most = self._limits(ray)
         running: dict[Any, str] = {}
