@@ -11,7 +11,7 @@ import typer
 
 from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, counted, note
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.console import Console
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import Dpm2Error, UsageError, printable
 
@@ -99,9 +99,8 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
     if not chosen:
         raise UsageError(f"--frames {packing['frames']}: {src} has {len(source)} frames")
     try:
-        with progress_bar() as bar:
-            task = bar.add_task(f"{source.name} -> {out}", total=len(chosen))
-            packed = write(source, out, network, chosen, lambda: bar.advance(task), packing)
+        with counted(f"{source.name} -> {out}") as progress:
+            packed = write(source, out, network, chosen, progress, packing)
     finally:
         for text in source.notes:  # such as an image that cannot be read
             note(text)

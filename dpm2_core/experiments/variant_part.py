@@ -32,15 +32,8 @@ def pack(folder: Path, advance: Advance, data: Path, settings: Sequence[str], we
         UsageError: no such sequence, no poses, or images of some frames only.
     """
     source = open_drive(data, settings)
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        advance(done, len(source))
-
     network = network_settings(weights_path(weights))
-    return {"frames": write_packed_drive(source, folder / DRIVE, network, None, count)}
+    return {"frames": write_packed_drive(source, folder / DRIVE, network, None, advance)}
 
 
 def training_of(

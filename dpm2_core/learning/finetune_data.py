@@ -113,7 +113,7 @@ def prepare(
         if followed < 2 * settings.frames:
             raise UsageError(f"{source.name}: the SLAM followed {followed} of {len(source)} scans; nothing to learn")
         cut = round(len(source) * (1 - settings.held_out))
-        packing = partial(advance, f"{name}: packing")
+        packing = _of_many(advance, f"{name}: packing")
         if _is_measurable(referenced.poses[cut:]):
             pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, asked)
         elif cut < len(source):
@@ -122,8 +122,12 @@ def prepare(
         pack(referenced, out / DRIVES / name, network, range(cut), packing, asked)
     if settings.rehearsal_share > 0 and not settings.rehearsal:
         worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
-        generate(out / REHEARSAL, worlds, 1, lambda done, total: advance(f"rehearsal: world {done} of {total}"))
+        generate(out / REHEARSAL, worlds, 1, _of_many(advance, "rehearsal: world"))
     return notes
+
+
+def _of_many(advance: Callable[[str], None], what: str) -> Callable[[int, int], None]:
+    return lambda done, total: advance(f"{what} {done} of {total}")
 
 
 def _is_measurable(poses: Array) -> bool:

@@ -180,7 +180,7 @@ def pack(
     folder: Path,
     network: NetworkSettings,
     frames: range | None = None,
-    advance: Callable[[], None] = lambda: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.
@@ -188,7 +188,7 @@ def pack(
     Points with time offsets are moved to where they are seen from at the stamp, by the true motion. All is as the
     network sees it: scans of a tilted sensor in level axes, and a drive that begins in a room enlarged.
 
-    `frames`: positions to look at; `advance` is called after each. `settings`: what made the poses, see `check_same`.
+    `frames`: positions to look at; `progress` is told of each. `settings`: what made the poses, see `check_same`.
 
     Raises:
         UsageError: the source has no poses, or some of its frames lack an image that others have.
@@ -200,7 +200,7 @@ def pack(
         before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
         twist, scale, first = np.zeros(6), 0.0, None
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
-            advance()
+            progress(position + 1 - chosen.start, len(chosen))
             pose = source.poses[position]
             if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
                 continue
