@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from time import perf_counter, process_time
 from typing import Any
@@ -13,11 +14,10 @@ import numpy as np
 from rich.console import Group
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, quantiles_ms, settings_of, truth_of
+from benchmarks.harness import Options, Report, drives, installed, processors, quantiles_ms, settings_of, truth_of
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.experiments.peers import cloud_and_times, kiss_icp_config
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -81,13 +81,14 @@ def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Trial, Mapp
     return Trial(recorder.poses(slam.mapper.poses), seconds, cpu, stages, failed, states), slam.mapper
 
 
-def kiss_icp(options: Options) -> Method | None:
+def kiss_icp(options: Options) -> Method:
     """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it, for KITTI, whose scans are deskewed
-    already; None where it is not installed."""
-    try:
-        config = kiss_icp_config(options.threads, deskew=False)
-    except MissingPackageError:
-        return None
+    already.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
+    config = kiss_icp_config(options.threads, deskew=False)
     from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Trial:
@@ -111,9 +112,8 @@ def bench_geometric(options: Options) -> Report:
     Raises:
         UsageError: there is no drive, or one has no ground truth.
     """
-    no_loops = dpm2(options, "slam.loops.enabled=false")
-    runs = {OURS: dpm2(options), NO_LOOPS: no_loops, BASELINE: kiss_icp(options)}
-    methods = {name: run for name, run in runs.items() if run is not None}
+    methods = {OURS: dpm2(options), NO_LOOPS: dpm2(options, "slam.loops.enabled=false")}
+    methods |= installed({BASELINE: partial(kiss_icp, options)})
     results: dict[str, Any] = {}
     truth: dict[str, str] = {}
     with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:

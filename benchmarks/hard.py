@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.progress import Progress
 from benchmarks.figures import verdicts_png
 from benchmarks.geometric import BASELINE, Method, Trial, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
-from benchmarks.harness import Options, Report, drives, processors, requested, truth_of
+from benchmarks.harness import Options, Report, drives, installed, processors, requested, truth_of
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
@@ -36,11 +37,11 @@ def bench_hard(options: Options) -> Report:
     Raises:
         UsageError: there is no drive, or one has no ground truth.
     """
-    methods: dict[str, Method] = {}
-    for name in requested(options, (*REGISTRATIONS, BASELINE)):
-        run = kiss_icp(options) if name == BASELINE else dpm2(options, f"slam.registration={name}", _BLIND)
-        if run is not None:
-            methods[name] = run
+    makers: dict[str, Callable[[], Method]] = {
+        name: partial(dpm2, options, f"slam.registration={name}", _BLIND) for name in REGISTRATIONS
+    }
+    makers[BASELINE] = partial(kiss_icp, options)
+    methods = installed({name: makers[name] for name in requested(options, makers)})
     results: dict[str, Any] = {}
     worlds = () if options.sources else _SYNTHETIC
     synthetic = [SimulatedDrive(road, preset, seed, preset) for road, preset, seed in worlds]

@@ -8,12 +8,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import RenderableType
@@ -23,9 +23,12 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.record import REPOSITORY, write_record
+from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array
 from dpm2_core.openmp import allowed
 from dpm2_core.slam.settings import Config, SlamSettings
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,15 @@ def requested(options: Options, parts: Collection[str]) -> list[str]:
     if options.only not in parts:
         raise UsageError(f"--only {options.only}: no such part; choose from {', '.join(parts)}")
     return [options.only]
+
+
+def installed(methods: Mapping[str, Callable[[], T]]) -> dict[str, T]:
+    """What makes each of the methods, called; those whose package is missing are left out."""
+    made: dict[str, T] = {}
+    for name, make in methods.items():
+        with suppress(MissingPackageError):
+            made[name] = make()
+    return made
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ No IMU. The velocity changes within each sweep, which bends its scan; what is me
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, settings_of
+from benchmarks.harness import Options, Report, installed, settings_of
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.experiments.peers import KissIcp
-from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
@@ -49,8 +49,7 @@ def bench_motion(options: Options) -> Report:
                 task = f"{place}, {name}"
                 frames = list(progress.track(robot.frames(), total=FRAMES, description=task))
                 results[task] = {way: _ours(frames, robot, s) for way, s in zip(OURS, settings, strict=True)}
-                if (kiss := _kiss(frames, robot, options.threads)) is not None:
-                    results[task][BASELINE] = kiss
+                results[task] |= installed({BASELINE: partial(_kiss, frames, robot, options.threads)})
                 progress.console.print(f"{task}: {results[task]}", soft_wrap=True)
     return Report({"frames": FRAMES, "rides": results}, _table(results))
 
@@ -61,13 +60,13 @@ def _ours(frames: Iterable[Frame], robot: TurningRobot, settings: SlamSettings) 
     return {**_errors(np.array([one.T_odom_lidar for one in tracked]), robot.poses), "failed_frames": failed}
 
 
-def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[str, Any] | None:
-    """Compared with the truth in the middle and at the end of the sweeps: what fits better counts. None where it is not
-    installed."""
-    try:
-        peer = KissIcp(threads, deskew=True)
-    except MissingPackageError:
-        return None
+def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[str, Any]:
+    """Compared with the truth in the middle and at the end of the sweeps: what fits better counts.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
+    peer = KissIcp(threads, deskew=True)
     for frame in frames:
         peer.add(frame)
     at_end = robot.pose(robot.times + FRAME_PERIOD / 2)

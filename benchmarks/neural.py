@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -19,6 +20,7 @@ from benchmarks.harness import (
     Report,
     drives,
     earlier,
+    installed,
     processors,
     quantiles_ms,
     requested,
@@ -122,10 +124,8 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
         for name in ("neural", "refined", "geometric")
     }
     near = {name: methods[name] for name in ("neural", "refined")}
-    if (gicp := gicp_from_identity(options.threads)) is not None:
-        methods["small_gicp"] = gicp
-    if (kiss := kiss_from_identity(options.threads)) is not None:
-        methods[BASELINE] = kiss
+    peers: dict[str, Callable[[int], PairMethod]] = {"small_gicp": gicp_from_identity, BASELINE: kiss_from_identity}
+    methods |= installed({name: partial(make, options.threads) for name, make in peers.items()})
     kinds = {"consecutive": near, "8 apart": near} | dict.fromkeys(APART, methods)
     points = make_registration(settings_of(options, "slam.registration=geometric"))
     return all_pairs(kinds, frames, poses, options.pairs, points)
@@ -136,8 +136,7 @@ def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options:
     methods: dict[str, Method] = {
         name: dpm2(options, f"slam.registration={name}") for name in ("neural", "refined", "geometric")
     }
-    if (kiss := kiss_icp(options)) is not None:
-        methods[BASELINE] = kiss
+    methods |= installed({BASELINE: partial(kiss_icp, options)})
     trials: dict[str, list[Any]] = {name: [] for name in methods}
     for _ in range(options.repetitions):
         for name, run in methods.items():
@@ -152,13 +151,12 @@ def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options:
 def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Encode and register, raw points to pose, by stages; KISS-ICP in turns with it, and what the camera adds."""
     frames = frames[:60]
-    kiss, rounds = kiss_icp(options), []
+    peers, rounds = installed({BASELINE: partial(kiss_icp, options)}), []
     for _ in range(options.repetitions):
-        rounds.append((stage_times(network, frames), None if kiss is None else kiss(frames).seconds[1:]))
-    best, baseline = min(rounds, key=lambda r: r[0]["stages_ms"]["total"]["median"])
-    out: dict[str, Any] = {**best}
-    if baseline is not None:
-        out[BASELINE] = quantiles_ms(baseline)
+        rounds.append((stage_times(network, frames), {name: run(frames).seconds[1:] for name, run in peers.items()}))
+    best, beside = min(rounds, key=lambda r: r[0]["stages_ms"]["total"]["median"])
+    out: dict[str, Any] = {**best, **{name: quantiles_ms(seconds) for name, seconds in beside.items()}}
+    if BASELINE in out:
         out["ratio"] = round(best["stages_ms"]["total"]["median"] / out[BASELINE]["median"], 3)
     if network.encoder.image is None:
         out["with the camera"] = "not answered: these weights have no camera"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.evaluation.pair_set import SUCCESS
 from dpm2_core.experiments.peers import KissIcp, cloud_and_times
-from dpm2_core.extras import MissingPackageError
+from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
@@ -80,15 +80,14 @@ def by_registration(registration: ScanRegistration) -> Callable[..., Array | Non
     return register
 
 
-def gicp_from_identity(threads: int) -> PairMethod | None:
+def gicp_from_identity(threads: int) -> PairMethod:
     """small_gicp's GICP of the two scans at 0.25 m, started at the identity with correspondences up to 2 m.
 
-    None where it is not installed.
+    Raises:
+        MissingPackageError: it is not installed.
     """
-    try:
+    with needs("bench", "the peer small_gicp"):
         import small_gicp
-    except ImportError:
-        return None
 
     def register(first: Frame, second: Frame) -> Array:
         target, source = (cloud_and_times(frame)[0] for frame in (first, second))
@@ -98,9 +97,12 @@ def gicp_from_identity(threads: int) -> PairMethod | None:
     return register
 
 
-def kiss_from_identity(threads: int) -> PairMethod | None:
-    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity. None where it is not
-    installed."""
+def kiss_from_identity(threads: int) -> PairMethod:
+    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
 
     def register(first: Frame, second: Frame) -> Array:
         odometry = KissIcp(threads, deskew=False)
@@ -108,10 +110,7 @@ def kiss_from_identity(threads: int) -> PairMethod | None:
         odometry.add(second)
         return np.asarray(odometry.poses()[-1])
 
-    try:
-        KissIcp(threads, deskew=False)
-    except MissingPackageError:
-        return None
+    KissIcp(threads, deskew=False)  # it is installed
     return register
 
 

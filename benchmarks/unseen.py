@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.geometric import BASELINE
-from benchmarks.harness import Options, settings_of
+from benchmarks.harness import Options, installed, settings_of
 from benchmarks.pairs import MANY, PairMethod, by_registration, kiss_from_identity, summarized
 from dpm2_core.data.corrupt import hidden_by, random_box
 from dpm2_core.data.packed import PackedDrive, Sample
@@ -121,7 +122,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     direction included.
     """
     camera = network.encoder.image is not None
-    kiss = kiss_from_identity(options.threads)
+    peers = installed({BASELINE: partial(kiss_from_identity, options.threads)})
     out: dict[str, Any] = {"pairs": {}}
     for kind in ("highway", "tunnel"):
         pairs = _pairs(network, options, kind, options.pairs)
@@ -133,8 +134,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
             for name in ("neural", "refined"):
                 registered = by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
                 methods[f"{name} {word}"] = _near_errors(pairs, registered)
-        if kiss is not None:
-            methods[BASELINE] = _near_errors(pairs, kiss)
+        methods |= {name: _near_errors(pairs, register) for name, register in peers.items()}
         near = methods["descriptors without camera"][:, 0] <= NEAR
         out["pairs"][f"{kind}, up to 5 m"] = {name: summarized(rows[near, 1:]) for name, rows in methods.items()}
     if not camera:
