@@ -91,10 +91,10 @@ def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, rad
     return chosen[np.argsort(at @ along, kind="stable")]
 
 
-def finetune(settings: FinetuneSettings, out: Path, until: int | None = None, data: Path | None = None) -> Path:
+def finetune(settings: FinetuneSettings, out: Path, data: Path | None = None) -> Path:
     """Train on what `prepare` left below `data`; checkpoint, log and `weights.safetensors` go to `out`.
 
-    until: stop after this step, with a checkpoint; the next call goes on from there. data: `out`, if None.
+    data: `out`, if None.
 
     Raises:
         UsageError: no such weights, or no drives.
@@ -118,7 +118,7 @@ def finetune(settings: FinetuneSettings, out: Path, until: int | None = None, da
         about |= {"finetuned_from": start_from.stem, "finetuned_steps": str(optimizer.steps)}
         save_weights(averaged.model, weights, about)
 
-    Trainer(module, batches, optimizer, out, save).run(until)
+    Trainer(module, batches, optimizer, out, save).run()
     return weights
 
 

@@ -154,8 +154,8 @@ class ImageTraining(nn.Module):
         return loss, {"loss": loss.detach(), "right": right}
 
 
-def train_image(settings: ImageTrainingSettings, out: Path, until: int | None = None) -> Path:
-    """Train; checkpoint, log and the whole network's weights go to `out`. `until`: stop after this step."""
+def train_image(settings: ImageTrainingSettings, out: Path) -> Path:
+    """Train; checkpoint, log and the whole network's weights go to `out`."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
@@ -170,5 +170,5 @@ def train_image(settings: ImageTrainingSettings, out: Path, until: int | None = 
     def save(averaged: ImageTraining) -> None:
         save_weights(averaged.model, weights, {"phase": "image", "steps": str(optimizer.steps)})
 
-    Trainer(module, batches, optimizer, out, save).run(until)
+    Trainer(module, batches, optimizer, out, save).run()
     return weights

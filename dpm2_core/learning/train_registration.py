@@ -135,11 +135,8 @@ def set_pairs_of(poses: Tensor, settings: RegistrationTrainingSettings, step: in
     return tuple(plans)
 
 
-def train_registration(settings: RegistrationTrainingSettings, out: Path, until: int | None = None) -> Path:
-    """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`.
-
-    until: stop after this step; the next call goes on from there.
-    """
+def train_registration(settings: RegistrationTrainingSettings, out: Path) -> Path:
+    """Train; checkpoints, log and at the end the averaged weights, `weights.safetensors`, go to `out`."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     network = preset(settings.preset, settings.network)
@@ -162,7 +159,7 @@ def train_registration(settings: RegistrationTrainingSettings, out: Path, until:
         save_weights(averaged.model, weights, about)
 
     validate = validator(settings, network) if settings.validation else None
-    Trainer(module, batches, optimizer, out, save, validate).run(until)
+    Trainer(module, batches, optimizer, out, save, validate).run()
     return weights
 
 

@@ -31,6 +31,7 @@ from dpm2_core.slam.settings import SlamSettings
 from ...helpers.command import dpm2
 from ...helpers.drives import InMemory
 from ...helpers.networks import tiny
+from ...helpers.training import stopped
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
@@ -189,7 +190,7 @@ def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() ->
 
 @pytest.mark.long
 def test_a_stopped_training_goes_on_to_the_same_weights(
-    recording: Path, tmp_path: Path, settings: FinetuneSettings
+    recording: Path, tmp_path: Path, settings: FinetuneSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And the weights carry the metadata of those that they started from."""
     data = tmp_path / "data"
@@ -202,7 +203,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     with pytest.raises(UsageError, match=r"00_\w+: of a drive that is not asked for; remove it"):
         prepare([], settings, network, SlamSettings(threads=1), data)  # it was learned from, too
     whole = finetune(settings, tmp_path / "whole", data=data)
-    finetune(settings, tmp_path / "parts", until=2, data=data)
+    stopped(lambda: finetune(settings, tmp_path / "parts", data=data), monkeypatch)
     parts = finetune(settings, tmp_path / "parts", data=data)
     one, other, start = (load_model(path).state_dict() for path in (whole, parts, Path(settings.weights)))
     for name, value in one.items():

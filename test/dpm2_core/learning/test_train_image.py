@@ -21,6 +21,7 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.weights import save_weights
 
 from ...helpers.networks import tiny
+from ...helpers.training import stopped
 
 
 @pytest.fixture
@@ -45,14 +46,16 @@ def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> ImageTra
 
 
 @pytest.mark.slow
-def test_it_changes_the_image_branch_alone(settings: ImageTrainingSettings, tmp_path: Path) -> None:
+def test_it_changes_the_image_branch_alone(
+    settings: ImageTrainingSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """LiDAR, fusion and decoder stay bit for bit, and resuming gives the weights of one run."""
     whole = load_file(train_image(settings, tmp_path / "whole"))
     before = load_file(Path(settings.start))
     changed = {name for name in before if not torch.equal(before[name], whole[name])}
     assert changed
     assert all(name.startswith(("encoder.image.", "encoder.fusion.pixel.")) for name in changed)
-    train_image(settings, tmp_path / "halves", until=2)
+    stopped(lambda: train_image(settings, tmp_path / "halves"), monkeypatch)
     halves = load_file(train_image(settings, tmp_path / "halves"))
     assert all(torch.equal(whole[name], halves[name]) for name in whole)
     rows = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
