@@ -21,6 +21,7 @@ from rich.progress import track
 from benchmarks.harness import Options, Report, truth_of
 from dpm2_core.config import load_settings
 from dpm2_core.data.open import open_source
+from dpm2_core.database import size_with_log
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.evaluation.metrics import ape_rmse
@@ -225,8 +226,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
 
 def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
     own = sum(mapper.clouds.loan(node) is None for node in range(len(mapper.keyframes)))
-    size = sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{path}{suffix}")).exists())
-    accepted = sum(loop.ok for loop in mapper.loops)
+    size, accepted = size_with_log(path), sum(loop.ok for loop in mapper.loops)
     return {"lap": lap + 1, "keyframes": len(mapper.keyframes), "with_own_cloud": own, "bytes": size, "loops": accepted}
 
 

@@ -17,7 +17,7 @@ import typer
 
 from dpm2_core.commands.options import run_command
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.record import REPOSITORY, git_commit
+from dpm2_core.evaluation.record import MEASURED, REPOSITORY, git_commit
 
 RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
@@ -28,7 +28,6 @@ COMMANDS: dict[str, Sequence[str]] = {
 """Benchmarks and their options, the quick ones first."""
 TARGETS = {"livox": "bench-livox"}
 """Records that a target of the Makefile makes."""
-_CODE = ("dpm2_core", "benchmarks/*.py")
 
 
 def remaining(names: Sequence[str]) -> list[str]:
@@ -56,7 +55,7 @@ def measured_at(path: Path) -> str | None:
 
 def _is_current(commit: str | None) -> bool:
     """Whether the code is that of a commit."""
-    command = ["git", "diff", "--quiet", f"{commit}", "HEAD", "--", *_CODE]
+    command = ["git", "diff", "--quiet", f"{commit}", "HEAD", "--", *MEASURED]
     return commit is not None and not subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode
 
 

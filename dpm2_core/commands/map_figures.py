@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,12 @@ import numpy as np
 
 from dpm2_core.commands.options import note
 from dpm2_core.database import size_with_log
+from dpm2_core.evaluation.metrics import path_length
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.mapping.parts import placed
 from dpm2_core.slam.mapping.restore import restore_solved
-from dpm2_core.slam.store.map_data import MapData, Way, load_map, ways
+from dpm2_core.slam.store.map_data import MapData, load_map, ways
 from dpm2_core.slam.store.map_file import missing_log
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
@@ -69,7 +69,7 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
         "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),
         "robots": sorted({way.robot for way in drives}),
-        "length_m": _length(drives),
+        "length_m": sum(path_length(way.poses) for way in drives),
         "extent_m": np.ptp(data.poses[tied, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
@@ -136,12 +136,6 @@ def georeference_text(figures: dict[str, Any] | None, unplaced: str) -> str:
         f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "
         f"{figures['fixes_used']} of {figures['fixes']} fixes used"
     )
-
-
-def _length(drives: Iterable[Way]) -> float:
-    """Of the ways of all drives, m."""
-    steps = (np.diff(way.poses[:, :3, 3], axis=0) for way in drives)
-    return float(sum(np.linalg.norm(step, axis=1).sum() for step in steps))
 
 
 def graph_of(data: MapData) -> PoseGraph:

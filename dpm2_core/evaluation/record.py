@@ -15,6 +15,8 @@ from typing import Any
 from dpm2_core.files import atomic_write, json_text
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+MEASURED = ("dpm2_core", "benchmarks/*.py")
+"""What of it a record is of."""
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
@@ -45,7 +47,7 @@ def git_commit() -> str | None:
         if _git("rev-parse", "--show-prefix"):
             return None  # installed below a repository of something else
         commit = _git("rev-parse", "--short=12", "HEAD")
-        changed = _git("status", "--porcelain", "--untracked-files=all", "--", "dpm2_core", "benchmarks/*.py")
+        changed = _git("status", "--porcelain", "--untracked-files=all", "--", *MEASURED)
         return commit + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -152,10 +152,9 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
 
 
 def _truth(source: Source, start: int, stop: int) -> Array:
-    truth = read_ground_truth(source, None, start, stop)
-    if truth is None or isinstance(truth, Trajectory):
+    if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth to compare with")
-    return truth
+    return source.poses[start:stop]
 
 
 def _measured(
