@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.estimates import OdometryResult, State
+from dpm2_ros.base_frame import BaseFrame
 from dpm2_ros.diagnostics import ERROR, OK, STALE, WARN, mapper_status, message_status, publish_diagnostics, status
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.health import Health
@@ -45,13 +46,12 @@ class Diagnostics:
         inputs: Inputs,
         frames: FrameBuilder,
         health: Health,
-        mapper: MapperThread | None,
-        sender: KeyframeSender,
+        keyframes: MapperThread | KeyframeSender,
+        base: BaseFrame,
     ) -> None:
+        """`keyframes`: the map, or what sends keyframes to one elsewhere."""
         self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
-        self._mapper, self._sender = mapper, sender
-        self.frame_problem = ""
-        """What is wrong with the frame that was asked for, in words."""
+        self._keyframes, self._base = keyframes, base
         self.tf_problem = ""
         """Why its pose is not on /tf, in words."""
         self.other: OtherOdometry | None = None
@@ -75,17 +75,18 @@ class Diagnostics:
             out.append(self._gnss())
         if self.other is not None:
             out.append(self._other_odometry(self.other))
-        if self._mapper is None:
-            arrived, made = self._sender.arrived
+        keyframes = self._keyframes
+        if isinstance(keyframes, KeyframeSender):
+            arrived, made = keyframes.arrived
             text = f"{arrived} of {made} keyframes have arrived at the mapper"
             level = WARN if made - arrived > BEHIND else OK
-            if problem := self._sender.problem:
+            if problem := keyframes.problem:
                 level, text = ERROR, f"{text}; {problem}"
             out.append(self._status("mapper", level, text, {"keyframes": made, "delivered": arrived}))
-        elif self._mapper.active.localizer is not None:
-            out.append(self._localization(self._mapper))
+        elif keyframes.active.localizer is not None:
+            out.append(self._localization(keyframes))
         else:
-            out.append(mapper_status(self._node, self._mapper))
+            out.append(mapper_status(self._node, keyframes))
         return [*out, message_status(self._node)]
 
     def account(self) -> str:
@@ -155,7 +156,7 @@ class Diagnostics:
             log.warning(clock, once=True)
         found = (
             (OK, f"the way across {last.breaks} pause(s) or lift(s) is not known" if last.breaks else ""),
-            (ERROR, self.frame_problem),
+            (ERROR, self._base.problem),
             (WARN, self.tf_problem),
             (WARN, self.tf.problem() if self.tf is not None else ""),
             (WARN, f"{count} publishers on {topic}: a drive has one LiDAR" if count > 1 else ""),
@@ -228,8 +229,8 @@ class Diagnostics:
     def _gnss(self) -> DiagnosticStatus:
         inputs, located = self._inputs, None
         problem = self._fix_problem() or self._frames.problems.get(inputs.calibration.gnss_topic)
-        if self._mapper is not None:
-            located = self._mapper.active.mapper.graph.georeference
+        if isinstance(self._keyframes, MapperThread):
+            located = self._keyframes.active.mapper.graph.georeference
         text = "in use" if located is not None else "the map's place on Earth is not known yet"
         return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
 

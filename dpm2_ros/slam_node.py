@@ -106,7 +106,8 @@ class SlamNode(ManagedNode):
         self._frames = FrameBuilder(
             reading, self._known, self.get_logger().error, imu=self._inputs.imu, gnss=self._inputs.gnss
         )
-        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, self._mapper, self._sender)
+        keyframes = self._sender if self._mapper is None else self._mapper
+        self._diagnostics = Diagnostics(self, self._inputs, self._frames, self._health, keyframes, self._base)
         self._diagnostics.other, self._diagnostics.tf = self._other, self._tf
         worker = threading.Thread(target=self._work, name="worker")
         worker.start()
@@ -242,7 +243,6 @@ class SlamNode(ManagedNode):
             )
         if base.problem:
             self.get_logger().error(base.problem, throttle_duration_sec=10)
-        self._diagnostics.frame_problem = base.problem
         if base.child_problem and ros.publish_tf_odom and not self._beside and not ros.invert_odom_tf:
             self._diagnostics.tf_problem = f"no {ros.odom_frame} -> {base.name} on /tf: {base.child_problem}"
             self.get_logger().warning(self._diagnostics.tf_problem, once=True)
