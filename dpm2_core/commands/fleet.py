@@ -52,7 +52,7 @@ def run(
     What is whole is not done again: the same call goes on with what was stopped or has failed.
     """
     parts = parts_of(read_drives(drives), config, settings or ())
-    _carry_out(parts, out, (address, workers), json_file, partial(summary_table, str(out)))
+    _carry_out(parts, out, Cluster(address, workers), json_file, partial(summary_table, str(out)))
 
 
 @app.command()
@@ -103,13 +103,13 @@ def sweep(
 
     values = variants(settings)
     parts = list(sweep_parts(read_drives(drives), config, values))
-    _carry_out(parts, out, (address, workers), json_file, partial(sweep_table, str(out), list(values)))
+    _carry_out(parts, out, Cluster(address, workers), json_file, partial(sweep_table, str(out), list(values)))
 
 
 def _carry_out(
     parts: list[Part],
     out: Path,
-    where: tuple[str | None, int | None],
+    cluster: Cluster,
     json_file: Path | None,
     table: Callable[[Sequence[Outcome]], FigureTable],
 ) -> None:
@@ -119,7 +119,7 @@ def _carry_out(
         Dpm2Error: some failed.
     """
     with TerminalView(Console(stderr=True)) as view:
-        outcomes = carry_out(parts, out, Cluster(*where), view)
+        outcomes = carry_out(parts, out, cluster, view)
     show(table(outcomes), {"drives": [outcome._asdict() for outcome in outcomes]}, json_file)
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise typer.Abort

@@ -41,8 +41,7 @@ def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | N
     """
     out = out.resolve()  # a worker has another working directory
     make_folder(out)
-    kept = [(part.name, figures_of(part, out)) for part in parts]
-    _write(out, [Outcome(name, "stopped" if figures is None else "kept", figures) for name, figures in kept])
+    _write(out, list(_before(parts, out).values()))
     with cluster:
         found = do_parts(parts, out, cluster, view or View())
     _write(out, found)
@@ -68,9 +67,8 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     Args:
         out: absolute.
     """
-    kept = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
-    outcomes = {name: Outcome(name, "kept", figures) for name, figures in kept.items()}
-    missing = [part for part in parts if part.name not in kept]
+    outcomes = _before(parts, out)
+    missing = [part for part in parts if outcomes[part.name].state == "stopped"]
     view.begun([part.name for part in missing])
     try:
         for outcome in cluster.run(missing, out, view.running):
@@ -81,7 +79,13 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     finally:
         for part in missing:
             remove_attempts(part, out)
-    return [outcomes.get(part.name, Outcome(part.name, "stopped")) for part in parts]
+    return list(outcomes.values())
+
+
+def _before(parts: Sequence[Part], out: Path) -> dict[str, Outcome]:
+    """What became of each part before anything is done: those that are whole are kept."""
+    found = {part.name: figures_of(part, out) for part in parts}
+    return {name: Outcome(name, "stopped" if row is None else "kept", row) for name, row in found.items()}
 
 
 def summary_table(title: str, outcomes: Sequence[Outcome]) -> FigureTable:
