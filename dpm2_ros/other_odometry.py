@@ -25,13 +25,12 @@ from dpm2_ros.conversions import check_frame, covariance_from_ros
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
+from dpm2_ros.synchronizer import PATIENCE
 from dpm2_ros.tf_message import TFMessage
 from dpm2_ros.transform_history import TransformHistory
 
 WAIT = 0.1
 """s that a cloud waits for the odometry that comes after it."""
-PATIENCE = 5
-"""Clouds in a row without it, after which none waits any more until it is there again, or would have been."""
 _MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
 _SLIPS = 0.01  # so much is said
 _DOUBTFUL = 1.5  # times as far off as assumed
