@@ -29,17 +29,21 @@ class Scan:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame.
         label: (N,) uint32 as in SemanticKITTI: class in the low 16 bits (252 and more where moving), number of the
             dynamic object in the high ones.
-        moving: (N,) bool. ring: (N,) uint8, 0 is the top beam.
+        ring: (N,) uint8, 0 is the top beam.
         time_offset: (N,) float32 s, from the middle of the turn.
         static: (M, 4) float32, what the same pulses return without anything that moves.
     """
 
     points: Float
     label: NDArray[np.uint32]
-    moving: NDArray[np.bool_]
     ring: NDArray[np.uint8]
     time_offset: Float
     static: Float
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """(N,) whether it is of a dynamic object."""
+        return self.label >> 16 > 0
 
 
 class Lidar:
@@ -90,24 +94,22 @@ class Lidar:
         twin = returns.copy()
         self.errors.finish(twin, draws)
         static = self._points(aim, twin, believed)
-        moving = np.zeros(len(directions), bool)
         if dynamic_objects := world.traffic.dynamic_objects(time, T_world_lidar[:3, 3]):
             one_eye = twist is None and not any(self.config.real.emitters)
             hits, toward = dynamic_objects.cast(origins[0] if one_eye else origins, directions, self.config.range)
             near = hits.distance < still.distance[toward]
             hits, which = hits.part(near), toward[near]
-            moving[which] = True
             mesh = dynamic_objects.scene.mesh
             nearer = self._returns(mesh, hits, directions[which], chance[:, which], jitter[:, which], which)
             returns.put(which, nearer)
             number = dynamic_objects.number[hits.face].astype(np.uint32)
             label[which] = MOVING_LABEL[mesh.label[hits.face]] | number << 16
         stray = self.errors.finish(returns, draws)
-        label[stray], moving[stray] = Label.OUTLIER, False
+        label[stray] = Label.OUTLIER
         back = returns.back
         time_offset = self.beams.column_time[self.beams.column[back]]
         points = self._points(aim, returns, believed)
-        return Scan(points, label[back], moving[back], self.beams.ring[back], time_offset, static)
+        return Scan(points, label[back], self.beams.ring[back], time_offset, static)
 
     def pose(self, world: World, time: float) -> Array:
         """T_world_lidar (4, 4) of the mounted sensor at a time of the drive, s."""
