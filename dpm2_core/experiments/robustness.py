@@ -87,14 +87,14 @@ def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     whole: float | None = None
     for name, _, corrupt in variants:
         add_runs(table, name, sequences, figures)
-        mean = table.value(table.rows[-1], MEAN, "t_err_percent")
+        mean = table.rows[-1].cells[MEAN]["t_err_percent"]
         whole = mean if corrupt is None else whole
         change = 100 * (mean / whole - 1) if mean is not None and whole else None
         if corrupt is not None:
             changes[name] = change
             said = ["" if change is None else f"{change:+.0f} %", table.rows[-1].note]
             table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, said)))
-    table.add("DeepPointMap2, whole", {s: PAPER[s] for s in sequences if s in PAPER}, "the paper")
+    table.add("DeepPointMap2, whole", PAPER, "the paper")
     for kind, means in _PAPER_MEAN.items():
         for share, mean in zip(SHARES, means, strict=True):
             table.add(f"DeepPointMap2, {KINDS[kind]} {share:.0%}", {MEAN: {"t_err_percent": mean}}, "the paper",

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from dpm2_core.tables import FigureTable
+from dpm2_core.tables import FigureTable, cells_of
 
 MEAN = "mean"
 """Name of the last column: the arithmetic mean of the others, as the papers take it."""
@@ -42,15 +42,13 @@ class ResultTable:
     rows: list[Row] = field(default_factory=list)
 
     def add(self, name: str, cells: Cells, origin: str = "this run", note: str = "") -> None:
-        """A row; a mean is added where every column has a figure and there are several, and the row brings none."""
+        """A row, of the table's columns; a mean is added where every column has a figure and there are several, and the
+        row brings none."""
+        cells = {column: cells[column] for column in self.columns if column in cells}
         given = [column for column in self.columns if column != MEAN]
         if MEAN in self.columns and MEAN not in cells:
             cells = {**cells, MEAN: {figure: _mean(cells, given, figure) for figure in self.figures}}
         self.rows.append(Row(name, origin, cells, note))
-
-    def value(self, row: Row, column: str, figure: str) -> float | None:
-        """A figure; None where there is none."""
-        return row.cells.get(column, {}).get(figure)
 
     def record(self) -> dict[str, Any]:
         """For JSON, the cells of each row also as text; see `shown`."""
@@ -59,11 +57,8 @@ class ResultTable:
 
     def _text(self, row: Row, column: str) -> str:
         """The figures of a column with slashes between, "-" for what is not there."""
-        values = [self.value(row, column, figure) for figure in self.figures]
-        if all(value is None for value in values):
-            return "-"
-        both = zip(values, self.figures.values(), strict=True)
-        return " / ".join("-" if value is None else format(value, form) for value, form in both)
+        cells = cells_of(row.cells.get(column, {}), (f"{{{name}:{form}}}" for name, form in self.figures.items()))
+        return "-" if set(cells) == {"-"} else " / ".join(cells)
 
 
 def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:

@@ -115,8 +115,7 @@ class VariantTable:
                 about = f"{random} tensors began at random" if random else ""
                 add_runs(table, self._name(variant), sequences, figures, variant, about)
             for variant, row in self.paper.items():
-                there = {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True) if s in sequences}
-                table.add(variant, there, "the paper")
+                table.add(variant, {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True)}, "the paper")
             tables.append(table)
             notes.append("every variant was fine-tuned from the same weights, as far as they fit it")
             notes += missing_note(sequences, TESTED)
