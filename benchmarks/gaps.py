@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
+from benchmarks.harness import Options, Report, drives, evenly, processors, requested, settings_of, truth_of
 from dpm2_core.estimates import OdometryResult, State
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
@@ -40,9 +40,8 @@ def gaps(stamps: Sequence[int]) -> Iterator[Gap]:
     period = float(np.median(np.diff(np.array(stamps)))) * 1e-9
     for seconds in _SECONDS:
         missing = round(seconds / period)
-        last = len(stamps) - _BEFORE - missing
-        for first in sorted(set(np.linspace(_BEFORE, last, _PLACES).astype(int).tolist())) if last >= _BEFORE else ():
-            yield Gap(first, first + missing, seconds)
+        for place in evenly(len(stamps) - 2 * _BEFORE - missing + 1, _PLACES):
+            yield Gap(_BEFORE + place, _BEFORE + place + missing, seconds)
 
 
 def bench_gaps(options: Options) -> Report:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.harness import evenly
 from dpm2_core.evaluation.pair_set import SUCCESS
 from dpm2_core.experiments.peers import KissIcp, cloud_and_times
 from dpm2_core.extras import needs
@@ -54,7 +55,7 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
     out = {}
     for kind, pairs in kinds.items():
         usable = [(a, b) for a, b in pairs if known[a] and known[b]]
-        out[kind] = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, min(most, len(usable))).astype(int))]
+        out[kind] = [usable[k] for k in evenly(len(usable), most)]
     return out
 
 

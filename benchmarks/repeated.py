@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.figures import bars_png
-from benchmarks.harness import Options, drives, truth_of
+from benchmarks.harness import Options, drives, evenly, truth_of
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.learning.generate import training_camera
@@ -79,8 +79,8 @@ def shares(frames: Sequence[Frame], poses: Array, network: NetworkSettings, most
         chosen = [_references(*scan, settings) for scan in zip(cropped, images, strict=True)]
         out[name] = {}
         for apart in APART:
-            starts = np.linspace(0, len(frames) - 1 - apart, max(min(most, len(frames) - apart), 0)).astype(int)
-            pairs = [(a, a + apart) for a in np.unique(starts) if np.isfinite(poses[[a, a + apart]]).all()]
+            starts = evenly(len(frames) - apart, most)
+            pairs = [(a, a + apart) for a in starts if np.isfinite(poses[[a, a + apart]]).all()]
             distance = [
                 cKDTree(chosen[b]).query(se3.transform(se3.inverse(poses[b]) @ poses[a], chosen[a]))[0]
                 for a, b in pairs

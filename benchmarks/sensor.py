@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import lines_png
-from benchmarks.harness import Options, Report, drives
+from benchmarks.harness import Options, Report, drives, evenly
 from benchmarks.scan_statistics import RANGES, statistics
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import HDL64E, LidarConfig, PresetName
@@ -30,7 +30,7 @@ def bench_sensor(options: Options) -> Report:
     real = []
     with drives(options) as sources:
         for source in sources.values():
-            chosen = set(np.linspace(0, len(source) - 1, _SCANS // len(sources)).astype(int).tolist())
+            chosen = evenly(len(source), _SCANS // len(sources))
             real += [frame.points for i, frame in enumerate(source.frames()) if i in chosen]
     results = {
         "real": statistics(real),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of
+from benchmarks.harness import Options, Report, drives, evenly, processors, settings_of, truth_of
 from benchmarks.pairs import summarized
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import Descriptors
@@ -45,10 +45,7 @@ def bench_tilt(options: Options) -> Report:
 
 def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
     poses, frames = truth_of(source), list(source.frames())
-    pairs = []
-    for n in APART:
-        starts = np.linspace(0, len(frames) - 1 - n, max(min(most, len(frames) - n), 0))
-        pairs += [(a, a + n) for a in np.unique(starts.astype(int)).tolist()]
+    pairs = [(a, a + n) for n in APART for a in evenly(len(frames) - n, most)]
     noise = np.random.default_rng(0)
     out: dict[str, Any] = {}
     for tilt, turned in product((*map(str, TILTS), "random"), (False, True)):
