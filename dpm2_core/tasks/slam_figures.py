@@ -25,16 +25,13 @@ from dpm2_core.tasks.training import mean_figures
 
 @dataclass(frozen=True, eq=False)
 class TaskRun:
-    """Odometry on each kind of cloud of one sequence: (N, 4, 4) poses by kind, and the true ones."""
+    """Odometry on each kind of cloud of one sequence: (N, 4, 4) poses by kind, the true ones, and the stamps, ns, which
+    follow from the numbers of the scans: where some are missing there is a pause."""
 
     sequence: str
     truth: Array
     poses: dict[str, Array]
-
-    @property
-    def stamps(self) -> list[int]:
-        """Of its scans, ns."""
-        return _stamps(len(self.truth))
+    stamps: list[int]
 
 
 def slam_figures(task: Task, path: Path, sequences: Sequence[str] = ()) -> dict[str, float]:
@@ -56,7 +53,7 @@ def figures_of(run: TaskRun) -> dict[str, float]:
     """The figures of one sequence."""
     row: dict[str, float] = {}
     for kind, poses in {**run.poses, "still": np.tile(np.eye(4), (len(run.truth), 1, 1))}.items():
-        figures = evaluate(run.truth, poses)
+        figures = evaluate(run.truth, poses, stamps=np.array(run.stamps))
         row[f"{kind}_ate_m"] = _number(figures.ape_rmse_m)
         row[f"{kind}_rpe_m"] = _number(figures.rpe_trans_m)
         row[f"{kind}_rpe_deg"] = _number(figures.rpe_rot_deg)
@@ -73,11 +70,15 @@ def slam_runs(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[Task
     found = False
     for name, truth, scans in _with_poses(task, path, sequences):
         found = True
-        made = [task.clouds(scans[i].to(task.device)) for i in range(len(scans))]
+        made, numbers = [], []
+        for scan in map(scans.__getitem__, range(len(scans))):
+            made.append(task.clouds(scan.to(task.device)))
+            numbers.append(scan.number)
         if not made[0]:
             raise UsageError(f"{task.name}: makes no clouds that SLAM could run on")
-        poses = {kind: _odometry([of[kind].cpu().numpy() for of in made]) for kind in made[0]}
-        yield TaskRun(name, truth, poses)
+        stamps = stamps_of(np.array(numbers) - numbers[0] + 1).tolist()
+        poses = {kind: _odometry([of[kind].cpu().numpy() for of in made], stamps) for kind in made[0]}
+        yield TaskRun(name, truth, poses, stamps)
     if not found:
         raise UsageError(f"{path}: no sequences with poses; want sequences/NN/velodyne and its poses")
 
@@ -95,18 +96,14 @@ def _with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tu
         yield "/".join(names_of(folder, path)), truth, scans
 
 
-def _odometry(clouds: list[np.ndarray]) -> Array:
-    """Poses (N, 4, 4) of clouds (M, 3), m."""
+def _odometry(clouds: list[np.ndarray], stamps: list[int]) -> Array:
+    """Poses (N, 4, 4) of clouds (M, 3), m, with their stamps, ns."""
     odometry = make_odometry(SlamSettings(registration="geometric"))
     poses = []
-    for i, (stamp, cloud) in enumerate(zip(_stamps(len(clouds)), clouds, strict=True)):
+    for i, (stamp, cloud) in enumerate(zip(stamps, clouds, strict=True)):
         points = np.concatenate([cloud, np.zeros((len(cloud), 1))], 1).astype(np.float32)
         poses.append(odometry.process(Frame(stamp=stamp, index=i, points=points)).T_odom_lidar)
     return np.stack(poses)
-
-
-def _stamps(scans: int) -> list[int]:
-    return stamps_of(np.arange(1, scans + 1)).tolist()
 
 
 def _number(value: float | None) -> float:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,7 +18,7 @@ from dpm2_core.tasks.ae_lidar import AeLidarSettings
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.tasks.open import folders_of, names_of, open_scans
-from dpm2_core.tasks.slam_figures import slam_figures
+from dpm2_core.tasks.slam_figures import figures_of, slam_figures, slam_runs
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +67,27 @@ def test_a_perfect_network_is_as_good_as_its_input(
     assert untrained["output_ate_m"] > 10 * found["output_ate_m"]
     alone = [untrained["input_ate_m"], slam_figures(task, drives, ["1"])["input_ate_m"]]
     assert found["input_ate_m"] == pytest.approx(sum(alone) / 2)  # each drive is evaluated by its own scans
+
+
+@pytest.mark.slow
+def test_missing_scans_are_a_pause_and_no_step(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
+    """Numbers 0 to 3 and 20 to 23: the clouds come at their times, and the step across is none of the RPE.
+
+    Both parts are the same scans at the same places: a pose that stands still errs in each step as in the one part.
+    """
+    copied = tmp_path / "00"
+    shutil.copytree(drives / "0" / "sequences" / "00", copied)
+    whole = slam_figures(task, copied)
+    for kind in ("velodyne", "labels", "static"):
+        for path in sorted((copied / kind).iterdir()):
+            shutil.copy(path, path.with_stem(f"{int(path.stem) + 20:06d}"))
+    lines = (copied / "poses.txt").read_text().splitlines()
+    (copied / "poses.txt").write_text("\n".join([*lines, *lines[-1:] * 16, *lines]) + "\n")
+    times = (copied / "times.txt").read_text().splitlines()
+    (copied / "times.txt").write_text("\n".join([*times, *(f"{i / 10}" for i in range(4, 24))]) + "\n")
+    [run] = slam_runs(task, copied, [])
+    assert np.diff(run.stamps).tolist() == [100_000_000] * 3 + [1_700_000_000] + [100_000_000] * 3
+    assert figures_of(run)["still_rpe_m"] == pytest.approx(whole["still_rpe_m"])
 
 
 @pytest.mark.slow
