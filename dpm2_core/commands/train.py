@@ -104,7 +104,8 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
     finally:
         for text in source.notes:  # such as an image that cannot be read
             note(text)
-    note(f"{out}: {packed} frames")
+    of_all = f" of {len(chosen)} frames; the others have no pose, cannot be read or show hardly any point"
+    note(f"{out}: {packed}{of_all if packed < len(chosen) else ' frames'}")
 
 
 @train.command()

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, field_validator
 
 from dpm2_core.config import Settings
-from dpm2_core.data.packed import PackedDrive, Sample, packed_writer, write_packed
+from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writer, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
@@ -22,7 +22,7 @@ from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.packed_frames import crop_of
-from dpm2_core.network.pyramid import crop, tilt_of
+from dpm2_core.network.pyramid import MIN_POINTS, crop, tilt_of
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar
@@ -185,6 +185,7 @@ def pack(
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.
 
+    Those that cannot be read or show fewer than `MIN_POINTS` points, of which no network makes anything, are left out.
     Points with time offsets are moved to where they are seen from at the stamp, by the true motion. All is as the
     network sees it: scans of a tilted sensor in level axes, and a drive that begins in a room enlarged.
 
@@ -202,21 +203,28 @@ def pack(
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
             pose = source.poses[position]
-            if position not in chosen or frame.problem is not None or not np.isfinite(pose).all():
+            readable = frame.problem is None and len(frame.points) >= MIN_POINTS
+            if position not in chosen or not readable or not np.isfinite(pose).all():
                 continue
             scale = scale or scale_of(frame.points)
             first = first or (frame.index, _cameras(frame))
             _check_cameras(source.name, first, (frame.index, _cameras(frame)))
             if before is not None:
                 twist = _twist(before, (frame, pose))
-                writer.add(_packed(*before, twist, network, scale))
+                _add(writer, _packed(*before, twist, network, scale))
             before = frame, pose
-        if before is None:
+        if before is not None:
+            _add(writer, _packed(*before, twist, network, scale))
+        if not len(writer):
             raise UsageError(f"{source.name}: no readable frame with a pose")
-        writer.add(_packed(*before, twist, network, scale))
         about = {"source": source.name, "scale": scale, "crop": crop_of(network.points)}
         writer.finish({**about, "settings": dict(settings or {})})
     return len(writer)
+
+
+def _add(writer: PackedWriter, sample: Sample) -> None:
+    if len(sample.cloud) >= MIN_POINTS:  # within the crop
+        writer.add(sample)
 
 
 def _cameras(frame: Frame) -> list[str]:

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from dpm2_core.cli import app
 from dpm2_core.config import load_settings
+from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import PackedDrive, Sample, open_packed, write_packed
 from dpm2_core.data.source import IndexedSource
 from dpm2_core.errors import Dpm2Error, UsageError
@@ -118,6 +119,22 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
         gap = np.linalg.norm(there[:, None] - world[None], axis=2).min(1)
         # 2 mm of packing, and steps of a millisecond at 10 m/s; without undistorting it is half a meter.
         assert np.quantile(gap, 0.99) < 0.02
+
+
+def test_a_scan_that_shows_hardly_anything_is_left_out_and_said(kitti: Path, tmp_path: Path) -> None:
+    """An empty file, and a sensor that sees its own housing alone: the first pair of a validation that took such a scan
+    ended the training, and every one that was resumed."""
+    drive, out = kitti / "sequences" / "03", tmp_path / "d"
+    (drive / "velodyne" / "000000.bin").write_bytes(b"")
+    np.full((500, 4), 0.2, np.float32).tofile(drive / "velodyne" / "000002.bin")
+    done = CliRunner().invoke(app, ["train", "pack", str(drive), str(out)])
+    assert done.exit_code == 0, done.output
+    assert f"{out}: 2 of 4 frames; the others have no pose, cannot be read or show hardly any" in done.stderr
+    np.testing.assert_allclose(PackedDrive(out).poses[:, 0, 3], [1, 3])
+    for name in ("000001.bin", "000003.bin"):
+        (drive / "velodyne" / name).write_bytes(b"")
+    with pytest.raises(UsageError, match="no readable frame with a pose"):
+        pack(open_source(drive), tmp_path / "none", tiny())
 
 
 def test_what_cannot_be_packed(tmp_path: Path) -> None:
