@@ -74,11 +74,13 @@ def pack(
     left_out = []
     names = sequences_below(src)
     for name in names:
+        asked = [*overrides, f"input.sequence={name}"]
+        made_by = {**packing, **_content(src, asked)}
         if (out / name).exists():
-            check_same(out / name, packing)
+            check_same(out / name, made_by)
             continue
         try:
-            _pack_one(src, out / name, packing, [*overrides, f"input.sequence={name}"])
+            _pack_one(src, out / name, made_by, asked)
         except UsageError as error:  # of this drive; a full disk ends them all
             typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
             left_out.append(name)
@@ -106,6 +108,19 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
             note(text)
     of_all = f" of {len(chosen)} frames; the others have no pose, cannot be read or show hardly any point"
     note(f"{out}: {packed}{of_all if packed < len(chosen) else ' frames'}")
+
+
+def _content(src: Path, overrides: list[str]) -> dict[str, str]:
+    """What a drive holds, see `digest_of`; nothing where it cannot be read, as without its scans."""
+    from dpm2_core.data.open import open_source
+    from dpm2_core.data.settings import input_settings
+    from dpm2_core.data.source import digest_of
+
+    try:
+        source = open_source(src, input_settings(overrides))
+        return {"drive": f"of {len(source)} scans ({digest_of(source)})"}
+    except UsageError:
+        return {}
 
 
 @train.command()

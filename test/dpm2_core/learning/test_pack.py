@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -222,6 +223,10 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     ):
         refused = CliRunner().invoke(app, [*arguments, *other])
         assert f"03: made with {name}" in str(refused.exception)
+    (kitti / "sequences" / "05" / "velodyne" / "000001.bin").unlink()  # no other drive, and no scans that were packed
+    shutil.rmtree(kitti / "sequences" / "03" / "velodyne")
+    fewer = CliRunner().invoke(app, arguments)
+    assert re.search(r"05: made with drive of 4 scans \(\w+\), not of 3 scans", str(fewer.exception))
     one_of_all = CliRunner().invoke(app, [*arguments, "--set", "input.sequence=03"])
     assert "packs every drive" in str(one_of_all.exception)
     nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])
