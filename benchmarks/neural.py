@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -33,6 +34,9 @@ from benchmarks.pairs import APART, PairMethod, all_pairs, by_registration, gicp
 from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
+from dpm2_core.data.packed import open_packed, packed_digest
+from dpm2_core.data.source import digest_of
+from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import file_digest
 from dpm2_core.frame import Array, Frame
@@ -48,8 +52,8 @@ Part = Callable[[DeepPointMap2, Options], dict[str, Any]]
 
 
 def bench_neural(options: Options) -> Report:
-    """Part after part, each written to the JSON when it is there; a later run with the same weights and options adds
-    the rest.
+    """Part after part, each written to the JSON when it is there; a later run with the same weights, options and drives
+    adds the rest.
 
     Raises:
         UsageError: no weights, no drive, one without ground truth, or no such part.
@@ -85,11 +89,24 @@ def _options(options: Options) -> dict[str, Any]:
     return {
         "sources": [path.name for path in options.sources],
         "unseen": options.unseen and options.unseen.name,  # a record names no folders of a machine
+        "content": _content(options),
         "overrides": list(options.overrides),
         "repetitions": options.repetitions,
         "threads": options.threads,
         "pairs": options.pairs,
     }
+
+
+def _content(options: Options) -> dict[str, str]:
+    """What the drives and worlds hold: others may have their names. Where there are none, the parts that want them say
+    so."""
+    found: dict[str, str] = {}
+    with suppress(UsageError), drives(options) as sources:
+        found |= {name: digest_of(source) for name, source in sources.items()}
+    with suppress(UsageError):
+        if options.unseen is not None:
+            found["unseen"] = packed_digest(open_packed(options.unseen))
+    return found
 
 
 def _weights(name: str) -> dict[str, Any]:

@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks import neural
 from benchmarks.harness import Options
+from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
 
@@ -58,3 +60,36 @@ def test_parts_of_other_options_are_measured_again(
     record = json.loads((tmp_path / "neural.json").read_text())
     assert list(record["parts"]) == ["first", "second"]
     assert record["options"]["threads"] == record["machine"]["threads"]
+
+
+def _drive(folder: Path, scans: int) -> Path:
+    (folder / "velodyne").mkdir(parents=True)
+    for number in range(scans):
+        np.full((40, 4), 2.0 + number, np.float32).tofile(folder / "velodyne" / f"{number:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    return folder
+
+
+def _worlds(folder: Path, points: int) -> Path:
+    write_packed(folder / "world", [Sample(np.zeros((points, 3), np.float32), np.eye(4))], {})
+    return folder
+
+
+def test_parts_of_other_drives_and_worlds_of_the_same_name_are_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An excerpt of 00 and the whole sequence: the table was that of the first, whatever the second call was given."""
+    measured: list[Path] = []
+
+    def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
+        measured.append(options.sources[0])
+        return {}
+
+    monkeypatch.setattr(neural, "PARTS", {"first": part})
+    save_weights(DeepPointMap2(tiny()), tmp_path / "tiny.safetensors", {"phase": "2"})
+    excerpt, whole = _drive(tmp_path / "excerpt" / "00", 2), _drive(tmp_path / "whole" / "00", 3)
+    val, other = _worlds(tmp_path / "one" / "val", 5), _worlds(tmp_path / "other" / "val", 6)
+    options = Options(out=tmp_path, overrides=[f"slam.neural.weights={tmp_path}/tiny.safetensors"], threads=1)
+    for drive, worlds in ((excerpt, val), (excerpt, val), (whole, val), (whole, other), (whole, other)):
+        neural.bench_neural(replace(options, sources=[drive], unseen=worlds))
+    assert measured == [excerpt, whole, whole]
