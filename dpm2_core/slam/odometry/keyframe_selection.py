@@ -132,15 +132,20 @@ class KeyframeSelector:
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
         self._weakest, self._left_open = None, np.zeros((3, 3))
-        self._near.append(T_odom_lidar)
+        # In place of those that it looks like: at a halt one may be requested each second, and each frame asks all.
+        self._near = [T for T, degrees in self._near_by(T_odom_lidar) if degrees >= s.angle] + [T_odom_lidar]
         return keyframe
 
     def _is_known(self, T_odom_lidar: Array) -> bool:
         """Whether a keyframe shows what is seen there: one that turns on the spot sees the same with each turn."""
-        moved = [(T, *se3.apart(T, T_odom_lidar)) for T in self._near]
-        near = [(T, degrees) for T, meters, degrees in moved if meters < self._spacing.meters]
+        near = self._near_by(T_odom_lidar)
         self._near = [T for T, _ in near]
         return any(degrees < self._settings.angle for _, degrees in near)
+
+    def _near_by(self, T_odom_lidar: Array) -> list[tuple[Array, float]]:
+        """Of `_near` those that the robot has not left there (4, 4), and how many degrees it is turned from each."""
+        moved = [(T, *se3.apart(T, T_odom_lidar)) for T in self._near]
+        return [(T, degrees) for T, meters, degrees in moved if meters < self._spacing.meters]
 
     def _trace_fix(self, frame: Frame, T_odom_lidar: Array) -> None:
         """Note the way, and where on it a fix was measured: it comes late, and between two scans."""

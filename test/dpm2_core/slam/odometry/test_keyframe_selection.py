@@ -61,6 +61,28 @@ def test_a_robot_that_turns_on_the_spot_makes_the_keyframes_of_one_turn() -> Non
     assert turning([*to_and_fro, *to_and_fro], broken=len(to_and_fro)) == [0, 1, 40]
 
 
+def test_keyframes_that_are_requested_at_a_halt_cost_no_later_frame_time() -> None:
+    """A robot that is looked for in a map all night asks for one a second: after 90 minutes a frame took 0.1 s, all the
+    time there is. Counted is how often poses are compared, as times vary."""
+    selector, scan, compared = KeyframeSelector(KeyframeSettings()), Scan(np.zeros((5, 4), np.float32)), [0]
+
+    class Counted(np.ndarray):
+        def __rmatmul__(self, other: object) -> object:
+            compared[0] += 1
+            return np.asarray(other) @ np.asarray(self)
+
+    def select(x: float, heading: float, T_of: type[np.ndarray] = np.ndarray) -> bool:
+        T = se3.make(se3.rotation(np.array([0, 0, np.radians(heading)])), [x, 0, 0])
+        return selector.select(Frame(0, scan.points), scan, T.view(T_of), Registration(T, np.eye(6) * 1e-4)) is not None
+
+    for n in range(200):
+        selector.request()
+        assert select(0.01 * (n % 2), 90.0 * (n % 4))
+    assert not select(0.0, 0.0, Counted)
+    assert 0 < compared[0] <= 4  # one of each heading
+    assert [select(x, 0.0) for x in (4.0, 6.0, 10.0, 11.5)] == [False, True, False, True]
+
+
 def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
     """Scans that leave the way open for a while enter the map; the next one fits there, and knows no more."""
     selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
