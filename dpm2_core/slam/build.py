@@ -124,7 +124,10 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
     Raises:
         UsageError: the network has no weights to run with.
     """
-    nodes = np.flatnonzero(mapper.placed).tolist()  # where the others are in the map is not known
+    placed, loan = mapper.placed, mapper.clouds.loan  # where the others are in the map is not known
+    # Of a place that was passed again and again there is one: else all candidates, and the map around, would be of it.
+    lenders = ((node, lent.lender if (lent := loan(node)) else None) for node in np.flatnonzero(placed).tolist())
+    nodes = [node for node, lender in lenders if lender is None or not placed[lender]]
     known = KnownMap(
         [mapper.keyframes[node] for node in nodes],
         lambda i: mapper.clouds[nodes[i]],
