@@ -24,6 +24,9 @@ from dpm2_core.slam.settings import SlamSettings
 from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint, seen, stripes, with_intensities
 from ....helpers.drives import track
 
+GEOMETRIC = SlamSettings(registration="geometric")
+"""What is done with images is the same with the network, which takes most of the time."""
+
 
 def registered(first: Frame, second: Frame, **visual: object) -> Registration:
     """Of the second in the frame of the first."""
@@ -119,7 +122,7 @@ def test_a_camera_whose_calibration_is_wrong_leads_nowhere_where_intensities_tel
     """By the image alone 10 % of the focal length are 4 m of 39, `tracking`; intensities have no calibration."""
     paint, states, reasons, ahead = random_paint(), [], [], []
     camera = replace(CAMERA, K=CAMERA.K @ np.diag([focal, focal, 1.0]))
-    odometry = make_odometry(SlamSettings(registration="geometric"))
+    odometry = make_odometry(GEOMETRIC)
     way = np.cumsum(np.interp(np.arange(60), [0, 20, 40], [0.6, 0.6, 0.9]))
     for i, x in enumerate(way):
         one = with_intensities(frame(x, paint, i), x, paint)
@@ -152,7 +155,7 @@ def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -
     good = [noisy(frame(0.5 * i, paint, i)) for i in range(10)]
     hung = [replace(f, images=good[5 if hangs(7) else i - 1].images) if hangs(i) else f for i, f in enumerate(good)]
     without = [replace(f, images=()) if hangs(i) else f for i, f in enumerate(good)]
-    odometry = [make_odometry(SlamSettings()) for _ in range(2)]
+    odometry = [make_odometry(SlamSettings()) for _ in range(2)]  # the network does not see it either
     for i, (one, other) in enumerate(zip(hung, without, strict=True)):
         result, expected = odometry[0].process(one), odometry[1].process(other)
         assert_same(result.registration, expected.registration)
@@ -166,7 +169,7 @@ def test_a_camera_of_another_rate_than_the_scans() -> None:
     """At 15 Hz beside 10 Hz and 10 m/s, each second image is 0.33 m from its scan: that was the error of each step."""
     paint, late = random_paint(3), np.arange(10) % 2 / 30
     frames = [frame(1.0 * i, paint, i) for i in range(10)]
-    odometry, tracked = make_odometry(SlamSettings()), []
+    odometry, tracked = make_odometry(GEOMETRIC), []
     for i, one in enumerate(frames):
         image = replace(seen(i + 10 * late[i], paint, CAMERA), time_offset=late[i])
         tracked.append(odometry.process(replace(one, images=(image,))))
@@ -182,7 +185,7 @@ def test_a_camera_of_another_rate_than_the_scans() -> None:
 @pytest.mark.parametrize("late", [0.1, -0.1])
 def test_a_picture_of_another_time_than_its_keyframe(late: float) -> None:
     """Its camera is placed where that was then: places were found by it that were off by the speed times that time."""
-    paint, slam = random_paint(3), make_slam()
+    paint, slam = random_paint(3), make_slam(GEOMETRIC)
 
     def place(i: float) -> float:
         return 0.03 * max(0.0, i - 3) ** 2  # at rest, then 6 m/s^2
@@ -206,7 +209,7 @@ def test_an_image_that_is_sent_again_is_no_picture_of_a_keyframe() -> None:
     """It shows another place."""
     frames = [noisy(frame(0.5 * i, random_paint(3), i)) for i in range(3)]
     for images, shown in ((frames[2].images, True), (frames[1].images, False)):
-        slam = make_slam()
+        slam = make_slam(GEOMETRIC)
         for one in frames[:2]:
             slam.odometry_step(one)
         slam.odometry.request_keyframe()
@@ -221,7 +224,7 @@ def test_the_same_image_is_good_for_two_clouds_and_at_rest_without_noise() -> No
     first, second = (frame(0.5 * i, random_paint(3), i) for i in range(2))
     late = replace(second, images=(replace(first.images[0], time_offset=-0.1),))
     for again in (late, replace(first, stamp=second.stamp)):
-        odometry = make_odometry(SlamSettings())
+        odometry = make_odometry(GEOMETRIC)
         odometry.process(first)
         assert odometry.process(again).camera == ""
 
@@ -233,7 +236,10 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
     steps = [1.0] * 5 + [0.7, 0.4, 0.1, 0.0]
     at = np.concatenate([[0.0], np.cumsum(steps)])
     frames = [noisy(frame(x, paint, i)) for i, x in enumerate(at)]
-    odometry = {on: make_odometry(SlamSettings(visual=VisualSettings(enabled=on))) for on in (True, False)}
+    odometry = {
+        on: make_odometry(SlamSettings(registration="geometric", visual=VisualSettings(enabled=on)))
+        for on in (True, False)
+    }
     tracks = {on: [odometry[on].process(f) for f in frames] for on in odometry}
     errors = {
         on: [abs((se3.inverse(t[0].T_odom_lidar) @ t[i].T_odom_lidar)[0, 3] - at[i]) for i in range(len(at))]
