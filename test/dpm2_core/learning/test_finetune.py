@@ -33,6 +33,9 @@ from ...helpers.drives import InMemory
 from ...helpers.networks import tiny
 from ...helpers.training import stopped
 
+GEOMETRIC = SlamSettings(registration="geometric", loops={"descriptors": False}, threads=1)  # type: ignore[arg-type]
+"""A reference by points alone: what is made of it is the same as by the network, which takes most of the time."""
+
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
     """Tokens of G * F scans of the same 60 places, each with its own feature in every scan; poses (G, F, 4, 4)."""
@@ -156,7 +159,7 @@ def carried(frame: Frame) -> Frame:
 def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording: Path) -> None:
     """Where the second part is to the first is a guess, which was learned from and measured against like all else. The
     last scan before the pause is left out: the motion to the next one, by which its sweep is straightened, is none."""
-    referenced = refer(InMemory([*map(carried, open_source(recording).frames())]), SlamSettings(threads=1))
+    referenced = refer(InMemory([*map(carried, open_source(recording).frames())]), GEOMETRIC)
     poses, truth = referenced.poses, _truth(recording)
     there = np.flatnonzero(np.isfinite(poses).all((1, 2)))
     before, after = there[there < 8], there[there >= 8]
@@ -183,7 +186,7 @@ def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() ->
         points = frame.points.copy()
         points[:, :3] = np.einsum("nij,nj->ni", T[:, :3, :3], points[:, :3]) + T[:, :3, 3]
         frames.append(replace(frame, points=points))
-    referenced = refer(InMemory(frames), SlamSettings(threads=1))
+    referenced = refer(InMemory(frames), GEOMETRIC)
     assert all(frame.time_offset is None for frame in referenced.frames())
     assert referenced.notes == ["the times of the points are not used, the motion contradicts them"]
 
