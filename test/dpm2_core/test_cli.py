@@ -157,8 +157,8 @@ def test_completion(words: str, offered: list[str]) -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -> None:
-    """500 frames would take a minute."""
-    drive = ("sim", tmp_path / "drive", "--frames", 500, "--no-images")
+    """500 frames would take a minute. A tunnel is built in a tenth of the time of a city."""
+    drive = ("sim", tmp_path / "drive", "--frames", 500, "--preset", "tunnel", "--no-images")
     with started(*drive, until=lambda: list(tmp_path.rglob("*.bin"))) as process:
         process.send_signal(signal.SIGINT)
         began = time.monotonic()
