@@ -37,7 +37,8 @@ class Requests:
 
     async def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._mapper is not None:
-            await self._mapper.before_reset(response, "odometry and map start again with the next cloud")
+            begins = "map" if self._mapper.active.localizer is None else "the search for its place in the map"
+            await self._mapper.before_reset(response, f"odometry and {begins} start again with the next cloud")
         else:
             begins = "odometry starts again with the next cloud, and its keyframes as a new session of the mapper's map"
             response.success, response.message = True, begins

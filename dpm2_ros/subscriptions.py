@@ -151,6 +151,7 @@ class Inputs:
         """Other topics with point clouds."""
         own = {topic for topic, _ in self._node.get_publisher_names_and_types_by_node(
             self._node.get_name(), self._node.get_namespace())}  # fmt: skip
+        own.add(self.calibration.points_topic)
         wanted = {"sensor_msgs/msg/PointCloud2", *LIVOX}
         return sorted(
             topic

@@ -167,6 +167,8 @@ def test_hints_and_services_give_reasons(
     r.harness.wait(lambda: "want it in frame map, not in 'odom'" in r.log.read_text(), "the warning")
     saved = r.harness.call(Trigger, "/slam_node/save_map")
     assert not saved.success
+    reset = r.harness.call(Trigger, "/slam_node/reset")
+    assert (reset.success, "and the search" in reset.message) == (True, True)  # the map stays
     # the file goes: it cannot be loaded again, and the robot keeps what it has
     made_elsewhere = made.rename(made.with_name("gone.dpm2map"))
     try:

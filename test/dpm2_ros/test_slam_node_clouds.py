@@ -226,7 +226,9 @@ def test_one_cloud_stamped_far_ahead_costs_that_cloud_alone(
 
 def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
     r = rig()
-    assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud yet")).level == DiagnosticStatus.STALE
+    before = r.status("odometry", saying("no cloud on /kitti/velo/pointcloud yet"))
+    assert before.level == DiagnosticStatus.STALE
+    assert "are published on" not in before.message  # the topic itself, whose publisher is there, was named
     r.send_and_wait(0)
     monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud for")).level == DiagnosticStatus.STALE
