@@ -34,12 +34,12 @@ _HEAD = """# Parameters
 
 <!-- Written by `make parameters` from the settings themselves; a test keeps it up to date. -->
 
-One list for everything: `slam_node` and `mapper_node` take each value as a ROS parameter of this name
-(`--ros-args -p slam.registration:=geometric`), `dpm2 run` as `--set slam.registration=geometric` (all but
-`ros.*`), and both from a YAML file (`-p config_file:=FILE`, `--config FILE`; `dpm2 config dump` writes one).
-Defaults are overridden by the file, the file by single values. An unknown name or a value that is not
-allowed ends the program with exit code 2 and one line that says what is. They are read once, at the start;
-those that are *changeable* can also be set while a node runs (`ros2 param set`)."""
+One list for everything. `slam_node` and `mapper_node` take each value as a ROS parameter of this name
+(`--ros-args -p slam.registration:=geometric`) or from a YAML file (`-p config_file:=FILE`). `dpm2 run` takes all
+but `ros.*`, as `--set slam.registration=geometric` or from a file (`--config FILE`; `dpm2 config dump` writes one).
+A single value overrides the file, the file the defaults. An unknown name or a value that is not allowed ends the
+program with exit code 2 and one line that says what is. Values are read at the start; those that are *changeable*
+can also be set while a node runs (`ros2 param set`)."""
 
 
 def load_parameters(node: Node) -> NodeConfig:

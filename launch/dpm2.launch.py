@@ -27,7 +27,7 @@ ARGUMENTS = {
     "odom_frame": ("", "frame of the odometry; empty: odom"),
     "odom_source": ("", "tf or topic: the robot has an odometry already; empty: own"),
     "embed_mapper": ("", "true: the mapper within slam_node; false: mapper_node beside it; empty: true"),
-    "map_directory": ("", "where the map is saved at the end; empty: ros.map_directory"),
+    "map_directory": ("", "folder of the maps; empty: ros.map_directory"),
     "map_file": ("", "map file that is written, or, with localization_mode, read; empty: ros.map_file"),
     "localization_mode": ("", "true: slam_node finds itself in map_file"),
     "namespace": ("", "of all nodes: one a robot"),

@@ -38,8 +38,9 @@ class MapSettings(Settings):
     voxel: float = Field(0.3, gt=0)
     """Spacing of its points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
-    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of those by whose picture one can say
-    how far along a tunnel or a highway one is, see `slam.visual`: 6 to 10 kB each."""
+    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of the first of a drive, and
+    of those by whose picture one can say how far along a tunnel or a highway one is, see `slam.visual`: 6 to 10 kB
+    each."""
     moving_window: int = Field(5, ge=0)
     """So many keyframes before and after one tell which of its points are of moving things, and no part of the map; 0
     keeps all."""
