@@ -126,6 +126,13 @@ def test_different_lengths_are_rejected_naming_both(tmp_path: Path) -> None:
     assert re.search("60 poses .* 50 ", error)
 
 
+def test_a_run_of_some_frames_is_told_which_of_its_files_a_drive_is_the_truth_of(tmp_path: Path) -> None:
+    """It was told to take the drive as ground truth, which it had."""
+    folder, poses = drive_with_truth(tmp_path)
+    write_kitti(tmp_path / "est.txt", poses[2:5])
+    assert "trajectory.tum" in refused("eval", "--gt", folder, "--est", tmp_path / "est.txt")
+
+
 @pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
 def test_lengths_that_are_none_are_rejected(text: str) -> None:
     with pytest.raises(UsageError, match=f"--lengths {text}"):
