@@ -67,10 +67,13 @@ def bench_gaps(options: Options) -> Report:
     return Report({"wrong_m": _WRONG, "drives": results}, _table(results))
 
 
-def evaluated(frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings) -> dict[str, Any]:
-    """What the odometry does after one gap; errors are those of the way from the last pose before it."""
+def evaluated(
+    frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings, warm: int = _WARM
+) -> dict[str, Any]:
+    """What the odometry does after one gap, of which it has had `warm` frames before, at most; errors are those of the
+    way from the last pose before it."""
     odometry = make_odometry(settings)
-    before = [odometry.process(frame) for frame in frames[max(gap.first - _WARM, 0) : gap.first]][-1]
+    before = [odometry.process(frame) for frame in frames[max(gap.first - warm, 0) : gap.first]][-1]
     last, base, errors, states, uncovered = before, np.zeros((6, 6)), [], [], 0
     for i in range(gap.stop, min(gap.stop + _AFTER, len(frames))):
         tracked = odometry.process(measured_on(frames[gap.first : i + 1]) if i == gap.stop else frames[i])

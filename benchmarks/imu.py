@@ -21,7 +21,7 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
-from dpm2_core.sim.simulated_drive import RIDES, Ride, TurningRobot
+from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
@@ -45,6 +45,7 @@ WAYS: dict[str, Callable[[Frame], Frame]] = {
 """Of each frame, what the odometry is given."""
 CAR_FRAMES = 260
 CAR_LIDAR = LidarConfig()
+CAR = Ride(10.0, slows=0.8)  # by up to 2 m/s2
 _OF_PAUSES = ("without", "with")
 
 
@@ -67,7 +68,7 @@ def bench_imu(options: Options) -> Report:
             }
             results[name]["ratio"] = results[name]["with"]["ape_rmse_m"] / results[name]["without"]["ape_rmse_m"]
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
-        car = TurningRobot(build_world("loop", "suburb", 3), CAR_FRAMES, RIDES["car"], CAR_LIDAR, imu)
+        car = TurningRobot(build_world("loop", "suburb", 3), CAR_FRAMES, CAR, CAR_LIDAR, imu)
         frames = list(progress.track(car.frames(), total=CAR_FRAMES, description="car"))
         pauses = {way: _pauses([WAYS[way](frame) for frame in frames], car.poses, settings) for way in _OF_PAUSES}
     known = {"beams": LIDAR.beams, "imu": imu.model_dump(), "lengths_m": LENGTHS}
@@ -76,7 +77,9 @@ def bench_imu(options: Options) -> Report:
 
 def _pauses(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
     """After each of many gaps: how it went, and the error up to 3 s later, over the gaps of each length."""
-    rows = [evaluated(frames, truth, gap, settings) for gap in gaps([frame.stamp for frame in frames])]
+    rows = [
+        evaluated(frames, truth, gap, settings, warm=len(frames)) for gap in gaps([frame.stamp for frame in frames])
+    ]
     found = summary(rows)
     for name, row in found.items():
         errors = [r["error_m"]["last"] for r in rows if name in ("all", f"{r['seconds']:g} s")]

@@ -25,6 +25,7 @@ _STREAM, _IMU_STREAM = 12, 13  # of random numbers, beside those of the other pa
 _STEP = 0.01  # s between two poses of a robot; evenly in between
 _FASTEST = np.radians(100.0)  # rad/s
 _RAMP = 0.25  # s in which it begins to turn
+_CYCLE = 12.0  # s from one speed to the same again
 
 
 class _Simulated(IndexedSource):
@@ -78,11 +79,13 @@ class Ride:
     Attributes:
         speed: m/s, at most. turns: deg, to either side now and then; 0: not.
         shakes: amplitudes (rad and m) and frequencies (Hz) of a sine about and along each axis, x to z.
+        slows: by this share of the speed it brakes and speeds up again every 12 s.
     """
 
     speed: float
     turns: float = 0.0
     shakes: tuple[tuple[float, ...], tuple[float, ...]] = ((0.0,) * 6, (1.0,) * 6)
+    slows: float = 0.0
 
     def shaken(self, times: Array) -> Array:
         """(N, 4, 4) at times (N,), s, as seen from where it would be without shakes; they begin as it sets off."""
@@ -162,11 +165,12 @@ def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator
     times = np.arange(0.0, end + 1, _STEP)
     s, curvature = road.drive.s, np.abs(np.diff(road.drive.yaw) / np.diff(road.drive.s))
     paces = np.minimum(ride.speed, _FASTEST / np.maximum(curvature, 1e-3))
+    parts = _moving(times) * (1 - ride.slows * (1 - np.cos(2 * np.pi * times / _CYCLE)) / 2)
     travelled = np.zeros(len(times))
     for k in range(1, len(times)):
         segment = int(np.searchsorted(s, travelled[k - 1] % road.drive.length, "right")) - 1
         pace = paces[min(segment, len(paces) - 1)]
-        travelled[k] = travelled[k - 1] + _STEP * pace * float(_moving(times[k]))
+        travelled[k] = travelled[k - 1] + _STEP * pace * parts[k]
     rate, k, side = np.zeros(len(times)), round(2.5 / _STEP), 1
     while ride.turns and k < len(times):
         turn = np.radians(ride.turns) * rng.uniform(0.5, 1)
