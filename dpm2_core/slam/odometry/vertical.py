@@ -16,7 +16,7 @@ _WEIGHT = 5.0  # s that a start at rest counts as much as
 _MINUTE = 60.0  # s of which the mean force shows the vertical
 _UNPROVEN = (1.0, 0.3)  # m/s2 that accelerations are off before scans have confirmed any, and after a start at rest
 _STANDS = 0.3  # m/s: what seemed at rest and is faster than forces have made it was on its way, perhaps in a bend
-_LEAST = 0.03  # m/s2 that it is off at least, in the mean over seconds
+_LEAST = 0.06  # m/s2 that it is off at least, in the mean over seconds: a bias that turns with the robot does not show
 _MEMORY = 0.1  # fraction of the newest span in how far the accelerations are off
 
 
