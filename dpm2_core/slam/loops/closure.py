@@ -94,13 +94,19 @@ class LoopCloser:
             return keyframe
 
     def close(
-        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+        self,
+        keyframes: Sequence[Keyframe],
+        clouds: Sequence[Points],
+        poses: Array,
+        parts: NDArray[np.integer],
+        own: NDArray[np.bool_] | None = None,
     ) -> list[Edge]:
         """Try to close loops with the last keyframe.
 
         Args:
             keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
             parts: (N,) the part of the map that each is in: where two of them are to each other is not known.
+            own: (N,) which descriptors are their own: those that borrow look like nothing but the lender. None: all.
 
         Returns:
             Every candidate, accepted or rejected with its reason; and earlier ones of which it took a second to be
@@ -116,7 +122,8 @@ class LoopCloser:
         self._settings, self._verifier = self._ways.suited_to(clouds[node])
         self._consistency.update(poses, parts)
         since = self._path.since(node)
-        tried, proposals = self._proposals(node, since, keyframes, poses)
+        own = np.ones(len(keyframes), np.bool_) if own is None else own
+        tried, proposals = self._proposals(since, keyframes, poses, own)
         if self._by_head:
             return tried + proposals[:1]
         most, failed = self._settings.verified, list[Edge]()
@@ -135,16 +142,17 @@ class LoopCloser:
         return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
 
     def _proposals(
-        self, node: int, since: Array, keyframes: Sequence[Keyframe], poses: Array
+        self, since: Array, keyframes: Sequence[Keyframe], poses: Array, own: NDArray[np.bool_]
     ) -> tuple[list[Edge], list[Edge]]:
         """Candidates that the network rejected, and those for the points to verify, the most likely first."""
-        s, descriptors = self._settings, keyframes[node].descriptors
+        node, s = len(keyframes) - 1, self._settings
+        descriptors = keyframes[node].descriptors
         distance = np.linalg.norm(poses[:, :3, 3] - poses[node, :3, 3], axis=1)
         nearest = None if self._by_head else self._nearest(since, distance)
         rejections: list[Edge] = []
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
-            allowed = since > s.gap
+            allowed = own & (since > s.gap)
             if not self._by_head:  # what the odometry would reject in any case is not asked for
                 allowed &= distance <= _SEEN / descriptors.scale + margin(since, s.consistency)
             similar = self._places.similar(descriptors, allowed, s.candidates)

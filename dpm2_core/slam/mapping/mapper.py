@@ -21,7 +21,7 @@ from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
-from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender
+from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender, to_lender
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
@@ -310,7 +310,7 @@ class Mapper:
 
         `due`: solve it in any case.
         """
-        found = self._closer.close(self.keyframes, self.clouds, self.poses, self.graph.parts)
+        found = self._closer.close(self.keyframes, self.clouds, self.poses, self.graph.parts, self.clouds.own)
         tried = [self._tied(loop) for loop in found]
         self.loops += tried
         self._optimize(due or any(loop.ok for loop in tried))
@@ -318,6 +318,7 @@ class Mapper:
     def _tied(self, loop: Edge) -> Edge:
         """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
         if loop.ok:
+            loop = to_lender(loop, self.clouds.loan)
             try:
                 self.graph.add_loop(loop)
             except Dpm2Error as error:

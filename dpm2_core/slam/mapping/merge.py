@@ -101,7 +101,7 @@ def loops_by(closer: LoopCloser) -> FindLoops:
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             clouds: Sequence[Points] = both.clouds
             end = len(keyframes)
-            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end]):
+            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end], both.clouds.own[:end]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
                     out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out

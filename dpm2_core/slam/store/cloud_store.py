@@ -116,6 +116,13 @@ class CloudStore(LazySequence[Points]):
         """Whose cloud it is, where it is not its own."""
         return self._loans.get(index)
 
+    @property
+    def own(self) -> NDArray[np.bool_]:
+        """(N,) which clouds are of their own keyframe, and not borrowed."""
+        own = np.ones(len(self), np.bool_)
+        own[list(self._loans)] = False
+        return own
+
     def set_moving(self, index: int, moving: NDArray[np.bool_]) -> None:
         """Leave those points (M,) of a cloud out from now on."""
         self._moving[index] = pack_mask(moving)

@@ -42,7 +42,12 @@ class KnownLoops(LoopCloser):
         return keyframe
 
     def close(
-        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+        self,
+        keyframes: Sequence[Keyframe],
+        clouds: Sequence[Points],
+        poses: Array,
+        parts: NDArray[np.integer],
+        own: NDArray[np.bool_] | None = None,
     ) -> list[Edge]:
         node = len(keyframes) - 1
         if node < LAP:
@@ -98,14 +103,19 @@ class OneWrong(KnownLoops):
     """One of its loops is far off, and is accepted all the same."""
 
     def close(
-        self, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array, parts: NDArray[np.integer]
+        self,
+        keyframes: Sequence[Keyframe],
+        clouds: Sequence[Points],
+        poses: Array,
+        parts: NDArray[np.integer],
+        own: NDArray[np.bool_] | None = None,
     ) -> list[Edge]:
         wrong = se3.exp([0, 0, 0.3, 9.0, 0, 0])
         return [
             replace(loop, registration=replace(loop.registration, T_target_source=loop.T_from_to @ wrong))
             if loop.to_node == WRONG
             else loop
-            for loop in super().close(keyframes, clouds, poses, parts)
+            for loop in super().close(keyframes, clouds, poses, parts, own)
         ]
 
 
@@ -149,6 +159,22 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     for keyframe in laps(2):
         off.add(keyframe)
     assert all(off.clouds.loan(node) is None for node in range(40))
+
+
+def test_a_lap_is_tied_to_keyframes_that_have_clouds() -> None:
+    """The search names the lap before, whose keyframes borrow. Where three in ten loops lead from any lap to any other
+    one, a graph of 4000 keyframes, a shift of a robot, takes 9 s to solve; with all tied to the first lap 0.8 s."""
+    mapper, drive = make(), laps(4)
+    for keyframe in drive:
+        mapper.add(keyframe)
+    mapper.finish()
+    tied = [edge for edge in mapper.edges if edge.kind == "loop"]
+    assert len(tied) == 3 * LAP - 9  # of the multiples of 7 from 20 to 79 none
+    assert all(mapper.clouds.loan(edge.from_node) is None for edge in tied)
+    assert sum(edge.from_node < edge.to_node - LAP for edge in tied) > LAP
+    for edge in tied:  # each step of a lap errs by 2 mm
+        off = se3.inverse(drive[edge.from_node].T_odom_kf) @ drive[edge.to_node].T_odom_kf
+        assert se3.magnitude(se3.inverse(off) @ edge.T_from_to)[0] < 0.01
 
 
 def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
