@@ -163,14 +163,22 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
     gt, est = _ordered(gt), _ordered(est)
     if stamped and not (same_stamps(gt.keys, est.keys) and gt.period >= _CLEARLY * est.period):
         return _interpolated(gt, est)
-    rows, apart = _nearest(gt.keys, est.keys)
-    near = apart <= (_SAME_TIME if stamped else 0)
-    if not near.any():
+    est_poses = placed(est, gt.keys)
+    if not np.isfinite(est_poses).any():
         numbers = f"({est.keys[0]}...) is one of the ground truth ({gt.keys[0]}...)"
         raise UsageError(f"no frame number of the estimate {numbers}")
-    est_poses = np.full_like(gt.poses, np.nan)
-    est_poses[rows[near]] = est.poses[near]
     return gt.poses, est_poses, gt.keys
+
+
+def placed(trajectory: Trajectory, keys: Keys) -> Array:
+    """Poses (N, 4, 4) at `keys` (N,), NaN where there is none of that frame number, or of that stamp but for its
+    rounding."""
+    order = np.argsort(keys, kind="stable")
+    rows, apart = _nearest(keys[order], trajectory.keys)
+    near = apart <= (_SAME_TIME if trajectory.kind == "tum" else 0)
+    poses = np.full((len(keys), 4, 4), np.nan)
+    poses[order[rows[near]]] = trajectory.poses[near]
+    return poses
 
 
 def same_stamps(a: Keys, b: Keys) -> bool:

@@ -14,7 +14,16 @@ from dpm2_core.config import load_settings
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span, digest_of
-from dpm2_core.data.trajectory import Keys, Trajectory, interpolate, matched, read_trajectory, same_stamps, write_tum
+from dpm2_core.data.trajectory import (
+    Keys,
+    Trajectory,
+    interpolate,
+    matched,
+    placed,
+    read_trajectory,
+    same_stamps,
+    write_tum,
+)
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
@@ -138,15 +147,16 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
         assert isinstance(whole, np.ndarray)
         return whole
     own_keys = keys.get(found.kind, np.arange(len(truth), dtype=np.int64))
-    if found.kind == "tum" and not same_stamps(own_keys, found.keys):
-        found = Trajectory(interpolate(found.keys, found.poses, own_keys), own_keys, found.kind)
+    if found.kind == "tum":  # may be of some frames alone, such as keyframes: what is between these is not known
+        same = same_stamps(own_keys, found.keys)
+        return placed(found, own_keys) if same else interpolate(found.keys, found.poses, own_keys)
     try:
         _, poses, _ = matched(Trajectory(truth, own_keys, found.kind), found)
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
         raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
-    if found.kind != "tum" and source.T_cam_lidar is not None:
+    if source.T_cam_lidar is not None:
         poses = in_other_frame(poses, se3.inverse(source.T_cam_lidar))
     return poses
 
