@@ -33,9 +33,15 @@ _SAME_FRAME = isotropic(1e-4, 1e-3)  # the rounding of what is the same frame
 
 
 def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:
-    """The map file, for what `mode` says; see `open_session` and `open_for_localization`."""
+    """The map file, for what `mode` says; see `open_session` and `open_for_localization`.
+
+    Raises:
+        UsageError: there is none to extend.
+    """
     if mode == "localize":
         return open_for_localization(path, config.slam)
+    if mode == "extend" and not path.exists():
+        raise UsageError(f"--extend: {path}: no such map file; without --extend this drive begins one")
     return open_session(path, config.slam, dump_settings(config), mode != "create")
 
 

@@ -141,6 +141,7 @@ def test_another_drive_extends_the_map_as_a_session_tied_by_loops(recording: Pat
         (["--localise", "MAP", "--map", "MAP"], "without --map"),
         (["--hint", "1,2,3"], "only with --localise"),
         (["--map", "MAP", "--resume", "--extend"], "not both"),
+        (["--map", "/nowhere.dpm2map", "--extend"], "--extend: /nowhere.dpm2map: no such map file"),
         (["--localise", "NONE"], "no keyframe has descriptors"),
         (["--localise", "OTHER"], "made with weights other 0123"),
     ],
