@@ -128,25 +128,21 @@ def _whiten(T: Array, source: Array, target: Array, L: Array, residual: Array, j
             jacobian[n, j, 3], jacobian[n, j, 4], jacobian[n, j, 5] = p, q, r
 
 
-@compiled("Tuple((f8[:, ::1], f8[::1]))(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], UniTuple(f8, 2))")
-def solve_pose(
-    T: Array, source: Array, target: Array, weight: Array, L: Array, how: tuple[float, float]
-) -> tuple[Array, Array]:
+@compiled("Tuple((f8[:, ::1], f8[::1]))(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1])")
+def solve_pose(T: Array, source: Array, target: Array, weight: Array, L: Array) -> tuple[Array, Array]:
     """`weighted_gauss_newton` of one set of pairs.
 
     Args:
         T: (4, 4) start; it becomes the result. source, target: (N, 3), m; weight: (N,); L: (N, 3, 3): see
             `Correspondences`.
-        how: squared residual from which the weights fall, and how many steps.
 
     Returns:
         Information matrix (6, 6) of xi in T exp(xi) at the last step, and the squared residuals (N,) after it.
     """
-    soft, rounds = how
     n_pairs = len(source)
     residual, jacobian, squared = np.empty((n_pairs, 3)), np.empty((n_pairs, 3, 6)), np.empty(n_pairs)
     information, gradient, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    for _ in range(int(rounds)):
+    for _ in range(ROUNDS):
         _whiten(T, source, target, L, residual, jacobian)
         for i in range(6):
             for j in range(6):
@@ -154,7 +150,7 @@ def solve_pose(
             gradient[i] = 0.0
         for n in range(n_pairs):
             s = residual[n, 0] ** 2 + residual[n, 1] ** 2 + residual[n, 2] ** 2
-            w = weight[n] * ((soft + 3) / (soft + s)) ** 2
+            w = weight[n] * ((SOFT + 3) / (SOFT + s)) ** 2
             for axis in range(3):
                 for i in range(6):
                     weighted = w * jacobian[n, axis, i]

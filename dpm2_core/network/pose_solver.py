@@ -18,7 +18,7 @@ from dpm2_core.geometry.kabsch import weighted_kabsch
 from dpm2_core.geometry.se3_torch import transform
 from dpm2_core.network.consensus import TOLERANCE, alternatives, consensus
 from dpm2_core.network.decoder import Correlated, Decoder
-from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals
+from dpm2_core.network.gauss_newton import solve_pose, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.losses import cosine
 from dpm2_core.network.matching import (
     Correspondences,
@@ -196,10 +196,7 @@ def _solve_compiled(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, 
     poses = T.double().clone()
     fields = (pairs.source, pairs.target, pairs.weight, pairs.L)
     arrays = [np.ascontiguousarray(field.double().numpy()) for field in fields]
-    solved = [
-        solve_pose(pose, source, target, weight, L, (SOFT, float(ROUNDS)))
-        for pose, source, target, weight, L in zip(poses.numpy(), *arrays, strict=True)
-    ]
+    solved = [solve_pose(*row) for row in zip(poses.numpy(), *arrays, strict=True)]
     information, squared = (torch.from_numpy(np.stack(parts)) for parts in zip(*solved, strict=True))
     return poses, information, squared
 

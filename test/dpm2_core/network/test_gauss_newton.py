@@ -8,7 +8,7 @@ import torch
 
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.se3_torch import transform
-from dpm2_core.network.gauss_newton import ROUNDS, SOFT, solve_pose, weighted_gauss_newton, whitened_residuals
+from dpm2_core.network.gauss_newton import solve_pose, weighted_gauss_newton, whitened_residuals
 from dpm2_core.network.matching import Correspondences
 
 PAIRS = 120
@@ -33,7 +33,7 @@ def test_equals_the_solve_in_torch_to_rounding(noise: np.random.Generator) -> No
         T, information = weighted_gauss_newton(start, pairs)
         squared = whitened_residuals(T, pairs)[0].square().sum(-1)
         pose = start[0].numpy().copy()
-        found, residuals = solve_pose(pose, *(field[0].contiguous().numpy() for field in pairs), (SOFT, float(ROUNDS)))
+        found, residuals = solve_pose(pose, *(field[0].contiguous().numpy() for field in pairs))
         np.testing.assert_allclose(pose, T[0].numpy(), atol=1e-9)
         np.testing.assert_allclose(found, information[0].numpy(), rtol=1e-8, atol=1e-6)
         np.testing.assert_allclose(residuals, squared[0].numpy(), rtol=1e-7, atol=1e-7)
@@ -43,7 +43,7 @@ def test_without_weight_the_pose_stays_and_of_nothing_finite_comes_nothing_finit
     pairs, start = noisy(noise)
     arrays = [field[0].contiguous().numpy() for field in pairs]
     pose = start[0].numpy().copy()
-    solve_pose(pose, arrays[0], arrays[1], np.zeros(PAIRS), arrays[3], (SOFT, 8.0))
+    solve_pose(pose, arrays[0], arrays[1], np.zeros(PAIRS), arrays[3])
     np.testing.assert_allclose(pose, start[0].numpy(), atol=1e-12)
-    solve_pose(pose, arrays[0], np.full((PAIRS, 3), np.nan), arrays[2], arrays[3], (SOFT, 8.0))
+    solve_pose(pose, arrays[0], np.full((PAIRS, 3), np.nan), arrays[2], arrays[3])
     assert not np.isfinite(pose).all()
