@@ -30,6 +30,7 @@ from dpm2_core.data.mcap_scan import McapMessage, by_log_time, scanned_messages
 from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import RawMessage
 from dpm2_core.data.rosbag2_folder import STORAGES, check_unpacked, recorded
+from dpm2_core.data.source import note_once
 from dpm2_core.database import check_plain
 from dpm2_core.errors import UsageError, one_line
 
@@ -83,9 +84,8 @@ class Bag:
             if data:
                 yield topic, time, data
                 continue
-            note = f"{self.path}: {topic}: messages that are no {self.types[topic]} of ROS 2 Jazzy are left out"
-            if note not in self.notes:
-                self.notes.append(note)
+            what = f"{self.path}: {topic}: messages that are no {self.types[topic]} of ROS 2 Jazzy are left out"
+            note_once(self.notes, what)
 
     def decode(self, topic: str, data: bytes) -> Any:
         """A message object of rosbags; a Livox CustomMsg as a PointCloud2.

@@ -19,7 +19,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
-from dpm2_core.frame import Array, Camera, Fix, Frame, Image, Inertial, Points, Up
+from dpm2_core.frame import NO_POINTS, Array, Camera, Fix, Frame, Image, Inertial, Points, Up
 from dpm2_core.geometry import se3
 
 _MOST_REPORTED = 20  # damaged data may be damaged in endless ways
@@ -129,7 +129,7 @@ class FrameBuilder:
             points, offset = self._points(cloud)
         except MessageError as error:
             problem = self._tell(topic, error)
-            return Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
+            return Frame(stamp, NO_POINTS, index=index, problem=problem)
         expected = self._settings.time_field is None and not topic.startswith("/kitti/") and len(points)
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)

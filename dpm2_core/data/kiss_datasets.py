@@ -15,7 +15,7 @@ import numpy as np
 
 from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.source import IndexedSource
+from dpm2_core.data.source import IndexedSource, note_once
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Array, Frame
@@ -101,8 +101,6 @@ class KissSource(IndexedSource):
     def _offsets(self, times: Array, count: int) -> Any:
         """(count,) s relative to the end of the sweep; None where the points have no times."""
         if len(times) != count or not count or np.ptp(times) == 0:
-            note = f"{self.path}: no time field: not de-skewed"
-            if note not in self.notes:
-                self.notes.append(note)
+            note_once(self.notes, f"{self.path}: no time field: not de-skewed")
             return None
         return ((times - times.max()) / np.ptp(times) * _SWEEP).astype(np.float32)

@@ -19,7 +19,7 @@ from dpm2_core.data.messages import MessageError, point_cloud
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import NO_POINTS, Array, Frame
 
 # Its dependencies hold rosbags and others at releases that this package cannot use; to read, it needs none of them.
 INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
@@ -75,7 +75,7 @@ class OusterSource:
             except Exception as error:  # damaged files raise several kinds of the package's own
                 problem = f"{self.path}: sweep {index}: {_reason(error)}"
                 self.notes.append(problem)
-                yield Frame(stamp, np.empty((0, 4), np.float32), index=index, problem=problem)
+                yield Frame(stamp, NO_POINTS, index=index, problem=problem)
                 return
             yield self._frames.frame(stamp, point_cloud(columns, stamp, _FRAME), index)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Camera, Image, Points
+from dpm2_core.frame import NO_POINTS, Camera, Image, Points
 
 KITTI, KITTI_RAW = "*/velodyne", "*_drive_*/velodyne_points"
 KITTI_360, KITTI_CARLA = "data_3d_raw/*/velodyne_points", "*/generated/frames"
@@ -26,18 +26,17 @@ def numbered_scans(folder: Path) -> list[Path]:
 
 def read_scan(path: Path) -> tuple[Points, str | None]:
     """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
-    nothing = np.empty((0, 4), np.float32)
     try:
         values, size = np.fromfile(path, "<f4"), path.stat().st_size
     except OSError as error:
-        return nothing, f"{path}: {error.strerror}"
+        return NO_POINTS, f"{path}: {error.strerror}"
     if size % 16:
-        return nothing, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
+        return NO_POINTS, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
     if size % 20 == 0 and _are_rings(values[4::5]) and not _are_rings(values[::5]):
-        return nothing, f"{path}: 5 numbers a point, the last a ring, as nuScenes has them; want 4"
+        return NO_POINTS, f"{path}: 5 numbers a point, the last a ring, as nuScenes has them; want 4"
     points = values.reshape(-1, 4)
     if _are_none(points):
-        return nothing, f"{path}: no places that a LiDAR measures; want 4 float32 a point, x, y, z in m and intensity"
+        return NO_POINTS, f"{path}: no places that a LiDAR measures; want 4 float32 a point, x, y, z in m and intensity"
     return points, None
 
 

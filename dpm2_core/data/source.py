@@ -84,10 +84,10 @@ def frame_at(source: Source, position: int) -> Frame:
     return next(iter(source.frames(position, position + 1)))
 
 
-def note_once(notes: list[str], what: str, detail: str) -> None:
+def note_once(notes: list[str], what: str, detail: str = "") -> None:
     """Add to the notes of a drive what is to be said of it, with a detail, unless it is there with any."""
     if not any(note.startswith(what) for note in notes):
-        notes.append(f"{what} ({detail})")
+        notes.append(f"{what} ({detail})" if detail else what)
 
 
 def digest_of(source: Source) -> str:

@@ -22,7 +22,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import NO_POINTS, Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.registration.texture import Peak, moved_along, peak
 
@@ -58,7 +58,7 @@ class IntensitySearch:
     def __init__(self) -> None:
         self._scans: deque[_Placed] = deque(maxlen=_SCANS)
         self._missed = 0  # scans since the way was known
-        self._searched = _Scan(np.empty((0, 4), np.float32))  # the last one: it is often the next to be remembered
+        self._searched = _Scan(NO_POINTS)  # the last one: it is often the next to be remembered
 
     def update(self, points: Points, T_odom_lidar: Array, tied: bool = True) -> None:
         """A scan (P, 4) that is now at a pose (4, 4); `tied` if its way from those before is known."""
