@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -15,7 +14,7 @@ from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
 from dpm2_core.files import make_folder
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.begun import begin_training
-from dpm2_core.learning.checkpoint import LOG
+from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.tasks.open import open_scans
 from dpm2_core.tasks.slam_figures import figures_of, slam_runs
 from dpm2_core.tasks.task import SlamTaskTraining, task_type
@@ -123,9 +122,7 @@ def folder_name(sequence: str) -> str:
 
 def _logged(folder: Path, epochs: int, gamma: float) -> Figures:
     """The losses of the last epoch of so many, and what the SLAM loss was beside the task's when it first counted."""
-    lines = (folder / LOG).read_text(encoding="utf-8").splitlines()
-    # A training that was stopped may have logged steps twice, and goes on after the last checkpoint.
-    rows = list({row["step"]: row for row in map(json.loads, lines) if "norm" in row}.values())
+    rows = [row for row in read_log(folder) if "norm" in row]
     epoch = max(1, len(rows) // epochs)  # steps of one
     first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch]
     share = [gamma * row["slam_loss"] / row["task_loss"] for row in first]

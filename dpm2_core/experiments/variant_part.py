@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from dpm2_core.data.packed import PackedDrive, packed_digest
 from dpm2_core.experiments.slam_part import open_drive
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.begun import begin_training
-from dpm2_core.learning.checkpoint import LOG
+from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.learning.generate import pack as write_packed_drive
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 from dpm2_core.network.pretrained import weights_path
@@ -71,7 +70,6 @@ def train(
     weights = train_registration(chosen, folder)
     steps = chosen.optimiser.steps
     advance(steps, steps)
-    losses = [json.loads(line).get("loss") for line in (folder / LOG).read_text().splitlines()]
-    last = [loss for loss in losses if loss is not None][-50:]
+    last = [row["loss"] for row in read_log(folder) if row.get("loss") is not None][-50:]
     random = read_metadata(weights).get("random_at_start", "")
     return {"steps": steps, "last_loss": sum(last) / len(last), "random_at_start": random.split(", ") if random else []}

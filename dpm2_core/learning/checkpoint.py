@@ -108,6 +108,11 @@ class Log:
             self.board.close()
 
 
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """What a training has logged, by steps."""
+    return [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
+
+
 def _lines_before(path: Path, start: int) -> list[str]:
     """Of a log, those of steps before `start`; a last line that was cut off is none."""
     if not start or not path.exists():

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from safetensors.torch import load_file
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera
+from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.learning.train_image import ImageDataset, ImageDataSettings, ImageTrainingSettings, shown, train_image
 from dpm2_core.learning.trainer import OptimizerSettings
 from dpm2_core.network.model import DeepPointMap2
@@ -58,7 +58,7 @@ def test_it_changes_the_image_branch_alone(
     stopped(lambda: train_image(settings, tmp_path / "halves"), monkeypatch)
     halves = load_file(train_image(settings, tmp_path / "halves"))
     assert all(torch.equal(whole[name], halves[name]) for name in whole)
-    rows = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    rows = read_log(tmp_path / "whole")
     assert all(np.isfinite(row["loss"]) and 0 <= row["right"] <= 1 for row in rows)
 
 

@@ -27,7 +27,7 @@ from dpm2_core.console import QUIET
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.learning.augment import AugmentSettings
-from dpm2_core.learning.checkpoint import Log, load_checkpoint, save_checkpoint
+from dpm2_core.learning.checkpoint import Log, load_checkpoint, read_log, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
@@ -66,7 +66,7 @@ def settings(packed: Path) -> RegistrationTrainingSettings:
 
 def losses(out: Path) -> dict[int, float]:
     """Logged loss of each step, the last entry of a step counting."""
-    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    rows = read_log(out)
     return {row["step"]: row["loss"] for row in rows if "loss" in row}
 
 
@@ -90,7 +90,7 @@ def test_resumed_equals_uninterrupted(
 def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
     """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
     train_registration(settings, tmp_path / "out")
-    rows = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
+    rows = read_log(tmp_path / "out")
     assert {"pairing", "coarse", "backbone", "image", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
     validations = [row for row in rows if "near_m" in row]
     assert [row["step"] for row in validations] == [1, 3]
@@ -217,7 +217,7 @@ def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         replace(training, validate=validate).run()
     replace(training, module=line(), validate=validate).run()
-    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    rows = read_log(tmp_path)
     assert [(row["step"], row["figure"]) for row in rows if "figure" in row] == [(1, 1.0), (3, 2.0)]
     assert list(losses(tmp_path)) == [0, 1, 2, 3]
 
@@ -481,7 +481,7 @@ def test_a_log_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
     log = Log(tmp_path, start=2)
     log.write(2, {"loss": 0.25})
     log.close()
-    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    lines = read_log(tmp_path)
     assert [(line["step"], line["loss"]) for line in lines] == [(0, 0.5), (1, 0.5), (2, 0.25)]
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ from torch.distributions import Normal, kl_divergence
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
-from dpm2_core.learning.checkpoint import WEIGHTS
+from dpm2_core.learning.checkpoint import WEIGHTS, read_log
 from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.tasks.ae_lidar import AeLidarSettings, LidarAutoencoder
 from dpm2_core.tasks.ae_lidar_task import AeLidarTask, AeLidarTraining
@@ -95,7 +94,7 @@ def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool
     scans = open_scans(pairs)
     settings = training(network=network(variational=variational), slam=ScheduleSettings(gamma=1.0, every=5))
     task = train_task(new_task("ae_lidar", settings), scans, tmp_path)
-    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    log = read_log(tmp_path)
     assert log[-1]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [8, 9, 18, 19]
     figures = measure(task, scans)

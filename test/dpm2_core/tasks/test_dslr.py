@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from torch import nn
 
 from dpm2_core.diffslam import ScheduleSettings, SlamLossSettings
 from dpm2_core.errors import UsageError
-from dpm2_core.learning.checkpoint import WEIGHTS
+from dpm2_core.learning.checkpoint import WEIGHTS, read_log
 from dpm2_core.network.perception.dslr import Dslr, DslrSettings, PairDiscriminator, RangeDecoder, RangeEncoder, load
 from dpm2_core.network.perception.range_image import RangeImageSettings
 from dpm2_core.network.weights import read_tensors
@@ -141,7 +140,7 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
     )
     scans = open_scans(pairs)
     task = train_task(new_task("dslr", settings), scans, tmp_path / "whole")
-    log = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    log = read_log(tmp_path / "whole")
     assert log[51]["task_loss"] < 0.5 * log[0]["task_loss"]
     assert [row["step"] for row in log if row.get("slam_loss") is not None] == [76, 77, 78, 79]
     train_task(new_task("dslr", settings), scans, tmp_path / "parts", until=18)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 
 from dpm2_core.diffslam import SlamLoss
 from dpm2_core.errors import UsageError
-from dpm2_core.learning.checkpoint import WEIGHTS
+from dpm2_core.learning.checkpoint import WEIGHTS, read_log
 from dpm2_core.network.perception import dslr, dynamic_objects, gndnet
 from dpm2_core.tasks.ground_task import GroundTask, GroundTraining
 from dpm2_core.tasks.open import open_scans
@@ -51,17 +50,12 @@ def scans(write_drive: Callable[..., Path], tmp_path: Path) -> TaskScans:
     return open_scans(write_drive(tmp_path / "drive"))
 
 
-def rows(out: Path) -> list[dict[str, Any]]:
-    """The log."""
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-
-
 @pytest.mark.slow
 def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
     """The loss of the task falls by half in 40 steps; both losses are logged, that of the SLAM where it counts."""
     out = tmp_path / "out"
     train_task(new_task("gndnet", settings(epochs=20)), scans, out, val=scans)
-    log = rows(out)
+    log = read_log(out)
     steps = [row for row in log if "norm" in row]
     assert [row["step"] for row in steps] == list(range(40))
     losses = [row["task_loss"] for row in steps]
@@ -110,9 +104,9 @@ def test_resumed_equals_uninterrupted(scans: TaskScans, tmp_path: Path, placebo:
     chosen = settings(slam_loss={"points": 300, "placebo": placebo})
     train_task(new_task("gndnet", chosen), scans, whole)
     train_task(new_task("gndnet", chosen), scans, halves, until=2)
-    assert len(rows(halves)) == 4
+    assert len(read_log(halves)) == 4
     train_task(new_task("gndnet", chosen), scans, halves)
-    curve = [[(row["step"], row["loss"], row["norm"]) for row in rows(out)] for out in (whole, halves)]
+    curve = [[(row["step"], row["loss"], row["norm"]) for row in read_log(out)] for out in (whole, halves)]
     assert curve[0] == curve[1]
     one, other = (load_file(out / WEIGHTS) for out in (whole, halves))
     assert all(torch.equal(one[name], other[name]) for name in one)
@@ -122,7 +116,7 @@ def test_gamma_zero_is_the_task_alone(scans: TaskScans, tmp_path: Path, monkeypa
     """The SLAM is not even run."""
     monkeypatch.setattr(SlamLoss, "forward", None)
     train_task(new_task("gndnet", settings(slam={"gamma": 0.0, "every": 1})), scans, tmp_path / "out")
-    assert not any("slam_loss" in row for row in rows(tmp_path / "out"))
+    assert not any("slam_loss" in row for row in read_log(tmp_path / "out"))
 
 
 @pytest.mark.slow
@@ -151,8 +145,8 @@ def test_what_is_not_finite_never_reaches_a_checkpoint(
     monkeypatch.setattr(GroundTask, "losses", losses)
     out = tmp_path / "out"
     train_task(new_task("gndnet", settings()), scans, out)
-    assert [row["step"] for row in rows(out) if row["norm"] is None] == [3]
-    assert all(row["loss"] is not None for row in rows(out) if row["step"] > 3)
+    assert [row["step"] for row in read_log(out) if row["norm"] is None] == [3]
+    assert all(row["loss"] is not None for row in read_log(out) if row["step"] > 3)
     state = torch.load(out / "checkpoint.pt", weights_only=True)
     stored = [*state["module"].values(), *state["ema"].values(), *load_file(out / WEIGHTS).values()]
     moments = [v for values in state["optimiser"]["state"].values() for v in values.values()]
