@@ -82,7 +82,7 @@ def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tu
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import input_settings
     from dpm2_core.data.trajectory import Trajectory
-    from dpm2_core.evaluation.ground_truth import in_other_frame
+    from dpm2_core.evaluation.ground_truth import camera_poses
     from dpm2_core.evaluation.kitti_metric import known
 
     source = open_source(path, input_settings([*settings, "input.images=false"]))
@@ -91,7 +91,7 @@ def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tu
     if not known(source.poses).any():
         raise UsageError(f"{path}: no frame has a pose; {'; '.join(source.notes)}")
     camera = None if lidar else source.T_cam_lidar
-    poses = source.poses if camera is None else in_other_frame(source.poses, camera)
+    poses = camera_poses(source.poses, camera)
     sensor = "LiDAR" if camera is None else "left camera"
     if stamped:
         stamps = getattr(source, "stamps", None)  # some sources have them with their frames alone

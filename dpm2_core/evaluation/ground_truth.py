@@ -40,7 +40,7 @@ def read_ground_truth(source: Source, path: Path | str | None, start: int, stop:
         poses = truth.poses[numbers]
     else:
         poses = truth.poses[start:stop]
-    return poses if source.T_cam_lidar is None else in_other_frame(poses, se3.inverse(source.T_cam_lidar))
+    return lidar_poses(poses, source.T_cam_lidar)
 
 
 def _check_overlap(truth: Trajectory, path: Path | str, source: Source, start: int, stop: int) -> None:
@@ -77,12 +77,19 @@ def truth_by_stamp(
         return truth.keys[during].tolist(), truth.poses[during]
     at = dict(zip(index, stamps, strict=True))
     found = [i for i, key in enumerate(truth.keys.tolist()) if key in at]
-    poses = truth.poses[found]
-    if T_cam_lidar is not None:
-        poses = in_other_frame(poses, se3.inverse(T_cam_lidar))
-    return [at[int(truth.keys[i])] for i in found], poses
+    return [at[int(truth.keys[i])] for i in found], lidar_poses(truth.poses[found], T_cam_lidar)
 
 
-def in_other_frame(poses: Array, T_other_sensor: Array) -> Array:
+def camera_poses(poses: Array, T_cam_lidar: Array | None) -> Array:
+    """Of LiDAR poses (N, 4, 4) those of the left camera, as KITTI has them; the same where its place is not known."""
+    return poses if T_cam_lidar is None else _in_other_frame(poses, T_cam_lidar)
+
+
+def lidar_poses(poses: Array, T_cam_lidar: Array | None) -> Array:
+    """The poses of the LiDAR, given those that `camera_poses` would make of them."""
+    return poses if T_cam_lidar is None else _in_other_frame(poses, se3.inverse(T_cam_lidar))
+
+
+def _in_other_frame(poses: Array, T_other_sensor: Array) -> Array:
     """Poses of one sensor as those of another that is rigidly mounted to it."""
     return T_other_sensor @ poses @ se3.inverse(T_other_sensor)

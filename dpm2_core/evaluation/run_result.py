@@ -18,7 +18,7 @@ from dpm2_core.data.trajectory import Keys, Trajectory, matched, write_kitti, wr
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import OdometryResult
 from dpm2_core.evaluation.figures import trajectory_png
-from dpm2_core.evaluation.ground_truth import in_other_frame, truth_by_stamp
+from dpm2_core.evaluation.ground_truth import camera_poses, truth_by_stamp
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import (
@@ -124,7 +124,7 @@ class Result:
     @property
     def sensor_poses(self) -> Array:
         """(N, 4, 4) of the left camera, as KITTI has them; of the LiDAR where the calibration is not known."""
-        return self.poses if self.source.T_cam_lidar is None else in_other_frame(self.poses, self.source.T_cam_lidar)
+        return camera_poses(self.poses, self.source.T_cam_lidar)
 
     @property
     def connected(self) -> bool:
@@ -174,7 +174,7 @@ class Result:
             if known(truth).sum() < 2:
                 return None
             poses = self.sensor_poses
-            truth = truth if self.source.T_cam_lidar is None else in_other_frame(truth, self.source.T_cam_lidar)
+            truth = camera_poses(truth, self.source.T_cam_lidar)
         metrics = evaluate(truth, poses, self.lengths, stamps=stamps, failed_frames=self.methods["failed"])
         own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)

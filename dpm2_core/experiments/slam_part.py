@@ -25,7 +25,7 @@ from dpm2_core.data.trajectory import (
     write_tum,
 )
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.evaluation.ground_truth import in_other_frame, read_ground_truth
+from dpm2_core.evaluation.ground_truth import camera_poses, lidar_poses, read_ground_truth
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.evaluation.metrics import Metrics, evaluate
@@ -34,7 +34,6 @@ from dpm2_core.experiments.peers import make_peer
 from dpm2_core.files import write_json
 from dpm2_core.fleet.part import Advance, Figures, counted
 from dpm2_core.frame import Array
-from dpm2_core.geometry import se3
 from dpm2_core.pipeline import OfflineRun, open_recording, span_of
 from dpm2_core.slam.settings import Config
 
@@ -156,9 +155,7 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
         raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
-    if source.T_cam_lidar is not None:
-        poses = in_other_frame(poses, se3.inverse(source.T_cam_lidar))
-    return poses
+    return lidar_poses(poses, source.T_cam_lidar)
 
 
 def _truth(source: Source, start: int, stop: int) -> Array:
@@ -172,9 +169,8 @@ def _measured(
 ) -> Figures:
     """Figures of stamps (N,) ns, true and estimated poses (N, 4, 4) of the LiDAR; of KITTI's left camera where its
     place is known."""
-    stamps, truth, est = poses
-    if source.T_cam_lidar is not None:
-        truth, est = in_other_frame(truth, source.T_cam_lidar), in_other_frame(est, source.T_cam_lidar)
+    stamps, *both = poses
+    truth, est = (camera_poses(each, source.T_cam_lidar) for each in both)
     metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), stamps=np.asarray(stamps, np.int64))
     metrics = metrics.model_copy(update={"truth": source.truth, "fps": fps})
     write_json(folder / METRICS, metrics.model_dump())
