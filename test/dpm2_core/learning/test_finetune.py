@@ -36,6 +36,9 @@ from ...helpers.training import stopped
 GEOMETRIC = SlamSettings(registration="geometric", loops={"descriptors": False}, threads=1)  # type: ignore[arg-type]
 """A reference by points alone: what is made of it is the same as by the network, which takes most of the time."""
 
+GEOMETRIC = SlamSettings(registration="geometric", loops={"descriptors": False}, threads=1)  # type: ignore[arg-type]
+"""A reference by points alone: what is made of it is the same as by the network, which takes most of the time."""
+
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
     """Tokens of G * F scans of the same 60 places, each with its own feature in every scan; poses (G, F, 4, 4)."""
