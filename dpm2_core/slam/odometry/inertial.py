@@ -14,7 +14,7 @@ the accelerations are off is what the scans say differently, too.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,20 @@ _SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
 _SHAKEN = 0.6  # m/s2 that accelerations may be off, to lead anywhere
 _AT_REST, _FEWEST = 1_000_000_000, 5  # ns of samples that show it, and so many at least
 _FOLLOWS = np.radians(0.02)  # rad for each m or s: so fast is the frame turned
+
+
+@dataclass(frozen=True, eq=False)
+class Reckoned(Step):
+    """A step by dead reckoning.
+
+    Attributes:
+        gained: (2, 3) by how much it is longer, m, and faster in the end, m/s, than at the velocity of the beginning,
+            along the axes there.
+        sigma: standard deviation of its accelerations, m/s2.
+    """
+
+    gained: Array
+    sigma: float
 
 
 class InertialMotion:
@@ -110,7 +124,7 @@ class InertialMotion:
         of_turn = _TURN**2 + (_SHARE * angle) ** 2
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
-    def step(self, R: Array, velocity: Array, of_velocity: Array) -> Step | None:
+    def step(self, R: Array, velocity: Array, of_velocity: Array) -> Reckoned | None:
         """The way since the last registered frame, from its velocity on by turns and forces; None where it is unknown.
 
         Args:
@@ -127,18 +141,21 @@ class InertialMotion:
         if found is None or of_turn is None:
             return None
         at, found = np.r_[0.0, at, seconds], np.r_[found[:1], found, found[-1:]]
-        way = velocity * seconds + R.T @ np.trapezoid((seconds - at)[:, None] * found, at, axis=0)
-        along = of_velocity * seconds**2 + (0.5 * self._vertical.sigma * seconds**2) ** 2 * np.eye(3)
+        farther, faster = (np.trapezoid(a, at, axis=0) for a in ((seconds - at)[:, None] * found, found))
+        gained, sigma = np.stack([farther, faster]) @ R, self._vertical.sigma
+        way = velocity * seconds + gained[0]
+        along = of_velocity * seconds**2 + (0.5 * sigma * seconds**2) ** 2 * np.eye(3)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = of_turn
         covariance[3:, 3:] = self.turn.T @ along @ self.turn + 0.25 * (way @ way) * of_turn
-        return Step(se3.make(self.turn, way), covariance)
+        return Reckoned(se3.make(self.turn, way), covariance, gained, sigma)
 
-    def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None) -> None:
+    def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None, led: bool = False) -> None:
         """A frame was registered at T (4, 4), the last one at T_before.
 
         Args:
             twist: (6,) [rad/s, m/s] the motion between the two; None: nothing is known of it, T begins a map.
+            led: its velocity is that of `step`, in part.
         """
         measured, before, self._before, self.turns = self._measured, self._before, stamp, False
         if before is None and twist is None:
@@ -154,7 +171,7 @@ class InertialMotion:
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
         forces = self._forces(before, stamp)[1]
-        if not len(forces) or self._doubt > _CREDIBLE:
+        if not len(forces) or self._doubt > _CREDIBLE or led:
             self._vertical.pause()
             return
         self._vertical.add(T_before[:3, :3] @ forces.mean(0), T[:3, :3] @ twist[3:], seconds)

@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Up
+from dpm2_core.frame import Array, Frame, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open
 from dpm2_core.geometry.turning import leveled
-from dpm2_core.slam.odometry.inertial import InertialMotion
+from dpm2_core.slam.odometry.inertial import InertialMotion, Reckoned
+from dpm2_core.slam.odometry.open_way import OpenWay
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.registration.swept import Beginning, Swept, begun_steadily
@@ -38,7 +41,8 @@ class MotionState:
         of_velocity: covariance (3, 3) of the twist's velocity, m/s.
         left_open: covariance (3, 3), m, of the last step along what the scene leaves open; zeros if that is nothing.
         T_registered, seconds: the last registered pose (4, 4), and the time from then to the last frame.
-        inertial: the IMU, since a frame came with samples. other: another odometry, since a frame came with a guess.
+        inertial: the IMU, since a frame came with samples. reckoned: the way to the frame that is looked at, if it
+            knows that. other: another odometry, since a frame came with a guess.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
@@ -50,6 +54,8 @@ class MotionState:
         self.of_velocity, self.left_open = ANY_VELOCITY, np.zeros((3, 3))
         self.T_registered, self.seconds = np.eye(4), 0.0
         self.inertial: InertialMotion | None = None
+        self.reckoned: Reckoned | None = None
+        self._open_way: OpenWay | None = None
         self.other: OtherMotion | None = None
         self._open = 0.0  # s, for which the scene has left a direction open
         self._started = False
@@ -61,9 +67,23 @@ class MotionState:
             self.T = self.T_registered = se3.make(leveled(up), np.zeros(3))
         self._started = True
 
+    def look(self, frame: Frame, starts: bool) -> Frame:
+        """Take in what an IMU says of a new frame, and return that as `InertialMotion.look`; `starts`: the drive begins
+        with it."""
+        if frame.imu is not None and self.inertial is None:
+            self.inertial = InertialMotion(starts)
+        self.reckoned = None
+        if self.inertial is None:
+            return frame
+        frame = self.inertial.look(frame)
+        if self.twist is not None:
+            self.reckoned = self.inertial.step(self.T_registered[:3, :3], self.twist[3:], self.of_velocity)
+        return frame
+
     def begin(self, T: Array) -> None:
         """A map begins at T (4, 4), to which no motion has led."""
-        self.T, self.twist, self.sweep, self.of_velocity = T, None, None, ANY_VELOCITY
+        self.T, self.twist, self.sweep, self.of_velocity, self.reckoned = T, None, None, ANY_VELOCITY, None
+        self._open_way = None
 
     @property
     def known_twist(self) -> Array:
@@ -99,13 +119,7 @@ class MotionState:
     def step(self) -> Step | None:
         """The way since the last registered frame, as another odometry or else an IMU knows it."""
         step = None if self.other is None else self.other.step
-        return self._inertial_step if step is None else step
-
-    @property
-    def _inertial_step(self) -> Step | None:
-        if self.inertial is None or self.twist is None:
-            return None
-        return self.inertial.step(self.T_registered[:3, :3], self.twist[3:], self.of_velocity)
+        return self.reckoned if step is None else step
 
     def turned(self, twist: Array, seconds: float) -> Array:
         """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
@@ -115,8 +129,7 @@ class MotionState:
 
     def predicted(self, twist: Array, dt: float) -> Array:
         """Pose (4, 4) of a frame, `dt` s after the one before; where an IMU knows the way, that has led there."""
-        step = self._inertial_step
-        return self.steadily(twist, dt) if step is None else self.T_registered @ step.T
+        return self.steadily(twist, dt) if self.reckoned is None else self.T_registered @ self.reckoned.T
 
     def steadily(self, twist: Array, dt: float) -> Array:
         """The same at a constant velocity; from the last registered frame where an IMU has measured how the LiDAR
@@ -174,9 +187,12 @@ class MotionState:
             swept: the motion during its sweep, where that is known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
+        by_imu = self._along_open(registration, seconds) if moved and not led else None
+        if by_imu is not None:
+            registration, swept = _led_along_open(registration, swept, *by_imu)
         if moved:
             self._move(registration, seconds, led, swept)
-        self.register(registration, stamp, moved)
+        self.register(registration, stamp, moved, led=by_imu is not None)
         self.sweep = swept
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
         self.left_open = np.zeros((3, 3))
@@ -185,6 +201,18 @@ class MotionState:
             of_velocity = along_open(registration.of_scene[3:, 3:], self.of_velocity)
             self.covariance[3:, 3:] += of_velocity * self._open**2
             self.left_open = of_velocity * seconds**2
+
+    def _along_open(self, registration: Registration, seconds: float) -> tuple[Array, Array] | None:
+        """Where the scene leaves a direction open and an IMU contradicts the scan there: how far (3,) m it leads, and
+        at which velocity (3,) m/s, along the axes of the odometry."""
+        if self.reckoned is None or registration.worst_sigma < OPEN:
+            self._open_way = None
+            return None
+        if self._open_way is None:
+            self._open_way = OpenWay(self.T_registered, self.known_twist[3:])
+        along = along_open(registration.of_scene[3:, 3:], np.eye(3))
+        off = self._open_way.follow(self.T_registered, registration.T_target_source, along, self.reckoned, seconds)
+        return (off, self._open_way.velocity) if self._open_way.leads else None
 
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""
@@ -214,12 +242,15 @@ class MotionState:
         along[3:, 3:] = R.T @ np.diag([_ASIDE, _ASIDE, _UP]) ** 2 @ R
         self.covariance = self.covariance + along
 
-    def register(self, registration: Registration, stamp: int | None, moved: bool) -> None:
-        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way."""
+    def register(self, registration: Registration, stamp: int | None, moved: bool, led: bool = False) -> None:
+        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way; `led`: an IMU
+        did, along what the scene leaves open."""
         T_before, self.T = self.T_registered, registration.T_target_source
+        if not moved:
+            self._open_way = None
         if self.inertial is not None and stamp is not None:
-            self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None)
-        self.T_registered, self.seconds, self.sweep = self.T, 0.0, None
+            self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None, led)
+        self.T_registered, self.seconds, self.sweep, self.reckoned = self.T, 0.0, None, None
         if self.other is not None:
             self.other.keep()
         self.covariance = registration.covariance.copy()
@@ -232,3 +263,17 @@ class MotionState:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
             self.T = predicted(self.T_registered, self.ahead, self.seconds, self.turning)
+
+
+def _led_along_open(
+    registration: Registration, swept: Swept | None, off: Array, velocity: Array
+) -> tuple[Registration, Swept | None]:
+    """A registration moved by (3,) m, and the motion during its sweep at a velocity (3,) m/s along what the scene
+    leaves open; both along the axes of the odometry."""
+    T = registration.T_target_source.copy()
+    T[:3, 3] += off
+    if swept is not None:
+        along, motion = along_open(registration.of_scene[3:, 3:], np.eye(3)), swept.motion.copy()
+        motion[0, 3:] += along @ (T[:3, :3].T @ velocity - motion[0, 3:])
+        swept = replace(swept, T=T, motion=motion)
+    return replace(registration, T_target_source=T), swept

@@ -19,7 +19,6 @@ from dpm2_core.geometry.motion import period_by_motion
 from dpm2_core.geometry.scale import is_enclosed
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.odometry.bridge import Bridge, Limits
-from dpm2_core.slam.odometry.inertial import InertialMotion
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.other import OtherMotion
@@ -173,13 +172,13 @@ class Odometry:
         match, dt = self._register(frame, scan, T_predicted, dt)
         self._clock.correct(dt)
         if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
-            frame = replace(frame, imu=None)
+            frame, self._motion.reckoned = replace(frame, imu=None), None
         match, motion = self._unbent(frame, match, twist, dt), self._motion
         known = motion.twist is not None and match.result.method not in ("none", "first")
         if known and motion.turn is not None and not match.result.ok:
             again = self._matcher.again_without_imu(frame, dt, self._sweep.span / 2)
             if again.result.ok:
-                frame, match = replace(frame, imu=None), again
+                frame, match, motion.reckoned = replace(frame, imu=None), again, None
         return frame, match, dt
 
     def _look(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
@@ -187,11 +186,8 @@ class Odometry:
         is of use, and the twist (6,) that leads to it."""
         motion = self._motion
         twist = motion.ahead
-        if frame.imu is not None and motion.inertial is None:
-            motion.inertial = InertialMotion(not len(self._registration) and self._bridge is None)
-        if motion.inertial is not None:
-            frame = motion.inertial.look(frame)
-            twist = motion.turned(twist, seconds)
+        frame = motion.look(frame, starts=not len(self._registration) and self._bridge is None)
+        twist = motion.turned(twist, seconds)
         frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])))
         if frame.guess is not None and motion.other is None:
             motion.other = OtherMotion(self._settings.steadiness)

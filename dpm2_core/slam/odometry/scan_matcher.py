@@ -108,7 +108,8 @@ class ScanMatcher:
         """A frame that fits nowhere with its IMU, matched and straightened as if there were none: after a wrong turn
         the points of the sweep do not show how a turn begins."""
         motion = copy(self.motion)
-        motion.inertial, motion.T = None, predicted(motion.T_registered, motion.ahead, motion.seconds)
+        motion.inertial, motion.reckoned = None, None
+        motion.T = predicted(motion.T_registered, motion.ahead, motion.seconds)
         frame, twist, matcher = replace(frame, imu=None), motion.ahead, replace(self, motion=motion)
         match = matcher._alone(frame, self.registration.prepare(frame, twist), motion.predicted(twist, dt), dt)
         return matcher.straightened(frame, match, twist, dt, half)
