@@ -38,6 +38,7 @@ _RIVALS = 4.0  # m: at least so far, for other places that may fit as well
 _FARTHEST, _WIDEST = 12.0, 0.6  # m and rad: no farther
 _STEP, _TURN = 1.0, 0.07  # m and rad between two starts: the points find their place from within
 _SWAY = 0.05  # rad/s
+_EXCLUDED = 16.0  # squared sigmas of the way that an IMU knows
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class Bridge:
         if imu is not None:
             self._turning, of_turn = imu.turning, imu.covariance(seconds)
             step = None if self.twist is None else imu.step(self._T[:3, :3], self.twist[3:], self._of_velocity)
-        self._ways = [] if T_other is None else [T_other]
-        self._ways += [] if step is None else [self._T @ step.T]
+        self._by_imu = None if step is None else replace(step, T=self._T @ step.T)
+        self._ways = [way for way in (T_other, None if self._by_imu is None else self._by_imu.T) if way is not None]
         self._T_begin = self._ways[0] if self._ways else predicted(self._T, self._motion, seconds, self._turning)
         if T_other is None and step is not None:
             self._of_begin = step.covariance
@@ -196,6 +197,10 @@ class Bridge:
 
     def _impossible(self, T_begin: Array) -> str:
         """Why a vehicle cannot have come to T_begin (4, 4) in the pause; empty if it can."""
+        if self._by_imu is not None:
+            xi, of_way = se3.way(self._by_imu.T, T_begin)[3:], self._by_imu.covariance[3:, 3:]
+            if xi @ np.linalg.solve(of_way, xi) > _EXCLUDED:
+                return f"after a pause: {np.linalg.norm(xi):.0f} m from where the IMU leads"
         if self._after is None or self.twist is None:
             return ""
         # Between two known velocities, with a bounded acceleration, nothing is farther from their mean times the time.
