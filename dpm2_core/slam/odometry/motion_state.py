@@ -187,7 +187,7 @@ class MotionState:
             swept: the motion during its sweep, where that is known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
-        by_imu = self._along_open(registration, seconds) if moved and not led else None
+        by_imu = self._along_open(registration, seconds, led) if moved else None
         if by_imu is not None:
             registration, swept = _led_along_open(registration, swept, *by_imu)
         if moved:
@@ -202,10 +202,10 @@ class MotionState:
             self.covariance[3:, 3:] += of_velocity * self._open**2
             self.left_open = of_velocity * seconds**2
 
-    def _along_open(self, registration: Registration, seconds: float) -> tuple[Array, Array] | None:
+    def _along_open(self, registration: Registration, seconds: float, led: bool) -> tuple[Array, Array] | None:
         """Where the scene leaves a direction open and an IMU contradicts the scan there: how far (3,) m it leads, and
         at which velocity (3,) m/s, along the axes of the odometry."""
-        if self.reckoned is None or registration.worst_sigma < OPEN:
+        if led or self.reckoned is None or registration.worst_sigma < OPEN:
             self._open_way = None
             return None
         if self._open_way is None:
