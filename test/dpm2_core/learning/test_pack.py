@@ -108,9 +108,9 @@ def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -
 def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
     """Undistorted by the true motion, the points of all frames are the same in the world; no pose, no sample."""
     world = boxes(np.random.default_rng(0), 1000)
-    seen: list[int] = []
-    assert pack(Sweeps(world), tmp_path / "d", tiny(), advance=lambda: seen.append(1)) == 5
-    assert len(seen) == 6
+    seen: list[tuple[int, int]] = []
+    assert pack(Sweeps(world), tmp_path / "d", tiny(), progress=lambda *done: seen.append(done)) == 5
+    assert seen == [(n, 6) for n in range(1, 7)]
     drive = PackedDrive(tmp_path / "d")
     height, width = tiny().image.size
     for n in range(5):
