@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from typing import NamedTuple
 
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import part_beside
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_file import copy_with_log, remove_map
 
@@ -33,24 +35,41 @@ class MapConnection(NamedTuple):
 
 
 def create_map(path: Path) -> MapConnection:
-    """Make a new, empty map file, and open it to write.
+    """Make a new, empty map file, and open it to write. A kill on the way leaves no file of that name.
 
     Raises:
         UsageError: there is a file already. Dpm2Error: it cannot be made.
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        target = path.resolve()  # a symbolic link stays one
+        part = part_beside(target)
         try:
-            path.touch(exist_ok=False)  # of two programs that want the same name, one gets it
+            part.touch()
+            with closing(_connect(part, "rw")) as sql:
+                schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+            _named_anew(part, target)
         except FileExistsError:
             raise UsageError(f"{path}: there is a file already") from None
-        try:
-            with closing(_connect(path, "rw")) as sql:
-                schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
-            return open_map(path, read_only=False)
-        except BaseException:
-            remove_map(path)  # what is no map yet would be in the way of the next one
-            raise
+        finally:
+            remove_map(part)
+        return open_map(path, read_only=False)
+
+
+def _named_anew(part: Path, target: Path) -> None:
+    """Give a file its name; of two programs that want the same one, one gets it.
+
+    Raises:
+        FileExistsError: there is a file already.
+    """
+    try:
+        os.link(part, target)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links, as of memory cards
+        if target.exists():
+            raise FileExistsError from None
+        part.rename(target)
 
 
 def open_map(path: Path, read_only: bool) -> MapConnection:

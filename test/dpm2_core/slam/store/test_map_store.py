@@ -242,6 +242,57 @@ def test_what_is_no_map_is_rejected_in_one_line(tmp_path: Path, map_file: Path) 
         MapStore.create(text)
 
 
+_KILLED_AT_THE_START = """
+import os, signal, sys
+from pathlib import Path
+from dpm2_core.slam.store import schema
+from dpm2_core.slam.store.map_store import MapStore
+create = schema.create
+def killed(sql):
+    sql.execute("BEGIN")
+    sql.execute("CREATE TABLE t (x)")
+    os.kill(os.getpid(), signal.SIGKILL)
+schema.create = killed
+MapStore.create(Path(sys.argv[1]))
+"""
+
+
+def test_a_kill_while_a_map_is_made_leaves_no_file_of_its_name(tmp_path: Path) -> None:
+    """A robot that is switched off then would find "not a dpm2 map" there for ever."""
+    path = tmp_path / "map"
+    done = subprocess.run([sys.executable, "-c", _KILLED_AT_THE_START, str(path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not path.exists()
+    MapStore.create(path).close()
+    assert check_map(path).problems == []
+    assert [file.name for file in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.mark.parametrize("error", [None, PermissionError(1, "Operation not permitted")], ids=["links", "no links"])
+def test_of_two_programs_that_make_a_map_of_one_name_one_gets_it(
+    tmp_path: Path, error: OSError | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other program comes between; also on a file system without hard links."""
+    path, link = tmp_path / "map", os.link
+
+    def late(source: Path, target: Path) -> None:
+        path.write_bytes(b"the other's")
+        if error is not None:
+            raise error
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", late)
+    with pytest.raises(UsageError, match="there is a file already"):
+        MapStore.create(path)
+    assert path.read_bytes() == b"the other's"
+    path.unlink()
+    monkeypatch.setattr(
+        os, "link", lambda source, target: (_ for _ in ()).throw(error) if error else link(source, target)
+    )
+    MapStore.create(path).close()
+    assert check_map(path).problems == []
+
+
 def test_two_writers(map_file: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     with closing(sqlite3.connect(map_file)) as one, MapStore.open(map_file, read_only=False) as two:
