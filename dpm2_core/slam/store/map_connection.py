@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 from dpm2_core.database import Connection, connect
@@ -20,6 +21,7 @@ from dpm2_core.slam.store.map_file import copy_with_log, remove_map
 BUSY = 5.0
 """s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
 _HEAD = b"SQLite format 3"
+_MAKING = Lock()  # `part_beside` is one file for the whole process
 
 
 class MapConnection(NamedTuple):
@@ -42,18 +44,27 @@ def create_map(path: Path) -> MapConnection:
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        target = path.resolve()  # a symbolic link stays one
-        part = part_beside(target)
+        with _MAKING:
+            _make(path)
         try:
-            part.touch()
-            with closing(_connect(part, "rw")) as sql:
-                schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
-            _named_anew(part, target)
-        except FileExistsError:
-            raise UsageError(f"{path}: there is a file already") from None
-        finally:
-            remove_map(part)
-        return open_map(path, read_only=False)
+            return open_map(path, read_only=False)
+        except BaseException:
+            remove_map(path)  # as on a full disk: it would be in the way of the next one
+            raise
+
+
+def _make(path: Path) -> None:
+    target = path.resolve()  # a symbolic link stays one
+    part = part_beside(target)
+    try:
+        part.touch()
+        with closing(_connect(part, "rw")) as sql:
+            schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+        _named_anew(part, target)
+    except FileExistsError:
+        raise UsageError(f"{path}: there is a file already") from None
+    finally:
+        remove_map(part)
 
 
 def _named_anew(part: Path, target: Path) -> None:
