@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -14,9 +13,9 @@ from typing import NamedTuple
 
 from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import part_beside
+from dpm2_core.files import named, part_beside
 from dpm2_core.slam.store import schema
-from dpm2_core.slam.store.map_file import copy_with_log, remove_map
+from dpm2_core.slam.store.map_file import copy_with_log, name_map, remove_map
 
 BUSY = 5.0
 """s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
@@ -44,8 +43,9 @@ def create_map(path: Path) -> MapConnection:
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _MAKING:
-            _make(path)
+        target = path.resolve()  # a symbolic link stays one
+        with _MAKING, named(path, target):
+            _make(target)
         try:
             return open_map(path, read_only=False)
         except BaseException:
@@ -54,33 +54,14 @@ def create_map(path: Path) -> MapConnection:
 
 
 def _make(path: Path) -> None:
-    target = path.resolve()  # a symbolic link stays one
-    part = part_beside(target)
+    part = part_beside(path)
     try:
         part.touch()
         with closing(_connect(part, "rw")) as sql:
             schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
-        _named_anew(part, target)
-    except FileExistsError:
-        raise UsageError(f"{path}: there is a file already") from None
+        name_map(part, path)
     finally:
         remove_map(part)
-
-
-def _named_anew(part: Path, target: Path) -> None:
-    """Give a file its name; of two programs that want the same one, one gets it.
-
-    Raises:
-        FileExistsError: there is a file already.
-    """
-    try:
-        os.link(part, target)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links, as of memory cards
-        if target.exists():
-            raise FileExistsError from None
-        part.rename(target)
 
 
 def open_map(path: Path, read_only: bool) -> MapConnection:

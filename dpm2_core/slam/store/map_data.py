@@ -13,14 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import named, part_beside
 from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_file import move_map, remove_map
+from dpm2_core.slam.store.map_file import already_there, name_map, remove_map
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -185,8 +185,7 @@ def save_as(data: MapData, path: Path) -> None:
     try:
         with named(path, part), MapStore.create(part) as store:
             append_map(store, data)
-        check_new(path)  # another program may have made one meanwhile
-        move_map(part, path)
+        name_map(part, path)  # another program may have made one meanwhile
     finally:
         remove_map(part)
 
@@ -194,7 +193,7 @@ def save_as(data: MapData, path: Path) -> None:
 def check_new(path: Path) -> None:
     """Raises UsageError if there is a file already."""
     if path.exists():
-        raise UsageError(f"{path}: there is a file already")
+        raise already_there(path)
 
 
 def append_map(store: MapStore, data: MapData) -> None:

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import not_written
 
 
@@ -47,14 +48,41 @@ def move_map(source: Path, target: Path) -> None:
         Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
             there stays.
     """
-    wal = Path(f"{source}-wal")
-    if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
-        raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
+    _check_whole(source, target)
     try:
         _remove_log(target)
         source.replace(target)
     except OSError as error:
         raise not_written(target, error) from error
+
+
+def name_map(source: Path, target: Path) -> None:
+    """Give a map that was closed a name that no file has; of two programs that want the same one, one gets it.
+
+    Raises:
+        UsageError: there is a file already. Dpm2Error: as `move_map`.
+    """
+    _check_whole(source, target)
+    try:
+        os.link(source, target)
+        source.unlink()
+    except FileExistsError:
+        raise already_there(target) from None
+    except OSError:  # a file system without hard links, as of memory cards
+        if target.exists():
+            raise already_there(target) from None
+        move_map(source, target)
+
+
+def already_there(path: Path) -> UsageError:
+    """What to raise where a map is to be made, and there is a file."""
+    return UsageError(f"{path}: there is a file already")
+
+
+def _check_whole(source: Path, target: Path) -> None:
+    wal = Path(f"{source}-wal")
+    if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
+        raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")
 
 
 def remove_map(path: Path) -> None:
