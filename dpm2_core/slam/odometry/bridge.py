@@ -18,7 +18,7 @@ from dpm2_core.estimates import Registration
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
-from dpm2_core.slam.odometry.inertial import InertialMotion
+from dpm2_core.slam.odometry.inertial import InertialMotion, Reckoned
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
@@ -82,11 +82,19 @@ class Bridge:
         self._limits = limits
         self._ties: list[_Tie] = []
 
-    def begin(self, seconds: float, T_other: Array | None, imu: InertialMotion | None, stepped: bool) -> Array:
+    def begin(
+        self,
+        seconds: float,
+        T_other: Array | None,
+        imu: InertialMotion | None,
+        reckoned: Reckoned | None,
+        stepped: bool,
+    ) -> Array:
         """A new stretch, so long after the last pose before the pause: where it begins (4, 4).
 
         Args:
-            T_other: there, if another odometry knows the way. imu: it may know the turn since that pose, or the way.
+            T_other: there, if another odometry knows the way. imu, reckoned: it may know the turn since that pose, and
+                the way.
             stepped: it is so long by a clock that was set meanwhile.
         """
         self._seconds = seconds
@@ -94,17 +102,15 @@ class Bridge:
         self.held = self._stepped
         self._ties.clear()
         self._after: Array | None = None
-        self._turning, of_turn, step = None, None, None
-        if imu is not None:
-            self._turning, of_turn = imu.turning, imu.covariance(seconds)
-            step = None if self.twist is None else imu.step(self._T[:3, :3], self.twist[3:], self._of_velocity)
-        self._by_imu = None if step is None else replace(step, T=self._T @ step.T)
+        self._turning = None if imu is None else imu.turning
+        self._by_imu = None if reckoned is None else replace(reckoned, T=self._T @ reckoned.T)
         self._ways = [way for way in (T_other, None if self._by_imu is None else self._by_imu.T) if way is not None]
         self._T_begin = self._ways[0] if self._ways else predicted(self._T, self._motion, seconds, self._turning)
-        if T_other is None and step is not None:
-            self._of_begin = step.covariance
+        if T_other is None and reckoned is not None:
+            self._of_begin = reckoned.covariance
         else:
             acceleration, of_velocity = self._limits.acceleration, self._of_velocity
+            of_turn = None if imu is None else imu.covariance(seconds)
             self._of_begin = covariance(self._speed, seconds, acceleration, of_velocity, of_turn=of_turn)
         return self._T_begin
 

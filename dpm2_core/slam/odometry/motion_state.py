@@ -187,12 +187,11 @@ class MotionState:
             swept: the motion during its sweep, where that is known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
-        by_imu = self._along_open(registration, seconds, led) if moved else None
-        if by_imu is not None:
-            registration, swept = _led_along_open(registration, swept, *by_imu)
+        leads = False
         if moved:
+            registration, swept, leads = self._along_open(registration, swept, seconds, led)
             self._move(registration, seconds, led, swept)
-        self.register(registration, stamp, moved, led=by_imu is not None)
+        self.register(registration, stamp, moved, leads)
         self.sweep = swept
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
         self.left_open = np.zeros((3, 3))
@@ -202,17 +201,26 @@ class MotionState:
             self.covariance[3:, 3:] += of_velocity * self._open**2
             self.left_open = of_velocity * seconds**2
 
-    def _along_open(self, registration: Registration, seconds: float, led: bool) -> tuple[Array, Array] | None:
-        """Where the scene leaves a direction open and an IMU contradicts the scan there: how far (3,) m it leads, and
-        at which velocity (3,) m/s, along the axes of the odometry."""
+    def _along_open(
+        self, registration: Registration, swept: Swept | None, seconds: float, led: bool
+    ) -> tuple[Registration, Swept | None, bool]:
+        """A registration and the motion during its sweep; and whether an IMU has led them, which it does along what the
+        scene leaves open where it contradicts the scan."""
         if led or self.reckoned is None or registration.worst_sigma < OPEN:
             self._open_way = None
-            return None
+            return registration, swept, False
         if self._open_way is None:
             self._open_way = OpenWay(self.T_registered, self.known_twist[3:])
-        along = along_open(registration.of_scene[3:, 3:], np.eye(3))
-        off = self._open_way.follow(self.T_registered, registration.T_target_source, along, self.reckoned, seconds)
-        return (off, self._open_way.velocity) if self._open_way.leads else None
+        T, along = registration.T_target_source.copy(), along_open(registration.of_scene[3:, 3:], np.eye(3))
+        off = self._open_way.follow(self.T_registered, T, along, self.reckoned, seconds)
+        if not self._open_way.leads:
+            return registration, swept, False
+        T[:3, 3] += off
+        if swept is not None:
+            motion = swept.motion.copy()
+            motion[0, 3:] += along @ (T[:3, :3].T @ self._open_way.velocity - motion[0, 3:])
+            swept = replace(swept, T=T, motion=motion)
+        return replace(registration, T_target_source=T), swept, True
 
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """The motion from the last registered frame to one `seconds` later."""
@@ -263,17 +271,3 @@ class MotionState:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
             self.T = predicted(self.T_registered, self.ahead, self.seconds, self.turning)
-
-
-def _led_along_open(
-    registration: Registration, swept: Swept | None, off: Array, velocity: Array
-) -> tuple[Registration, Swept | None]:
-    """A registration moved by (3,) m, and the motion during its sweep at a velocity (3,) m/s along what the scene
-    leaves open; both along the axes of the odometry."""
-    T = registration.T_target_source.copy()
-    T[:3, 3] += off
-    if swept is not None:
-        along, motion = along_open(registration.of_scene[3:, 3:], np.eye(3)), swept.motion.copy()
-        motion[0, 3:] += along @ (T[:3, :3].T @ velocity - motion[0, 3:])
-        swept = replace(swept, T=T, motion=motion)
-    return replace(registration, T_target_source=T), swept

@@ -226,15 +226,15 @@ class Odometry:
     def _begin_stretch(self, dt: float, stepped: bool) -> Array:
         """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns; `stepped` if
         the pause may be of the clock alone."""
-        motion, imu, step = self._motion, None, self._motion.step
+        motion, imu, reckoned, step = self._motion, None, None, self._motion.step
         if self._bridge is None:
-            imu, step = motion.inertial, None if motion.other is None else motion.other.step
+            imu, reckoned, step = motion.inertial, motion.reckoned, None if motion.other is None else motion.other.step
             limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
             self._bridge = Bridge(self._registration, motion.T_registered, motion.twist, motion.of_velocity, limits)
             self._left = self._clock.now - motion.seconds - dt
         self._registration, self._first = self._registration.fresh(), None
         T_other = None if step is None else motion.T_registered @ step.T
-        motion.begin(self._bridge.begin(self._clock.now - self._left, T_other, imu, stepped))
+        motion.begin(self._bridge.begin(self._clock.now - self._left, T_other, imu, reckoned, stepped))
         return motion.T
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
