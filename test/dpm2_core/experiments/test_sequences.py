@@ -158,18 +158,27 @@ def test_a_peer_or_a_file_that_is_not_there_is_named_with_its_part(kitti: Path, 
     assert "other.tum" in dpm2(*call, "--peer", f"x={tmp_path}/other.tum").stderr
 
 
-def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None:
-    """As of a program that leaves the poses of its keyframes: it was refused, one of two frames of three was not."""
-    folder, t = tmp_path / "sequences" / "10", np.arange(12) * 0.1
+def ahead(t: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) of a car that gathers speed, at times s."""
+    return se3.make(np.eye(3), np.column_stack([10 * t**2, 0 * t, 0 * t]))
+
+
+def gathering_speed(root: Path) -> tuple[Drive, np.ndarray]:
+    """Its drive of twelve frames in KITTI's layout, and their times, s."""
+    folder, t = root / "sequences" / "10", np.arange(12) * 0.1
     (folder / "velodyne").mkdir(parents=True)
     for n in range(12):
         np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
     (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     np.savetxt(folder / "times.txt", t, "%.9e")
-    poses = se3.make(np.eye(3), np.column_stack([10 * t**2, 0 * t, 0 * t]))
-    write_kitti(folder / "poses.txt", poses)
-    write_tum(tmp_path / "peer.tum", np.round(t * 1e9).astype(np.int64)[::2], poses[::2])
-    drive = Drive(data=folder, settings=(), frames=(0, None), lengths=(1.0,))
+    write_kitti(folder / "poses.txt", ahead(t))
+    return Drive(data=folder, settings=(), frames=(0, None), lengths=(1.0,)), t
+
+
+def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None:
+    """As of a program that leaves the poses of its keyframes: it was refused, one of two frames of three was not."""
+    drive, t = gathering_speed(tmp_path)
+    write_tum(tmp_path / "peer.tum", np.round(t * 1e9).astype(np.int64)[::2], ahead(t[::2]))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
     assert (found["frames"], found["failed_frames"]) == (12, 6)
     assert found["ape_rmse_m"] < 1e-9
@@ -179,19 +188,8 @@ def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None
 def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -> None:
     """Each pose 8 ms after a frame, as of a program that stamps otherwise: of a car that gathers speed the nearest pose
     was up to 0.2 m off."""
-    folder, t = tmp_path / "sequences" / "10", np.arange(12) * 0.1
-    (folder / "velodyne").mkdir(parents=True)
-    for n in range(12):
-        np.zeros(4, "<f4").tofile(folder / "velodyne" / f"{n:06d}.bin")
-    (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
-    np.savetxt(folder / "times.txt", t, "%.9e")
-
-    def poses(at: np.ndarray) -> np.ndarray:
-        return se3.make(np.eye(3), np.column_stack([10 * at**2, 0 * at, 0 * at]))
-
-    write_kitti(folder / "poses.txt", poses(t))
-    write_tum(tmp_path / "peer.tum", np.round((t + 0.008) * 1e9).astype(np.int64), poses(t + 0.008))
-    drive = Drive(data=folder, settings=(), frames=(0, None), lengths=(1.0,))
+    drive, t = gathering_speed(tmp_path)
+    write_tum(tmp_path / "peer.tum", np.round((t + 0.008) * 1e9).astype(np.int64), ahead(t + 0.008))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
     assert (found["frames"], found["failed_frames"]) == (12, 1)  # none at or before the first
     assert found["ape_rmse_m"] < 1e-3  # a line between poses is 7 mm off at this acceleration, at each frame the same
