@@ -64,7 +64,7 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
     return {
         "map": str(path),
         "keyframes": len(data),
-        "own_clouds": sum(data.clouds.loan(node) is None for node in range(len(data))),
+        "own_clouds": int(data.clouds.kept.sum()),
         "with_descriptors": with_descriptors,
         "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),

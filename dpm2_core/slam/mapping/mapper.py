@@ -200,12 +200,14 @@ class Mapper:
         return self.loops[before:]
 
     def _lend(self, node: int, to_before: list[Edge], loops: list[Edge]) -> None:
-        """Give up the cloud of a keyframe that came back to an older one for that one's."""
+        """Let a keyframe that came back to an older one borrow that one's cloud."""
         odometry = [edge for edge in to_before if edge.kind == "odometry"]
         again = odometry if node == self.session_start else []  # the frame with which the session before ended
         loan = lender(node, [*again, *self.kept(loops)], self.clouds.loan, self._settings.redundancy)
         if loan is not None:
-            self.clouds.borrow(node, loan)
+            before = self.clouds.borrow(node, loan)
+            if self._writer is not None and before is not None:
+                self._writer.give_up(before)
             self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
 
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
@@ -336,7 +338,7 @@ class Mapper:
 
     def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:
         for node, moving in checked:
-            if self.clouds.loan(node) is None and moving.any():
+            if moving.any() and self.clouds.keeps(node):
                 self.clouds.set_moving(node, moving)
                 if self._writer is not None:
                     self._writer.set_moving(node)

@@ -5,6 +5,9 @@ What a keyframe sees is kept as a fan: how far it is free in each direction, and
 at the keyframe's pose, and, when that changes, taken back and drawn anew: 1 to 2 ms, where reading the cloud takes ten
 times as long. Where the map needs cells of another size all are drawn anew, and the grid that was there is shown until
 then: a robot that plans in it does not lose what it knew.
+
+How a place was last seen counts for more than how it looked before: when the robot comes by again, what was moved goes,
+and what is new appears.
 """
 
 from __future__ import annotations
@@ -26,6 +29,10 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 _DIRECTIONS = 720
 _MARGIN = 20.0  # m around what is needed: the next keyframes fit as well
 _BORDER = 2.0  # m: what is seen is rounded
+_PLACE = np.array([6.0, 6.0, 3.0])  # m: keyframes in a box of this size see about the same
+_BOX_NUMBER = 1 << np.array([42, 21, 0])
+_LAP = 10  # keyframes: so many later it is there again
+_NEWER, _VISITS = 3, 3  # a fan counts for three of the visit before; beyond the third all count the same
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray values of map_server
 
 
@@ -98,10 +105,12 @@ def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: A
 
 @dataclass(eq=False)
 class _Entry:
-    """A keyframe: its fan, the version of the cloud that it was made of, and the pose (4, 4) at which it is drawn."""
+    """A keyframe: its fan, the mask of moving points without which it was made, and how much it counts and the pose
+    (4, 4) at which it is drawn."""
 
     fan: Fan
-    version: object
+    moving: bytes | None
+    count: int = 0
     T: Array | None = None
 
 
@@ -136,25 +145,27 @@ class OccupancyMap:
         end = time.monotonic() + seconds
         placed = np.ones(len(poses), np.bool_) if placed is None else placed
         self._make_room(poses[placed])
-        for node in np.flatnonzero(~placed).tolist():
+        counts = _counts(poses, placed & clouds.kept[: len(poses)])
+        for node in [node for node in self._entries if not counts[node]]:
             self._take_back(node)
-        for node in np.flatnonzero(placed)[::-1].tolist():
-            entry, now = self._entries.get(node), clouds.version(node)
-            if entry is not None and entry.version is now and entry.T is not None and self._near(entry.T, poses[node]):
+            del self._entries[node]
+        for node in np.flatnonzero(counts)[::-1].tolist():
+            entry, count, moving = self._entries.get(node), int(counts[node]), clouds.moving(node)
+            if entry is not None and (entry.count, entry.moving) == (count, moving) and self._near(entry, poses[node]):
                 continue
             if time.monotonic() > end:
                 return False
             self._take_back(node)
-            if entry is None or entry.version is not now:
-                fan = fan_of(clouds[node], poses[node], self._settings, clouds.origin(node))
-                entry = self._entries[node] = _Entry(fan, now)
-            entry.T = poses[node].copy()
-            self._draw(entry.fan, entry.T, 1)
+            if entry is None or entry.moving is not moving:
+                fan = fan_of(clouds.seen(node), poses[node], self._settings, clouds.seen_from(node))
+                entry = self._entries[node] = _Entry(fan, moving)
+            entry.count, entry.T = count, poses[node].copy()
+            self._draw(entry, entry.T, 1)
         self._before = None
         return True
 
     def grid(self) -> Grid:
-        """What is known by now: a cell is occupied where at least half of those that see it see something in it."""
+        """What is known by now: a cell is occupied where at least half of the counts that see it see something."""
         if self._before is not None:
             return self._before
         cells = np.full(self._seen.shape, UNKNOWN, np.uint8)
@@ -210,20 +221,41 @@ class OccupancyMap:
     def _take_back(self, node: int) -> None:
         entry = self._entries.get(node)
         if entry is not None and entry.T is not None:
-            self._draw(entry.fan, entry.T, -1)
+            self._draw(entry, entry.T, -1)
             entry.T = None
 
-    def _near(self, T: Array, T_now: Array) -> bool:
-        """Whether a fan that is drawn at T (4, 4) may stay."""
-        meters = float(np.abs(T[:2, 3] - T_now[:2, 3]).max())
-        turn = abs(_wrapped(_yaw(T) - _yaw(T_now)))
+    def _near(self, entry: _Entry, T_now: Array) -> bool:
+        """Whether a fan is drawn so near to T_now (4, 4) that it may stay."""
+        if entry.T is None:
+            return False
+        meters = float(np.abs(entry.T[:2, 3] - T_now[:2, 3]).max())
+        turn = abs(_wrapped(_yaw(entry.T) - _yaw(T_now)))
         return meters + turn * self._settings.reach / 2 < self._size / 2
 
-    def _draw(self, fan: Fan, T: Array, sign: int) -> None:
+    def _draw(self, entry: _Entry, T: Array, sign: int) -> None:
+        fan, times = entry.fan, sign * entry.count
         turn = _yaw(T) - fan.yaw
         cos, sin = np.cos(turn), np.sin(turn)
         low, (x, y) = self._low * self._size, (T[:2, 3] + [[cos, -sin], [sin, cos]] @ fan.origin).tolist()
-        _draw_fan(self._hits, self._seen, x - low[0], y - low[1], turn, self._size, fan.free, fan.stands, sign)
+        _draw_fan(self._hits, self._seen, x - low[0], y - low[1], turn, self._size, fan.free, fan.stands, times)
+
+
+def _counts(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(N,) how much each of (N, 4, 4) keyframes counts by how often the robot was there later; 0 if it is not `drawn`.
+
+    Places are boxes, in all eight ways to lay them half a box apart: two keyframes that are near share one of them.
+    """
+    nodes, counts = np.flatnonzero(drawn), np.zeros(len(poses), np.int64)
+    later = np.zeros(len(nodes), np.int64)
+    for shift in np.ndindex(2, 2, 2):
+        box = np.floor(poses[nodes, :3, 3] / _PLACE + np.array(shift) / 2).astype(np.int64) @ _BOX_NUMBER
+        order = np.argsort(box, kind="stable")
+        first = np.diff(box[order], prepend=box[order[:1]] - 1) != 0
+        visit = np.cumsum(first | (np.diff(nodes[order], prepend=0) > _LAP))
+        last = np.append(visit[np.flatnonzero(first)[1:] - 1], visit[-1:])[np.cumsum(first) - 1]
+        later[order] = np.maximum(later[order], last - visit)
+    counts[nodes] = _NEWER ** (_VISITS - np.minimum(later, _VISITS))
+    return counts
 
 
 @compiled("void(i4[:,::1], i4[:,::1], f8, f8, f8, f8, f4[::1], f4[:,::1], i8)")
@@ -236,9 +268,9 @@ def _draw_fan(  # noqa: PLR0913
     size: float,
     free: NDArray[np.float32],
     stands: NDArray[np.float32],
-    sign: int,
+    times: int,
 ) -> None:
-    """Add `sign` to every cell that a fan at x, y (m from the corner of the grids), turned by `turn` (rad), sees."""
+    """Add `times` to every cell that a fan at x, y (m from the corner of the grids), turned by `turn` (rad), sees."""
     reach = float(free.max())
     for k in range(len(stands)):
         reach = max(reach, float(np.hypot(stands[k, 0], stands[k, 1])))
@@ -256,8 +288,8 @@ def _draw_fan(  # noqa: PLR0913
         marks[int(np.floor(px / size)) - first, int(np.floor(py / size)) - second] |= 2
     for i in range(max(0, -first), min(len(marks), seen.shape[0] - first)):
         for j in range(max(0, -second), min(len(marks), seen.shape[1] - second)):
-            seen[first + i, second + j] += sign * (marks[i, j] & 1)
-            hits[first + i, second + j] += sign * (marks[i, j] >> 1)
+            seen[first + i, second + j] += times * (marks[i, j] & 1)
+            hits[first + i, second + j] += times * (marks[i, j] >> 1)
 
 
 def _yaw(T: Array) -> float:

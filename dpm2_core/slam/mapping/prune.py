@@ -25,13 +25,13 @@ _LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
-    """Keyframes without a payload of their own, and those near an older one that stays; never the last of a part.
+    """Keyframes without a cloud of their own, and those near an older one that stays; never the last of a part.
 
     Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known. Nor
     does one with descriptors go for one without: nobody would be found there any more.
 
     Args:
-        distance: m, at most, where a meter of height counts for four; 0: only those without a payload.
+        distance: m, at most, where a meter of height counts for four; 0: only those without a cloud.
         angle: degrees between their headings, at most.
     """
     if not len(data):
@@ -44,12 +44,15 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     for node in range(len(data)):
         if node in needed:
             continue
+        if (loan := data.clouds.loan(node)) is not None:  # one that tells how a place was last seen, stays with it
+            stays[node] = data.clouds.keeps(node) and loan.lender < node and stays[loan.lender]
+            continue
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
         near = near[(near < node) & stays[near] & (parts[near] == parts[node])]
         near = near[(node - near >= _LAP) | (session[near] != session[node])]
         near = near[described[near] >= described[node]]
         turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
-        stays[node] = data.clouds.loan(node) is None and np.min(turned) > np.radians(angle)
+        stays[node] = np.min(turned) > np.radians(angle)
     return np.flatnonzero(~stays).tolist()
 
 

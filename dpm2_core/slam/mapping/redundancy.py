@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Driving a block ten times does not make ten maps: a keyframe that came back to an old one uses its payload."""
+"""Driving a block ten times does not make ten maps: a keyframe that came back to an old one uses its payload.
+
+Its own cloud tells how the place looks now, for the grid that robots plan in, and stays until the next one comes.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ Reader = Callable[[int], bytes | None]
 
 @dataclass(frozen=True, eq=False)
 class Loan:
-    """Whose cloud a redundant keyframe shows: that of `lender`, moved by T_kf_lender (4, 4)."""
+    """Whose cloud a redundant keyframe shows: that of `lender`, where it came back to, moved by T_kf_lender (4, 4)."""
 
     lender: int
     T_kf_lender: Array
@@ -68,7 +68,8 @@ class CloudStore(LazySequence[Points]):
     """The packed clouds of keyframes 0, 1, ...: in the map file where it holds them, else in a temporary one.
 
     An item is the (M, 4) float32 cloud without the points that were found to move; `whole` has them too. A keyframe
-    that a revisit made redundant has none of its own: it borrows that of the keyframe it came back to.
+    that a revisit made redundant borrows that of the keyframe it came back to. Its own tells how the place looks now,
+    which is what robots plan by: it is kept until the next one borrows there.
 
     Attributes:
         name: of the map, for errors.
@@ -86,7 +87,7 @@ class CloudStore(LazySequence[Points]):
         Args:
             stored: reads a packed cloud from the file.
             moving: packed mask, or None, of each that is in the file.
-            loans: those among them that have no cloud of their own.
+            loans: of those among them that borrow.
             name: of the map, for errors.
         """
         self.name = name
@@ -95,6 +96,7 @@ class CloudStore(LazySequence[Points]):
         self._where: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
         self._moving = {index: mask for index, mask in enumerate(moving) if mask is not None}
         self._loans = dict(loans or {})
+        self._newest = {loan.lender: index for index, loan in sorted(self._loans.items())}  # borrower of each lender
 
     def append(self, packed: bytes) -> None:
         """The cloud of the next keyframe: in memory until the map file has it, or else the next one comes."""
@@ -106,22 +108,38 @@ class CloudStore(LazySequence[Points]):
         """The map file has it now."""
         self._where[index] = None
 
-    def borrow(self, index: int, loan: Loan) -> None:
-        """Give a cloud up for that of another keyframe, which has its own."""
+    def borrow(self, index: int, loan: Loan) -> int | None:
+        """Let the newest keyframe borrow the cloud of another one, which does not; returns whose own cloud is gone."""
+        before = self._newest.get(loan.lender)
         self._loans[index] = loan
-        self._where[index] = None
-        self._moving.pop(index, None)
+        self._newest[loan.lender] = index
+        if before is not None:
+            self._where[before] = None
+            self._moving.pop(before, None)
+        return before
 
     def loan(self, index: int) -> Loan | None:
-        """Whose cloud it is, where it is not its own."""
+        """Whose cloud it shows, where that is not its own."""
         return self._loans.get(index)
 
     @property
     def own(self) -> NDArray[np.bool_]:
-        """(N,) which clouds are of their own keyframe, and not borrowed."""
+        """(N,) which keyframes do not borrow."""
         own = np.ones(len(self), np.bool_)
         own[list(self._loans)] = False
         return own
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """(N,) which keyframes have their own clouds: those that do not borrow, and the newest that do."""
+        kept = self.own
+        kept[list(self._newest.values())] = True
+        return kept
+
+    def keeps(self, index: int) -> bool:
+        """Whether a keyframe has its own cloud."""
+        loan = self._loans.get(index)
+        return loan is None or self._newest[loan.lender] == index
 
     def set_moving(self, index: int, moving: NDArray[np.bool_]) -> None:
         """Leave those points (M,) of a cloud out from now on."""
@@ -131,21 +149,17 @@ class CloudStore(LazySequence[Points]):
         """The packed mask of points that move; None: none is known."""
         return self._moving.get(index)
 
-    def version(self, index: int) -> object:
-        """Another object once the cloud is another one."""
-        return self._loans.get(index) or self._moving.get(index)
-
     def packed(self, index: int) -> bytes | None:
-        """The bytes of a cloud; None where it is borrowed."""
+        """The bytes of a keyframe's own cloud; None where it is given up."""
         where = self._where[index]
-        if index in self._loans:
+        if not self.keeps(index):
             return None
         if isinstance(where, int):
             return self._spill.read(where)
         return where if where is not None or self._stored is None else self._stored(index)
 
     def whole(self, index: int) -> Points:
-        """(M, 4) with all its points; a borrowed one has none.
+        """A keyframe's own cloud (M, 4) with all its points; without any where it is given up.
 
         Raises:
             Dpm2Error: it is damaged.
@@ -154,17 +168,35 @@ class CloudStore(LazySequence[Points]):
         with self._named(index):
             return NO_POINTS if data is None else unpack_cloud(data)
 
+    def seen(self, index: int) -> Points:
+        """What a keyframe saw itself: (M, 4) without the points that move; none where its cloud is given up.
+
+        Raises:
+            Dpm2Error: it is damaged.
+        """
+        cloud, moving = self.whole(index), self._moving.get(index)
+        with self._named(index):
+            return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]
+
+    def seen_from(self, index: int) -> Array:
+        """(3,) m, where the LiDAR was then, in the keyframe's frame.
+
+        Raises:
+            Dpm2Error: it is damaged.
+        """
+        data = self.packed(index)
+        with self._named(index):
+            return np.zeros(3) if data is None else origin_of(data)
+
     def origin(self, index: int) -> Array:
-        """(3,) m, where the LiDAR was, in the keyframe's frame; of a borrowed cloud the lender's.
+        """(3,) m, where the LiDAR was that saw an item, in the keyframe's frame.
 
         Raises:
             Dpm2Error: it is damaged.
         """
         if (loan := self._loans.get(index)) is not None:
-            return loan.T_kf_lender[:3, :3] @ self.origin(loan.lender) + loan.T_kf_lender[:3, 3]
-        data = self.packed(index)
-        with self._named(index):
-            return np.zeros(3) if data is None else origin_of(data)
+            return loan.T_kf_lender[:3, :3] @ self.seen_from(loan.lender) + loan.T_kf_lender[:3, 3]
+        return self.seen_from(index)
 
     @contextmanager
     def _named(self, index: int) -> Iterator[None]:
@@ -183,8 +215,5 @@ class CloudStore(LazySequence[Points]):
             Dpm2Error: it is damaged.
         """
         if (loan := self._loans.get(index)) is not None:
-            return se3.transform(loan.T_kf_lender, self[loan.lender])
-        cloud = self.whole(index)
-        moving = self._moving.get(index)
-        with self._named(index):
-            return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]
+            return se3.transform(loan.T_kf_lender, self.seen(loan.lender))
+        return self.seen(index)

@@ -213,11 +213,11 @@ def append_map(store: MapStore, data: MapData) -> None:
         ending.setdefault(max(edge.from_node, edge.to_node), []).append(edge)
     for node, keyframe in enumerate(data.keyframes):
         loan, mask = data.clouds.loan(node), data.clouds.moving(node)
-        packed = data.clouds.packed(node) if loan is None else replace(loan, lender=loan.lender + first)
         if keyframe.descriptors is None and loan is None:
             keyframe = replace(keyframe, descriptors=data.describe(node))
         change = Change(
-            keyframes=[(first + node, keyframe, packed, data.thumbnail(node))],
+            keyframes=[(first + node, keyframe, data.clouds.packed(node), data.thumbnail(node))],
+            loans={} if loan is None else {first + node: replace(loan, lender=loan.lender + first)},
             edges=ending.get(first + node, []),
             poses={first + node: data.poses[node]},
             moving={} if mask is None else {first + node: mask},

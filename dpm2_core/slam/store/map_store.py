@@ -44,20 +44,23 @@ class Change:
     """What goes into the file together, or not at all.
 
     Attributes:
-        keyframes: node, keyframe (its cloud is not looked at), packed cloud or whose it borrows, JPEG or None.
+        keyframes: node, keyframe (its cloud is not looked at), packed cloud or None, JPEG or None.
         edges: in the order of the map; appended to those of the file.
         poses: T_map_kf (4, 4) by node. moving: packed mask by node. trail: what was pruned.
         georeference: as it is from now on; None: as it was.
         judged: edges of the file by their number, as they are from now on.
+        loans: of the keyframes that borrow. given_up: nodes whose own clouds are no longer needed.
     """
 
-    keyframes: list[tuple[int, Keyframe, bytes | Loan | None, bytes | None]] = field(default_factory=list)
+    keyframes: list[tuple[int, Keyframe, bytes | None, bytes | None]] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
     poses: dict[int, Array] = field(default_factory=dict)
     moving: dict[int, bytes] = field(default_factory=dict)
     trail: list[RemovedKeyframe] = field(default_factory=list)
     judged: dict[int, Edge] = field(default_factory=dict)
     georeference: Georeference | None = None
+    loans: dict[int, Loan] = field(default_factory=dict)
+    given_up: Sequence[int] = ()
 
 
 class MapStore:
@@ -113,14 +116,16 @@ class MapStore:
         with self._transaction() as sql:
             self._check_alone(sql)
             for node, keyframe, cloud, thumbnail in change.keyframes:
-                loan = cloud if isinstance(cloud, Loan) else None
+                loan = change.loans.get(node)
                 _insert(sql, "keyframes", [keyframe_row(node, keyframe, self.session, loan)])
                 if keyframe.fix is not None:
                     _insert(sql, "fixes", [fix_row(node, keyframe.fix)])
-                if isinstance(cloud, bytes):
-                    d = keyframe.descriptors
+                if cloud is not None:
+                    d = keyframe.descriptors if loan is None else None
                     packed = None if d is None else pack_descriptors(d)
-                    _insert(sql, "payloads", [with_crc(node, cloud, packed, thumbnail)])
+                    _insert(sql, "payloads", [with_crc(node, cloud, packed, thumbnail if loan is None else None)])
+            for table in ("payloads", "moving"):
+                sql.executemany(f"DELETE FROM {table} WHERE node = ?", [(node,) for node in change.given_up])
             first = sql.execute("SELECT coalesce(max(id), -1) + 1 FROM edges").fetchone()[0]
             _insert(sql, "edges", [edge_row(first + i, edge) for i, edge in enumerate(change.edges)])
             _insert(sql, "edges", [edge_row(number, edge) for number, edge in change.judged.items()])

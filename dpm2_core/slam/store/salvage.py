@@ -74,7 +74,7 @@ class Salvage:
             [],
             [],
             self._sessions(keyframes),
-            CloudStore(lambda node: self._payload(node)[0] or nothing, moving, loans),
+            CloudStore(lambda node: self._payload(node)[0] or (None if node in loans else nothing), moving, loans),
             lambda node: self._payload(node)[2],
             georeference=self._georeference(),
         )
@@ -96,6 +96,10 @@ class Salvage:
             if loan.lender not in keyframes or loan.lender in loans:
                 self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
                 del loans[node]
+        for node in loans:
+            with self._noted(f"keyframe {node}: how its place was last seen is lost"):
+                if (payload := self._row("payloads", node)) is not None:
+                    unpack_cloud(payload[1])
         without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
         self._findings.lost_clouds = len(without)
         for node in keyframes.keys() - set(without) - loans.keys():

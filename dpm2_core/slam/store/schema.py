@@ -36,11 +36,11 @@ CREATE TABLE keyframes (
   stamp    INTEGER NOT NULL,     -- ns
   frame    INTEGER NOT NULL,     -- number in the recording
   T_odom_kf BLOB NOT NULL,
-  lender   INTEGER,              -- a revisit: the keyframe whose payload it shares
+  lender   INTEGER,              -- a revisit: the keyframe whose cloud and descriptors it shares
   T_kf_lender BLOB,
   crc      INTEGER NOT NULL
 );
-CREATE TABLE payloads (
+CREATE TABLE payloads (          -- of those that share none, and clouds that tell how a place was last seen
   node     INTEGER PRIMARY KEY,
   cloud    BLOB NOT NULL,        -- see slam/store/cloud_codec.py
   descriptors BLOB,              -- see slam/store/rows.py

@@ -35,6 +35,7 @@ class MapWriter:
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
+        self._given_up: set[int] = set()
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
         """A keyframe, whose cloud is in the cloud store, and the edges that came with it."""
@@ -44,6 +45,10 @@ class MapWriter:
     def set_moving(self, node: int) -> None:
         """The cloud store has a mask for that node."""
         self._moving.add(node)
+
+    def give_up(self, node: int) -> None:
+        """The cloud store no longer has that node's own cloud."""
+        self._given_up.add(node)
 
     def sync(self, poses: Array, georeference: Georeference | None, judged: Sequence[Edge] = ()) -> None:
         """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`.
@@ -66,18 +71,21 @@ class MapWriter:
         ends = keyframes[-1][0] + 1 if keyframes else len(self._written)
         change, poses = Change(georeference=georeference), poses[:ends]
         for node, keyframe, thumbnail in keyframes:
-            cloud = self._clouds.loan(node) or self._clouds.packed(node)
-            change.keyframes.append((node, keyframe, cloud, thumbnail))
+            change.keyframes.append((node, keyframe, self._clouds.packed(node), thumbnail))
+            if (loan := self._clouds.loan(node)) is not None:
+                change.loans[node] = loan
         change.edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) < ends]
         change.poses = self._moved(poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
+        change.given_up = [node for node in self._given_up if node < ends]
         self._store.write(change)
         for node, *_ in keyframes:
             self._clouds.set_stored(node)
         self._keyframes = self._keyframes[len(keyframes) :]
         self._edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) >= ends]
         self._moving -= masks.keys()
+        self._given_up -= set(change.given_up)
         written = poses.copy()
         still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
         written[still] = self._written[still]  # small moves add up until they are worth writing

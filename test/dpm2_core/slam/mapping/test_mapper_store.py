@@ -21,7 +21,8 @@ from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
-from dpm2_core.slam.store.map_data import load_map
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 
 SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
@@ -123,6 +124,33 @@ def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> N
     ends = {(edge.from_node, edge.to_node) for edge in data.constraints}
     assert ends == {(edge.from_node, edge.to_node) for edge in mapper.edges}
     assert len(data.edges) == len(mapper.loops) + 2 * LAP - 1
+
+
+def again(node: int) -> bool:
+    """Whether a keyframe's loop, and that of the lap after it to it, are accepted."""
+    return node % 7 > 0 and (node + LAP) % 7 > 0
+
+
+def test_the_file_keeps_how_a_place_was_last_seen(tmp_path: Path) -> None:
+    """After three laps each keyframe of the last one that borrows has its cloud in the file, and of the second only
+    those whose place was not found again."""
+    path = tmp_path / "a.dpm2map"
+    with begun(path) as mapper:
+        for keyframe in laps(3):
+            mapper.add(keyframe)
+        clouds = mapper.clouds
+        last = {loan.lender: node for node in range(3 * LAP) if (loan := clouds.loan(node))}
+        packed = {node: clouds.packed(node) for node in range(3 * LAP) if clouds.keeps(node)}
+    assert packed.keys() == {node for node in range(3 * LAP) if node not in range(LAP, 2 * LAP) or not again(node)}
+    for file in (path, tmp_path / "copy"):
+        with MapStore.open(file) as store:
+            data = load_map(store)
+            assert np.flatnonzero(data.clouds.kept).tolist() == sorted(packed)
+            assert {node: store.payload(node, "cloud") for (node,) in store.rows("payloads", "node")} == packed
+            assert not any(store.payload(node, "descriptors") for node in last.values())
+            if file == path:
+                save_as(data, tmp_path / "copy")
+        assert not check_map(file).problems
 
 
 @pytest.mark.slow

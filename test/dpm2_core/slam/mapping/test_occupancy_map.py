@@ -22,7 +22,7 @@ from dpm2_core.sim.world import World, build_world
 from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, UNKNOWN, Grid, OccupancyMap, OccupancySettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from test.helpers.maps import stored
 
 SENSOR = 0.6  # m above the floor
@@ -171,9 +171,9 @@ class Counted(CloudStore):
 
     read = 0
 
-    def item(self, index: int) -> Points:
+    def whole(self, index: int) -> Points:
         self.read += 1
-        return super().item(index)
+        return super().whole(index)
 
 
 def test_what_moved_away_is_left_out_once_it_is_known() -> None:
@@ -190,6 +190,28 @@ def test_what_moved_away_is_left_out_once_it_is_known() -> None:
     assert clouds.read == 2
     fresh = OccupancyMap(SETTINGS, 10**7)
     fresh.update(clouds, np.eye(4)[None])
+    assert same(live.grid(), fresh.grid())
+
+
+@pytest.mark.parametrize("thing", [True, False])
+@pytest.mark.parametrize("borrows", [True, False])
+def test_what_was_moved_goes_and_what_is_new_appears_when_the_robot_comes_by(thing: bool, borrows: bool) -> None:
+    """In each of four rounds, of which three keyframes are in the room and eleven elsewhere, and whether or not they
+    find the place again; what they saw before, and where they were, leaves no trace."""
+    live, clouds, there = OccupancyMap(SETTINGS, 10**7), stored([]), thing
+    poses = np.repeat(np.eye(4)[None], 4 * 14, 0)
+    for node in range(4 * 14):
+        lap, at_home = node // 14, node % 14 < 3
+        poses[node, 0, 3] = 0.01 * lap if at_home else 50.0 + lap
+        there = thing == (lap % 2 == 0)
+        clouds.append(pack_cloud(room(there and at_home)))
+        if borrows and lap:
+            clouds.borrow(node, Loan(node % 14, np.eye(4)))
+        assert live.update(clouds, poses[: node + 1])
+        if node % 14 > 1:
+            assert at(live.grid(), 1.55, 0.05) == (OCCUPIED if there else FREE)
+    fresh = OccupancyMap(SETTINGS, 10**7)
+    fresh.update(clouds, poses)
     assert same(live.grid(), fresh.grid())
 
 

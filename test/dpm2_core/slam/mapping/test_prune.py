@@ -20,7 +20,7 @@ from dpm2_core.slam.mapping.parts import first_part, parts_of
 from dpm2_core.slam.mapping.prune import composed, eliminate, inverted, prune, redundant_nodes
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import MapData, load_map, save_as, trajectory
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as, subset, trajectory
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 
@@ -130,10 +130,10 @@ def test_pruned_keyframes_stay_with_the_part_that_they_are_tied_to() -> None:
     one = laps(1)
     again = [Edge("loop", node, node, Registration(np.eye(4), SIGMA)) for node in range(40)]
     revisit = merge_maps(merge_maps(one, one, np.eye(4)), one, np.eye(4), again)  # the second one is elsewhere
-    borrowing = merge_maps(one, one, np.eye(4))
-    for node in range(40):
-        borrowing.clouds.borrow(40 + node, Loan(node, np.eye(4)))  # by loops that were rejected since then
-    for data, stay in ((revisit, [*range(80), 119]), (borrowing, [*range(40), 79])):
+    borrowing = merge_maps(merge_maps(one, one, np.eye(4)), one, np.eye(4), again)
+    for node in range(40, 120):
+        borrowing.clouds.borrow(node, Loan(node % 40, np.eye(4)))  # the second by loops that were rejected since then
+    for data, stay in ((revisit, [*range(80), 119]), (borrowing, [*range(40), *range(79, 120)])):
         gone = redundant_nodes(data, 2.0, 20.0)
         assert sorted({*range(len(data))} - {*gone}) == stay
         less = prune(data, gone)
@@ -187,12 +187,20 @@ def test_the_optimum_stays_when_nodes_go() -> None:
 
 
 def test_borrowers_go_before_their_lenders() -> None:
-    data = laps(2)
-    for node in range(40, 80):
-        data.clouds.borrow(node, Loan(node - 40, np.eye(4)))
+    """But for the last one, and those that tell how a place was last seen."""
+    data = laps(3)
+    for node in range(40, 120):
+        data.clouds.borrow(node, Loan(node % 40, np.eye(4)))
+        if node == 99:
+            nodes = redundant_nodes(subset(data, range(100), data.edges, []), 0, 0)
+            assert nodes == list(range(40, 60))
     nodes = redundant_nodes(data, 0, 0)
-    assert nodes == list(range(40, 79))  # all that borrow, but the last, whose lender stays
-    assert len(prune(data, nodes)) == 41
+    assert nodes == list(range(40, 80))
+    less = prune(data, nodes)
+    assert less.clouds.kept.all()
+    assert [less.clouds.packed(node) for node in range(80)] == [
+        data.clouds.packed(node) for node in range(120) if node not in nodes
+    ]
     with pytest.raises(ValueError, match="borrows the cloud of 39"):
         prune(data, [39])
 

@@ -26,6 +26,7 @@ from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.mapping.parts import parts_of
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import pack_cloud
+from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import with_crc
@@ -123,6 +124,21 @@ def test_an_invalid_picture_costs_nothing_but_itself(map_file: Path, noise: np.r
         data = load_map(store)
         assert data.thumbnail(3) is None
         assert len(data.clouds[3])
+
+
+def test_how_a_place_was_last_seen_costs_nothing_but_itself(tmp_path: Path) -> None:
+    """A keyframe that borrows has its own cloud in the file, too: damaged, it is said, and left out."""
+    data, path = ring(12), tmp_path / "a.dpm2map"
+    for node in (10, 11):
+        data.clouds.borrow(node, Loan(node - 10, np.eye(4)))
+    save_as(data, path)
+    execute(path, "UPDATE payloads SET cloud = x'00' WHERE node = 10")
+    result = check_map(path)
+    assert (result.keyframes, result.lost, result.lost_clouds) == (12, 0, 0)
+    assert result.problems == ["keyframe 10: how its place was last seen is lost: its checksum is wrong"]
+    recovered(path)
+    with MapStore.open(path.with_name("recovered.dpm2map")) as store:
+        assert sorted(node for (node,) in store.rows("payloads", "node")) == [*range(10), 11]
 
 
 def test_a_destroyed_header(map_file: Path, keyframes: list[Keyframe]) -> None:

@@ -138,7 +138,26 @@ def test_moving_points_are_left_out_and_a_borrowed_cloud_is_moved() -> None:
     store.borrow(2, Loan(0, T))
     np.testing.assert_allclose(store[2], se3.transform(T, store[0]), atol=1e-5)
     np.testing.assert_allclose(store.origin(2), T[:3, 3])  # where the lender's LiDAR was
+
+
+AHEAD = np.array([1, 0, 0, 0], np.float32)
+
+
+def test_how_a_place_was_last_seen_is_kept() -> None:
+    """Of those that borrow in a place the newest has its own cloud, without what moves; the one before gives it up."""
+    store, (cloud, *_) = CloudStore(), clouds()
+    for number in range(4):
+        store.append(pack_cloud(cloud + number * AHEAD, np.array([1.0, 0, 2]) * number))
+        if number > 1:
+            assert store.borrow(number, Loan(0, np.eye(4))) == (None if number == 2 else 2)
+            store.set_moving(number, np.arange(100) % 3 == 0)
+    assert store.own.tolist() == [True, True, False, False]
+    assert store.kept.tolist() == [store.keeps(n) for n in range(4)] == [True, True, False, True]
     assert store.packed(2) is None
+    assert len(store.whole(2)) == len(store.seen(2)) == 0
+    np.testing.assert_allclose(store.seen(3), (cloud + 3 * AHEAD)[np.arange(100) % 3 > 0], atol=0.0051)
+    assert store.seen_from(3).tolist() == [3, 0, 6]
+    np.testing.assert_array_equal(store[3], store[0])
 
 
 def test_disk_that_fills_up() -> None:

@@ -97,7 +97,7 @@ def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyfra
     T[0, 3] = 2.0
     with MapStore.open(map_file, read_only=False) as store:
         store.begin_session()
-        store.write(Change([(12, keyframes[0], Loan(3, T), None)], poses={12: np.eye(4)}))
+        store.write(Change([(12, keyframes[0], None, None)], poses={12: np.eye(4)}, loans={12: Loan(3, T)}))
         store.write(change(13, keyframes[1], b"jpeg"))
     with MapStore.open(map_file) as store:
         data = load_map(store)
