@@ -196,10 +196,20 @@ class MotionState:
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
         self.left_open = np.zeros((3, 3))
         if moved and self._open:
-            # What the scene leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
-            of_velocity = along_open(registration.of_scene[3:, 3:], self.of_velocity)
-            self.covariance[3:, 3:] += of_velocity * self._open**2
-            self.left_open = of_velocity * seconds**2
+            whole, self.left_open = self._left_open(registration.of_scene[3:, 3:], seconds)
+            self.covariance[3:, 3:] += whole
+
+    def _left_open(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
+        """Covariances (3, 3), m, of the way along what the scene leaves open, since it does and in the last `seconds`.
+
+        What a scan leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
+        """
+        of_velocity, way = along_open(of_scene, self.of_velocity), self._open_way
+        whole, step = of_velocity * self._open**2, of_velocity * seconds**2
+        if way is None:
+            return whole, step
+        along = along_open(of_scene, np.eye(3))
+        return min(whole, along * way.sigma**2, key=np.trace), min(step, along * way.gained**2, key=np.trace)
 
     def _along_open(
         self, registration: Registration, swept: Swept | None, seconds: float, led: bool

@@ -25,11 +25,13 @@ class OpenWay:
     Attributes:
         velocity: (3,) m/s in the odometry's frame.
         leads: whether scans have contradicted it, from then on.
+        sigma: m, that of the way from where it began. gained: what the last frame added.
     """
 
     def __init__(self, T: Array, velocity: Array) -> None:
         """At T (4, 4), at a `velocity` (3,) m/s along its axes."""
         self.velocity, self.leads = T[:3, :3] @ velocity, False
+        self.sigma = self.gained = self._sigma_before = 0.0
         self._position, self._seconds = T[:3, 3], 0.0
 
     def follow(self, T_before: Array, T: Array, along: Array, step: Reckoned, seconds: float) -> Array:
@@ -47,9 +49,12 @@ class OpenWay:
         off = np.asarray(left @ (self._position - T[:3, 3]))
         self._position = T[:3, 3] + off
         t = self._seconds
-        sigma = float(np.linalg.norm([_SCANS, _SPEED * t, 0.5 * step.sigma * t**2]))
-        self.leads |= float(np.linalg.norm(off)) > _CONTRADICTS * sigma
+        allowed = _CONTRADICTS * float(np.linalg.norm([_SCANS, _SPEED * t, 0.5 * step.sigma * t**2]))
+        self.leads |= float(np.linalg.norm(off)) > allowed
+        # So far off it may be before the two contradict each other, each time to the same side.
+        self.gained = max(0.0, self._sigma_before + allowed - self.sigma)
+        self.sigma += self.gained
         if not self.leads and t >= _SPAN:
             self.velocity = self.velocity - _GAIN * off / t
-            self._position, self._seconds = T[:3, 3], 0.0
+            self._position, self._seconds, self._sigma_before = T[:3, 3], 0.0, self.sigma
         return off
