@@ -12,6 +12,7 @@ from dpm2_core.descriptors import LazyDescriptors
 from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.motion import OPEN
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
@@ -24,6 +25,7 @@ _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 _UNCONFIRMED = isotropic(np.radians(1), 0.3)
 """Covariance that a network pose has besides its own where the points fit nowhere near it: above a town, hovering, such
 poses err by 0.27 m and claim 0.06 m."""
+_MUCH_BETTER = 0.1  # confidence: more of the points fit, where a direction stays open
 _SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
 
 
@@ -83,7 +85,7 @@ class FusedScanRegistration:
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = neural.rejected("found where no vehicle can have come")
         if neural is not None and neural.ok and not prediction.known:
-            points, prediction = None, _also_from(neural, prediction)
+            points, prediction = self._from_both(scan, neural, prediction, points)
         points = points or self._geometric.located(scan, prediction)
         if neural is None:
             return points.because("neural: no descriptors yet")
@@ -92,6 +94,18 @@ class FusedScanRegistration:
         if not points.ok:
             return self._led(scan, neural, prediction)
         return self._weighed(scan, prediction, points, neural)
+
+    def _from_both(
+        self, scan: Scan, neural: Registration, prediction: Prediction, points: Registration | None
+    ) -> tuple[Registration, Prediction]:
+        """The points from the pose of the network as well, and what led there; unless that only lures them away."""
+        also = _also_from(neural, prediction)
+        found = self._geometric.located(scan, also)
+        if prediction.information is not None and not self._seen(scan):
+            points = points or self._geometric.located(scan, prediction)
+            if _lures(found, points):
+                return points, prediction
+        return found, also
 
     def _weighed(self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration) -> Registration:
         """What of two results counts."""
@@ -159,6 +173,14 @@ def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
     between = neural.covariance + np.linalg.inv(of_motion)
     xi = neural.covariance @ np.linalg.solve(between, se3.way(T, T_predicted))
     return replace(neural, T_target_source=se3.orthonormalized(T @ se3.exp(xi)))
+
+
+def _lures(found: Registration, points: Registration) -> bool:
+    """Whether a result is no reason to leave another one: it fits hardly better, and leaves a direction open.
+
+    A scan fits best where the map is as dense as it is: along a highway of 16 beams to 6 m away, up to 0.06 better.
+    """
+    return points.ok and found.worst_sigma >= OPEN and found.confidence <= points.confidence + _MUCH_BETTER
 
 
 def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
