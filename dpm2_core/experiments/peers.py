@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,12 +11,19 @@ import numpy as np
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
+from dpm2_core.geometry import se3
 
 _REACH = 100.0  # m, KISS-ICP's default
 
 
 class Peer(Protocol):
-    """Another odometry or SLAM."""
+    """Another odometry or SLAM.
+
+    Attributes:
+        at_end: whether its poses are those at the last point of each sweep, see `at_stamps`.
+    """
+
+    at_end: bool
 
     def add(self, frame: Frame) -> None:
         """Take the next frame in."""
@@ -39,6 +46,7 @@ class KissIcp:
         with needs("bench", "the peer kiss-icp"):
             from kiss_icp.kiss_icp import KissICP
 
+        self.at_end = deskew  # it moves all points to where the last one was seen from
         self._odometry, self._poses = KissICP(kiss_icp_config(threads, deskew)), list[Array]()
 
     def add(self, frame: Frame) -> None:
@@ -79,6 +87,7 @@ class KissSlam:
         config = load_config(None)
         config.odometry.preprocessing.deskew = deskew
         config.odometry.registration.max_num_threads = threads
+        self.at_end = deskew  # by KISS-ICP
         self._slam, self._frames = KissSLAM(config), 0
 
     def add(self, frame: Frame) -> None:
@@ -96,6 +105,8 @@ class KissSlam:
 
 class SmallGicp:
     """K. Koide, "small_gicp", JOSS 2024: its voxelized GICP, frame to model, from constant velocity."""
+
+    at_end = False
 
     def __init__(self, threads: int, deskew: bool) -> None:
         """As `KissIcp`; it has no means to deskew."""
@@ -145,3 +156,24 @@ def cloud_and_times(frame: Frame) -> tuple[Array, Array]:
     times = frame.time_offset[sound].astype(np.float64)
     span = float(np.ptp(times)) if len(times) else 0.0
     return cloud, (times - times.min()) / span if span > 0 else np.zeros(len(times))
+
+
+def end_of(frame: Frame) -> int:
+    """When the last point of a sweep was seen, ns; the stamp where points have no times."""
+    if frame.time_offset is None:
+        return frame.stamp
+    times = frame.time_offset[np.isfinite(frame.points[:, :3]).all(1)]
+    return frame.stamp + (round(float(times.max()) * 1e9) if len(times) else 0)
+
+
+def at_stamps(poses: Array, ends: Sequence[int], stamps: Sequence[int]) -> Array:
+    """Poses (N, 4, 4) at the `ends` (N,) of sweeps, ns, as those at their `stamps` (N,): on the way from the end of the
+    sweep before; the first on the way to the second, prolonged."""
+    if len(poses) < 2:
+        return poses
+    end, stamp = np.asarray(ends, np.float64), np.asarray(stamps, np.float64)
+    number = np.arange(len(poses))
+    before, after = np.maximum(number - 1, 0), np.maximum(number, 1)
+    span, own = end[after] - end[before], np.minimum(number, 1.0)
+    part = np.divide(stamp - end[before], span, out=own, where=span > 0)  # its own where a clock went back
+    return se3.interpolated(poses[before], poses[after], np.clip(part, -1, 1))

@@ -30,7 +30,7 @@ from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import FRAMES, METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
-from dpm2_core.experiments.peers import make_peer
+from dpm2_core.experiments.peers import at_stamps, end_of, make_peer
 from dpm2_core.files import write_json
 from dpm2_core.fleet.part import Advance, Figures, counted
 from dpm2_core.frame import Array
@@ -81,14 +81,14 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
 
 
 def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
-    """Another program on the same frames, read one at a time, on all processors.
+    """Another program on the same frames, read one at a time, on all processors; its poses are those at the stamps.
 
     Raises:
         UsageError: it is not installed, or as `own`. Dpm2Error: it gave another number of poses than frames.
     """
     source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
-    program, stamps, index, seconds = None, list[int](), list[int](), list[float]()
+    program, stamps, ends, index, seconds = None, list[int](), list[int](), list[int](), list[float]()
     for frame in prefetch(source.frames(start, stop)):
         if program is None:
             program = make_peer(name, processors(), frame.time_offset is not None)
@@ -96,12 +96,15 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
         program.add(frame)
         seconds.append(perf_counter() - began)
         stamps.append(frame.stamp)
+        ends.append(end_of(frame))
         index.append(frame.index)
         advance(len(stamps), stop - start)
     assert program is not None  # there are frames
     poses = program.poses()
     if len(poses) != len(stamps):
         raise Dpm2Error(f"{name}: {len(poses)} poses for {len(stamps)} frames")
+    if program.at_end:  # the truth is that at the stamps
+        poses = at_stamps(poses, ends, stamps)
     write_tum(folder / TRAJECTORY, stamps, poses)
     write_frames(folder / FRAMES, [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
                  {"total": seconds})  # fmt: skip
