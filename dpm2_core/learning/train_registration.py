@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from pydantic import Field
@@ -40,6 +40,7 @@ class RegistrationTraining(nn.Module):
         self.loss = loss
         self.model = DeepPointMap2(network)
         self.model.encoder.requires_grad_(encoder)
+        self._frozen = not encoder
         channels = self.model.encoder.points.channels
         sizes = [stage.points for stage in network.points.stages]
         self.level = min(range(len(sizes)), key=lambda i: abs(sizes[i] - 256))  # key-points as dense as descriptors
@@ -49,6 +50,13 @@ class RegistrationTraining(nn.Module):
         if network.image.backbone != "none" and not self.model.encoder.painted and loss.image > 0:
             own = None if fusion is None else fusion.pixel
             self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
+
+    def train(self, mode: bool = True) -> Self:
+        """But for an encoder that does not learn, running means included."""
+        super().train(mode)
+        if self._frozen:
+            self.model.encoder.eval()
+        return self
 
     def forward(
         self, points: PointBatch, views: Views | None, plans: tuple[SetPairs, ...]

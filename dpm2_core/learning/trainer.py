@@ -173,7 +173,7 @@ class Trainer(Generic[M]):
         """
         keep_memory()
         with process_group() as (rank, world, device):
-            module = self.module.to(device)
+            module = self.module.to(device).train()  # it says itself what of it is frozen
             ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
             optimizer = make_optimizer(module, self.settings)
             checkpoint = self.out / CHECKPOINT

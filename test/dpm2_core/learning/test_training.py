@@ -12,8 +12,9 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import count, repeat
+from itertools import accumulate, count, repeat
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ from dpm2_core.learning.train_registration import (
     train_registration,
 )
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer, learning_rate, make_optimizer
+from dpm2_core.network.pretrained import weights_id
 from dpm2_core.network.weights import network_settings, read_metadata
 
 from ...helpers import ranks
@@ -330,6 +332,46 @@ def test_overlap_leaves_the_running_means_of_the_encoder_as_they_are() -> None:
     module = OverlapTraining(tiny()).train()
     assert module.model.decoder.training
     assert not any(part.training for part in module.model.encoder.modules())
+
+
+class Normed(torch.nn.Module):
+    """Features of an image as timm's ResNets make them, with batch norms; of strides 8 and 16."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.feature_info = SimpleNamespace(channels=lambda: [8, 8], reduction=lambda: [8, 16])
+        widths = ((3, 8, 8), (8, 8, 2))
+        self.stages = torch.nn.ModuleList(
+            torch.nn.Sequential(torch.nn.Conv2d(a, b, stride, stride), torch.nn.BatchNorm2d(b))
+            for a, b, stride in widths
+        )
+
+    def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
+        return list(accumulate(self.stages, lambda y, stage: stage(y), initial=x))[1:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["phase 1 of the decoder alone", "phase 2"])
+def test_an_encoder_that_does_not_learn_keeps_its_running_means(
+    phase: str, settings: RegistrationTrainingSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A backbone of timm has such. They were those of the training's last batches: descriptors were no longer those of
+    the maps, which these weights then refused."""
+    monkeypatch.setitem(sys.modules, "timm", SimpleNamespace(create_model=lambda *_, **__: Normed()))
+    network = merged(settings.network, {"image": {"backbone": "timm:normed"}})
+    settings = settings.model_copy(update={"network": network, "validation": ""})
+    start = train_registration(settings, tmp_path / "one")
+    if phase == "phase 2":
+        weights = train_overlap(_overlap(settings, start, steps=2), tmp_path / "two")
+    else:
+        alone = settings.model_copy(update={"start": str(start), "encoder": False})
+        weights = train_registration(alone, tmp_path / "two")
+    before, after = load_file(start), load_file(weights)
+    assert any("running_mean" in name for name in before)
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert not any(name.startswith("encoder.") for name in changed)
+    assert weights_id(str(start)).split()[1] == weights_id(str(weights)).split()[1]
 
 
 def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:
