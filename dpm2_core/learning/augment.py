@@ -50,6 +50,13 @@ class AugmentSettings(Settings):
     """The same, m."""
 
 
+UNCHANGED = AugmentSettings(
+    drop=0, occlusion=0, beams=0, jitter=0, yaw=0, tilt=0, shift=(0, 0, 0), image_drop=0, image_black=0, exposure=0,
+    colour=0, extrinsic_rotation=0, extrinsic_translation=0,
+)  # fmt: skip
+"""Samples as they were packed, but for the order of their points."""
+
+
 def augment(sample: Sample, settings: AugmentSettings, noise: np.random.Generator) -> Sample:
     """A changed copy; its pose and extrinsics fit the changed cloud."""
     cloud = sample.cloud

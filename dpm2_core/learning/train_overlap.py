@@ -19,6 +19,7 @@ from dpm2_core.config import Settings
 from dpm2_core.data.packed import PackedDrive, open_packed
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3_torch
+from dpm2_core.learning.augment import UNCHANGED
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.learning.dataset import GroupDataset, GroupSettings
 from dpm2_core.learning.trainer import OptimizerSettings, Trainer
@@ -167,9 +168,10 @@ def validator(
     settings: OverlapTrainingSettings, network: NetworkSettings
 ) -> Callable[[OverlapTraining], dict[str, float]]:
     """A function that measures the average precision on fixed batches of unseen worlds, by their images if they have
-    any."""
+    any; scans are as they are, and each counts alike, whatever the training makes of its own."""
     images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
-    options = settings.data.model_copy(update={"packed": {settings.validation: 1.0}, "images": images})
+    measured = {"packed": {settings.validation: 1.0}, "images": images, "augment": UNCHANGED, "emphasis": {}}
+    options = settings.data.model_copy(update=measured)
     data = GroupDataset(options, network, _draw, seed=1)
     batch = cache(lambda number: data[number, 0])
 

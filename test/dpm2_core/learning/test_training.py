@@ -27,12 +27,13 @@ from dpm2_core.config import merged, settings_from
 from dpm2_core.console import QUIET
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import AugmentSettings
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, read_log, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.train_image import ImageTrainingSettings
-from dpm2_core.learning.train_overlap import OverlapTraining, OverlapTrainingSettings, train_overlap
+from dpm2_core.learning.train_overlap import OverlapTraining, OverlapTrainingSettings, train_overlap, validator
 from dpm2_core.learning.train_registration import (
     RegistrationTraining,
     RegistrationTrainingSettings,
@@ -325,6 +326,22 @@ def test_overlap_with_images_is_validated_on_worlds_without(
     second = second.model_copy(update={"validation": str(tmp_path / "val"), "validation_batches": 1})
     train_overlap(second, tmp_path / "two")
     assert "average_precision" in (tmp_path / "two" / "log.jsonl").read_text()
+
+
+def test_what_a_training_makes_of_its_scans_is_not_measured(samples: list[Sample], tmp_path: Path) -> None:
+    """Trainings that augment in different ways were measured on different scans, 20 m apart or not by where the
+    augmentation had shifted them."""
+    apart = se3.exp([0, 0, 0, 1, 0, 0])
+    drive = [s._replace(pose=np.linalg.matrix_power(apart, 9 * k)) for k, s in enumerate(samples)]
+    write_packed(tmp_path / "val" / "world", drive, {"source": "boxes", "preset": "city"})
+    torch.manual_seed(0)
+    module, figures = OverlapTraining(tiny()).eval(), []
+    much = {"drop": 0.8, "shift": (9, 9, 0)}
+    for change in ({}, {"augment": much}, {"emphasis": {"city": 0}}):
+        data = {"packed": {}, "groups": 2, "workers": 0, **change}
+        tree = {"start": "small", "data": data, "validation": str(tmp_path / "val"), "validation_batches": 2}
+        figures.append(validator(settings_from(OverlapTrainingSettings, tree), tiny())(module))
+    assert figures[0] == figures[1] == figures[2]
 
 
 def test_overlap_leaves_the_running_means_of_the_encoder_as_they_are() -> None:
