@@ -9,6 +9,7 @@ from typing import Any
 
 from dpm2_core.config import load_settings, merged
 from dpm2_core.data.packed import PackedDrive, packed_digest
+from dpm2_core.errors import UsageError
 from dpm2_core.experiments.slam_part import open_drive
 from dpm2_core.fleet.part import Advance, Figures
 from dpm2_core.learning.begun import begin_training
@@ -41,10 +42,17 @@ def training_of(
     """The training of a variant on packed drives, each as often as it has frames.
 
     `network`: its changes to the network of the weights that it starts from.
+
+    Raises:
+        UsageError: settings that there are not, or that ask for other weights or another network than `start` is.
     """
     chosen = load_settings(RegistrationTrainingSettings, config, settings)
     path = weights_path(start)
     own = network_settings(path)
+    if chosen.start:
+        raise UsageError(f"start {chosen.start}: what all variants start from is named by --weights")
+    if "preset" in chosen.model_fields_set and chosen.preset != own.preset:
+        raise UsageError(f"preset {chosen.preset}: the network is that of --weights {start}, of preset {own.preset}")
     tree = merged(merged(own.model_dump(mode="json"), chosen.network), network)
     data = chosen.data
     if not data.packed:

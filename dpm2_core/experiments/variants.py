@@ -26,7 +26,7 @@ from dpm2_core.experiments.sequences import (
 )
 from dpm2_core.experiments.slam_part import drive_content, open_drive
 from dpm2_core.experiments.table import MEAN, ResultTable
-from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN
+from dpm2_core.experiments.variant_part import DRIVE, PACK, TRAIN, training_of
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.pretrained import weights_path
@@ -76,7 +76,11 @@ class VariantTable:
         return Experiment(frozenset(uses), self.parts, self.findings)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
-        """Packed drives, a training of each variant, and each on every sequence."""
+        """Packed drives, a training of each variant, and each on every sequence.
+
+        Raises:
+            UsageError: no such sequences or weights, or settings of the training that cannot be; before all is packed.
+        """
         sequences = present(request, TESTED, ORIGINAL_POSES)
         start = request.weights or "small"
         packs = []
@@ -85,11 +89,12 @@ class VariantTable:
             of = {"data": request.data, "weights": start, "settings": asked}
             content = drive_content(request.data, asked)
             packs.append(Part(f"packed/{sequence}", PACK, of, [weights_path(start)], content=content))
-        training = {
+        training: dict[str, Any] = {
             "config": request.config,
             "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
             "start": start,
         }
+        training_of(**training, network={}, packed=())
         arguments = {"training": training, "packed": [request.out / pack.name / DRIVE for pack in packs]}
         content = " ".join(pack.content for pack in packs)
         inputs = [weights_path(start), *request.config_files]

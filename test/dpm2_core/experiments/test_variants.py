@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from dpm2_core.errors import UsageError
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.variant_part import TRAIN
 from dpm2_core.experiments.variants import TABLE_3, fusion
@@ -92,6 +93,21 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
     assert not any(figures_of(part, tmp_path / "out") for part in both)
     config.write_text("pairs: 2\n")
     assert not any(figures_of(part, tmp_path / "out") for part in trainings(request))
+
+
+@pytest.mark.parametrize(("asked", "said"), [
+    ("preset=paper", "preset paper: the network is that of --weights .*tiny.safetensors, of preset tiny"),
+    ("start=small", "start small: what all variants start from is named by --weights"),
+    ("optimiser.stepps=3", "unknown key optimiser.stepps"),
+])  # fmt: skip
+def test_settings_that_no_variant_is_trained_by_are_errors(
+    asked: str, said: str, kitti: Path, weights: Path, tmp_path: Path
+) -> None:
+    """Another preset, and other weights to start from, changed nothing, without a word: the table was of `small`. What
+    is mistyped was an error only after all drives had been packed."""
+    with pytest.raises(UsageError, match=said):
+        fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=(asked,)))
+    fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=("preset=tiny",)))  # what it is anyway
 
 
 def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, weights: Path, tmp_path: Path) -> None:
