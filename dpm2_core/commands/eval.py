@@ -23,6 +23,7 @@ OTHER_AXES = (
     "the two run alike, but along other axes, as those of LiDAR and left camera do (--calib takes the estimate "
     "from one to the other), or poses without rotations: then only APE means something"
 )
+UNESTIMATED = "without a pose in the estimate"
 FRAME_OF_DRIVE = "{}, as in the files of this kind that dpm2 run writes"
 
 
@@ -71,7 +72,8 @@ def eval_(
     both = known(true) & known(est_poses)
     if have_other_axes(true[both], est_poses[both]):
         note(OTHER_AXES)
-    show(metrics_table(metrics, title=f"{est} against {gt}", frame=frame), figures, json_file)
+    table = metrics_table(metrics, title=f"{est} against {gt}", frame=frame, failed=UNESTIMATED)
+    show(table, figures, json_file)
 
 
 def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:

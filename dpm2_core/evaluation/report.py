@@ -10,8 +10,9 @@ from dpm2_core.evaluation.metrics import Metrics
 from dpm2_core.tables import FigureTable
 
 
-def metrics_table(metrics: Metrics, title: str, frame: str) -> FigureTable:
-    """The figures, each row with its definition; `frame` says which sensor's poses were compared."""
+def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None = None) -> FigureTable:
+    """The figures, each row with its definition; `frame` says which sensor's poses were compared, `failed` what failed
+    frames are, where no run has counted them and its breaks."""
     caption = f"Sensor frame: {frame}." + (f" Truth: {metrics.truth}." if metrics.truth else "")
     how_measured = ["how it is measured"]
     table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)
@@ -22,8 +23,8 @@ def metrics_table(metrics: Metrics, title: str, frame: str) -> FigureTable:
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
         how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
-    states = f"{metrics.failed_frames} failed, {metrics.breaks} breaks; path {_value(metrics.path_length_m, 'm')}"
-    table.add_row("frames", str(metrics.frames), states)
+    states = f"{metrics.failed_frames} {failed or f'failed, {metrics.breaks} breaks'}"
+    table.add_row("frames", str(metrics.frames), f"{states}; true path {_value(metrics.path_length_m, 'm')}")
     table.add_row("KITTI t_err", _value(t_err, "%"), how)
     table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")
     for part in metrics.per_length if metrics.segments else ():

@@ -46,6 +46,16 @@ def _drive(count: int = 60) -> np.ndarray:
     return poses
 
 
+def test_frames_that_an_estimate_is_not_of_are_not_said_to_have_failed(tmp_path: Path) -> None:
+    """Of a run with `--frames` it said "10 failed, 0 breaks", and the length of all the drive as its path."""
+    write_kitti(tmp_path / "gt.txt", _drive())
+    write_kitti(tmp_path / "est.txt", _drive()[:-10], range(50))
+    shown = " ".join(succeeded("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt").stdout.split())
+    assert "10 without a pose in the estimate; true path 59.0000 m" in shown
+    assert "failed" not in shown
+    assert "breaks" not in shown
+
+
 def test_the_json_holds_the_fixed_keys_and_how_they_were_measured(tmp_path: Path) -> None:
     est = _drive()
     est[:, 2, 3] *= 1.01
