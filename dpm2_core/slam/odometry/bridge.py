@@ -19,6 +19,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import between, covariance, predicted, spread, velocity_change
 from dpm2_core.slam.odometry.inertial import InertialMotion, Reckoned
+from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
@@ -41,14 +42,6 @@ _SWAY = 0.05  # rad/s
 _EXCLUDED = 16.0  # squared sigmas of the way that an IMU knows
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a vehicle can do and a result must reach: `acceleration`, m/s2; `sigma` of its position at most, m."""
-
-    acceleration: float
-    sigma: float
-
-
 @dataclass(frozen=True, eq=False)
 class _Tie:
     """One scan twice: registered to the map before, and its pose T_odom_lidar (4, 4) in the new stretch."""
@@ -69,35 +62,32 @@ class Bridge:
         held: whether they were held back on their way: the pause may have been as short as a period.
     """
 
-    def __init__(
-        self, registration: ScanRegistration, T: Array, twist: Array | None, of_velocity: Array, limits: Limits
-    ) -> None:
-        """`T` (4, 4) is the last pose before the pause, `of_velocity` (3, 3) [m/s] the covariance of that there."""
+    def __init__(self, registration: ScanRegistration, motion: MotionState, left: float) -> None:
+        """The last pose before the pause is the registered one of `motion`, at `left` s by the clock of the stream."""
         self.registration = registration
-        self.twist = twist
-        self._of_velocity = of_velocity
+        self.twist = motion.twist
         self.tries, self.agreed = 0, False
         self.held = self._stepped = False
-        self._T = T
-        self._limits = limits
+        self._T, self._of_velocity, self._left = motion.T_registered, motion.of_velocity, left
+        self._settings = motion.settings
         self._ties: list[_Tie] = []
 
     def begin(
         self,
-        seconds: float,
+        now: float,
         T_other: Array | None,
         imu: InertialMotion | None,
         reckoned: Reckoned | None,
         stepped: bool,
     ) -> Array:
-        """A new stretch, so long after the last pose before the pause: where it begins (4, 4).
+        """A new stretch, at `now` s by the clock of the stream: where it begins (4, 4).
 
         Args:
             T_other: there, if another odometry knows the way. imu, reckoned: it may know the turn since that pose, and
                 the way.
             stepped: it is so long by a clock that was set meanwhile.
         """
-        self._seconds = seconds
+        self._seconds = seconds = now - self._left
         self._stepped |= stepped
         self.held = self._stepped
         self._ties.clear()
@@ -109,14 +99,14 @@ class Bridge:
         if T_other is None and reckoned is not None:
             self._of_begin = reckoned.covariance
         else:
-            acceleration, of_velocity = self._limits.acceleration, self._of_velocity
+            acceleration, of_velocity = self._settings.steadiness, self._of_velocity
             of_turn = None if imu is None else imu.covariance(seconds)
             self._of_begin = covariance(self._speed, seconds, acceleration, of_velocity, of_turn=of_turn)
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
         """Of the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before, less certain."""
-        sigma = dt * velocity_change(self._speed, self._seconds, self._limits.acceleration)
+        sigma = dt * velocity_change(self._speed, self._seconds, self._settings.steadiness)
         information = np.linalg.inv(spread(sigma, dt, self._of_velocity)).astype(np.float64)
         return Prediction([predicted(T, self._motion, dt)], 2.0, information)
 
@@ -193,7 +183,7 @@ class Bridge:
         """Why a result says nothing."""
         if not result.ok:
             return result.reason
-        if (sigma := result.worst_sigma) > self._limits.sigma:
+        if (sigma := result.worst_sigma) > self._settings.degraded_sigma:
             return f"after a pause: position uncertain by {sigma:.2f} m"
         return ""
 
@@ -217,9 +207,9 @@ class Bridge:
         if self.held:  # the time that fits best
             seconds = float(np.clip(way @ mean / (mean @ mean + 1e-9), 0.0, seconds))
         off = float(np.linalg.norm(way - seconds * mean))
-        if off > _NEAR + self._limits.acceleration * self._seconds**2 / 4:
+        if off > _NEAR + self._settings.steadiness * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
-        speeds, most = np.linalg.norm([before, after], axis=1), self._limits.acceleration
+        speeds, most = np.linalg.norm([before, after], axis=1), self._settings.steadiness
         if not self.held and speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
             # It did not reverse: it has come at least as far as it needs to stop, and to be as fast again.
             ahead = mean / np.linalg.norm(mean)

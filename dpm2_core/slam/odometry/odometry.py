@@ -18,7 +18,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import period_by_motion
 from dpm2_core.geometry.scale import is_enclosed
 from dpm2_core.geometry.sweep import Sweep
-from dpm2_core.slam.odometry.bridge import Bridge, Limits
+from dpm2_core.slam.odometry.bridge import Bridge
 from dpm2_core.slam.odometry.keyframe_selection import KeyframeSelector, KeyframeSettings
 from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.other import OtherMotion
@@ -79,7 +79,6 @@ class Odometry:
         self._first: Frame | None = None  # until the second one is registered
         self._first_sweep = Sweep()
         self._bridge: Bridge | None = None
-        self._left = 0.0  # the time of the last pose before the pause that is being bridged
         self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether a loop may cross it
         self._registration = self._tools.registration.fresh()
         self._keyframes.reset()
@@ -229,12 +228,10 @@ class Odometry:
         motion, imu, reckoned, step = self._motion, None, None, self._motion.step
         if self._bridge is None:
             imu, reckoned, step = motion.inertial, motion.reckoned, None if motion.other is None else motion.other.step
-            limits = Limits(self._settings.steadiness, self._settings.degraded_sigma)
-            self._bridge = Bridge(self._registration, motion.T_registered, motion.twist, motion.of_velocity, limits)
-            self._left = self._clock.now - motion.seconds - dt
+            self._bridge = Bridge(self._registration, motion, self._clock.now - motion.seconds - dt)
         self._registration, self._first = self._registration.fresh(), None
         T_other = None if step is None else motion.T_registered @ step.T
-        motion.begin(self._bridge.begin(self._clock.now - self._left, T_other, imu, reckoned, stepped))
+        motion.begin(self._bridge.begin(self._clock.now, T_other, imu, reckoned, stepped))
         return motion.T
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
