@@ -82,7 +82,6 @@ class InertialMotion:
         self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
         self._measured: Array | None = None  # the same, believed or not
         self._before: int | None = None  # stamp of the last registered frame
-        self._now = 0  # that of the last frame
         self.turns = False
         self._doubt = 1.0
         self._span = _Span(np.eye(3))
@@ -93,7 +92,6 @@ class InertialMotion:
         if self.turns:  # the last frame was not registered
             self._remember(_UNSEEN)
         self._join(frame)
-        self._now = frame.stamp
         self.turning = self._measured = None
         if self._before is None:
             self.problem = "" if len(self._samples) else "no samples"
@@ -124,14 +122,14 @@ class InertialMotion:
         of_turn = _TURN**2 + (_SHARE * angle) ** 2
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
-    def step(self, R: Array, velocity: Array, of_velocity: Array) -> Reckoned | None:
+    def step(self, now: int, R: Array, velocity: Array, of_velocity: Array) -> Reckoned | None:
         """The way since the last registered frame, from its velocity on by turns and forces; None where it is unknown.
 
         Args:
-            R: (3, 3) of that frame in the odometry's frame. velocity: (3,) m/s there, along its axes, of the covariance
-                `of_velocity` (3, 3).
+            now: stamp of the new frame, ns. R: (3, 3) of the last one in the odometry's frame. velocity: (3,) m/s
+                there, along its axes, of the covariance `of_velocity` (3, 3).
         """
-        before, now = self._before, self._now
+        before = self._before
         if before is None or self.turn is None or self._vertical.sigma > _SHAKEN:
             return None
         at, forces = self._forces(before, now)

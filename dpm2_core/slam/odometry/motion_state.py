@@ -77,13 +77,13 @@ class MotionState:
             return frame
         frame = self.inertial.look(frame)
         if self.twist is not None:
-            self.reckoned = self.inertial.step(self.T_registered[:3, :3], self.twist[3:], self.of_velocity)
+            R = self.T_registered[:3, :3]
+            self.reckoned = self.inertial.step(frame.stamp, R, self.twist[3:], self.of_velocity)
         return frame
 
     def begin(self, T: Array) -> None:
-        """A map begins at T (4, 4), to which no motion has led."""
-        self.T, self.twist, self.sweep, self.of_velocity, self.reckoned = T, None, None, ANY_VELOCITY, None
-        self._open_way = None
+        """A map begins with a frame at T (4, 4), to which no motion has led, and which is registered next."""
+        self.T, self.twist, self.of_velocity = T, None, ANY_VELOCITY
 
     @property
     def known_twist(self) -> Array:

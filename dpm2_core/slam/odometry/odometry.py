@@ -184,9 +184,8 @@ class Odometry:
         """What an IMU and another odometry say of a frame, `seconds` after the last registered one: the frame with what
         is of use, and the twist (6,) that leads to it."""
         motion = self._motion
-        twist = motion.ahead
         frame = motion.look(frame, starts=not len(self._registration) and self._bridge is None)
-        twist = motion.turned(twist, seconds)
+        twist = motion.turned(motion.ahead, seconds)
         frame = self._without_repetitions(frame, float(np.linalg.norm(twist[3:])))
         if frame.guess is not None and motion.other is None:
             motion.other = OtherMotion(self._settings.steadiness)
@@ -292,13 +291,11 @@ class Odometry:
         return match, dt
 
     def _unbent(self, frame: Frame, match: Match, twist: Array, dt: float) -> Match:
-        """Of a scan that was prepared by a motion (6,) other than the one found since, `seconds` after the last
-        registered frame: prepared and registered anew; the first scan of a map with it."""
+        """Of a scan that was prepared by a motion (6,) other than the one found since, `dt` s after the frame before:
+        prepared and registered anew; the first scan of a map with it."""
         if self._first is None:
-            match = self._matcher.straightened(frame, match, twist, dt, self._sweep.span / 2)
-        if self._first is not None and match.result.ok:
-            match = self._begin_again(self._first, frame, match, self._motion.seconds + dt)
-        return match
+            return self._matcher.straightened(frame, match, twist, dt, self._sweep.span / 2)
+        return self._begin_again(self._first, frame, match, self._motion.seconds + dt) if match.result.ok else match
 
     def _begin_again(self, first: Frame, frame: Frame, match: Match, seconds: float) -> Match:
         """The second scan has shown the velocity, `seconds` later: undo the motion in the first too; register anew."""
