@@ -156,8 +156,8 @@ class MotionState:
         """Of the sweep of a frame at T (4, 4), `seconds` after the last registered one; it began `half` s before."""
         if self.sweep is not None:
             return self.sweep.next(seconds, half, self.settings.steadiness)
-        twist = se3.log(se3.inverse(self.T_registered) @ T) / seconds
-        return begun_steadily(self.T_registered, twist, seconds, half, self.settings.steadiness)
+        before, steadiness = self.T_registered, self.settings.steadiness
+        return begun_steadily(before, se3.way(before, T) / seconds, seconds, half, steadiness)
 
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
@@ -169,7 +169,7 @@ class MotionState:
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
         """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
         time = self.seconds + dt
-        meters, degrees = se3.magnitude(se3.inverse(T_predicted) @ result.T_target_source)
+        meters, degrees = se3.apart(T_predicted, result.T_target_source)
         unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
         if result.ok and meters > 0.5 + unknown + self.settings.max_acceleration * time * time:
             return result.rejected(f"{meters:.1f} m from the prediction")

@@ -144,7 +144,8 @@ class GeometricRegistration:
         # The first of equals: least motion, where a tunnel fits anywhere.
         chosen = next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
         likely = [r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - DISTINCT]
-        return _with_spread(chosen, likely)
+        ways = [se3.way(chosen.T_target_source, other.T_target_source) for other in likely]
+        return chosen.doubted(max(ways, key=lambda xi: float(np.linalg.norm(xi[3:]))))
 
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
         """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.
@@ -328,10 +329,3 @@ def _covariance(H: Array) -> Array:
     information[3:, 3:] -= _NORMAL_NOISE**2 * np.trace(information[3:, 3:]) * np.eye(3)
     eigenvalues, axes = np.linalg.eigh(information)
     return (axes / np.maximum(eigenvalues, 1.0)) @ axes.T  # no direction is worse than 1 m or 1 rad
-
-
-def _with_spread(chosen: Registration, likely: Sequence[Registration]) -> Registration:
-    """With the way (6,) to the farthest of the results that are nearly as likely in its covariance."""
-    T = se3.inverse(chosen.T_target_source)
-    way = max((se3.log(T @ other.T_target_source) for other in likely), key=lambda xi: float(np.linalg.norm(xi[3:])))
-    return chosen.doubted(way)
