@@ -141,20 +141,14 @@ class CorruptedSource:
         """The frames start..stop-1, the same ones whether or not those before are read."""
         late = self._settings.time_offset
         before: deque[Frame] = deque()
-        first = self._first_needed(start)
+        first = max(0, start - int(np.ceil(late * 20)))  # at 5 Hz or more as many as the images are late
         for position, frame in enumerate(self._source.frames(first, stop), first):
-            images = frame.images
-            if late:
-                before.append(frame)
-                while len(before) > 1 and frame.stamp - before[1].stamp >= round(late * 1e9):
-                    before.popleft()
-                images = before[0].images if frame.stamp - before[0].stamp >= round(late * 1e9) else ()
+            before.append(frame)
+            while len(before) > 1 and frame.stamp - before[1].stamp >= round(late * 1e9):
+                before.popleft()
+            images = before[0].images if frame.stamp - before[0].stamp >= round(late * 1e9) else ()
             if position >= start:
                 yield self._corrupted(replace(frame, images=images), position)
-
-    def _first_needed(self, start: int) -> int:
-        """With late images the frames before are read too, at 5 Hz or more as many as the delay is long."""
-        return max(0, start - int(np.ceil(self._settings.time_offset * 20))) if self._settings.time_offset else start
 
     def _chosen(self, name: str, share: float) -> NDArray[np.bool_]:
         """(len,) True for exactly that fraction of the frames."""
