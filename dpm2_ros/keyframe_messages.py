@@ -149,8 +149,6 @@ def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]
     if not message.width:
         return None, ""
     feature = next((f for f in message.fields if f.name.partition(":")[0] == _FEATURE), None)
-    if feature is not None and feature.datatype == PointField.UINT16:
-        return None, ""  # float16, of a robot with an earlier dpm2: the receiver makes its own of the cloud
     channels = 0 if feature is None or feature.datatype != PointField.INT8 else feature.count
     if not 0 < channels <= _MOST_CHANNELS:
         raise RejectedError("descriptors", f"a cloud that holds descriptors of {channels} channels of int8")
