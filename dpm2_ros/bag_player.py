@@ -27,7 +27,7 @@ from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
 from dpm2_ros.lockstep import ODOMETRY, Lockstep
 from dpm2_ros.message_types import message_type
-from dpm2_ros.recorded_results import TF, is_result, odometry_frames, published_here, without_frames
+from dpm2_ros.recorded_results import is_result, odometry_frames, published_here, without_frames
 from dpm2_ros.runtime import STOP, end_ros, ros_context
 from dpm2_ros.stamps import stamp_to_msg
 from dpm2_ros.tf_message import MOST_TRANSFORMS, TFMessage
@@ -276,7 +276,10 @@ class BagPlayer:
                 return
             if log_time < first:
                 continue
-            if played := without_frames(bytes(data), self._frames) if topic == TF and self._frames else bytes(data):
+            played = bytes(data)
+            if topic == topics.TF and self._frames:
+                played = without_frames(played, self._frames)
+            if played:
                 yield topic, log_time, played
 
     def _why_nothing(self) -> str:

@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
 from dpm2_core.data.livox import LIVOX
+from dpm2_core.data.message_kinds import CLOUD, IMAGES
 from dpm2_ros.guard import take_waiting
 from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
@@ -78,10 +79,10 @@ class MatchedSubscription:
     def _kind_of(self, offered: set[str]) -> type:
         """What to subscribe to, given the types of the publishers."""
         if self._wanted in _IMAGES:
-            kinds = [kind for kind in _IMAGES if f"sensor_msgs/msg/{kind.__name__}" in offered]
+            kinds = [kind for kind, name in zip(_IMAGES, IMAGES, strict=True) if name in offered]
             return kinds[0] if len(kinds) == 1 else self._wanted
         custom = sorted(offered.intersection(LIVOX))
-        if self._wanted is not PointCloud2 or not custom or "sensor_msgs/msg/PointCloud2" in offered:
+        if self._wanted is not PointCloud2 or not custom or CLOUD in offered:
             return self._wanted
         found = message_type(custom[0])
         if found is None:

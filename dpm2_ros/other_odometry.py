@@ -14,6 +14,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
 from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.topics import TF
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Comparison
@@ -55,7 +56,7 @@ class OtherOdometry:
         self._static, self._frame = static, ros.odom_frame
         self._history, self._changed = TransformHistory(), threading.Condition()
         self._child = ""  # whose pose the topic has
-        self.source = node.resolve_topic_name("/tf" if ros.odom_source == "tf" else ros.odom_topic)
+        self.source = node.resolve_topic_name(TF if ros.odom_source == "tf" else ros.odom_topic)
         self.problem, self.missed, self.found, self.outweighed = f"nothing of use on {self.source} yet", 0, 0, 0
         self._in_a_row = 0  # clouds without it
         self._unmet: tuple[int, str, float] | None = None  # the last such: stamp, base, and until when it was to wait
@@ -69,7 +70,7 @@ class OtherOdometry:
         elif TFMessage is None:
             raise UsageError("ros.odom_source: tf needs tf2_msgs; `python -m dpm2_ros.build_tf2_msgs` builds it")
         else:
-            node.create_subscription(TFMessage, "/tf", self._on_tf, QoSProfile(depth=100))
+            node.create_subscription(TFMessage, TF, self._on_tf, QoSProfile(depth=100))
 
     def guess(self, stamp: int, base: str, T_base_lidar: Array) -> Guess | None:
         """Where it has the LiDAR at a stamp (ns), as soon as it says so; None where it does not."""

@@ -13,8 +13,6 @@ from dpm2_core.data.bag_file import Bag
 from dpm2_ros.lockstep import ODOMETRY
 from dpm2_ros.tf_message import TFMessage
 
-TF = "/tf"
-
 
 def is_result(topic: str) -> bool:
     """Whether it is a topic of dpm2's own."""

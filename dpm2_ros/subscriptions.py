@@ -22,7 +22,7 @@ from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside
 from dpm2_core.data.imu import ImuBuffer
-from dpm2_core.data.livox import LIVOX
+from dpm2_core.data.message_kinds import CLOUDS
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import checked_correction
@@ -152,11 +152,10 @@ class Inputs:
         own = {topic for topic, _ in self._node.get_publisher_names_and_types_by_node(
             self._node.get_name(), self._node.get_namespace())}  # fmt: skip
         own.add(self.calibration.points_topic)
-        wanted = {"sensor_msgs/msg/PointCloud2", *LIVOX}
         return sorted(
             topic
             for topic, kinds in self._node.get_topic_names_and_types()
-            if wanted.intersection(kinds) and topic not in own and self._node.count_publishers(topic)
+            if set(CLOUDS).intersection(kinds) and topic not in own and self._node.count_publishers(topic)
         )
 
     def _of_the_drive(self, message: PointCloud2 | bytes) -> PointCloud2:

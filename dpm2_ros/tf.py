@@ -10,6 +10,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
 from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.topics import TF
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.checks import check_transforms
@@ -42,9 +43,9 @@ class TransformBroadcaster:
         if TFMessage is None:
             node.get_logger().error("no /tf: tf2_msgs is missing; `python -m dpm2_ros.build_tf2_msgs` builds it")
             return
-        self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+        self._publisher = node.create_publisher(TFMessage, TF, 100)
         # Looked at now and then alone: there may be a thousand messages a second.
-        self._heard = node.create_subscription(TFMessage, "/tf", self._on_tf, 100, callback_group=_Unspun())
+        self._heard = node.create_subscription(TFMessage, TF, self._on_tf, 100, callback_group=_Unspun())
 
     def send(self, T_parent_child: Array, stamp: int, child: str) -> None:
         """(4, 4) at a stamp in ns."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 IMU = "/imu"
 FIX = "/fix"
-TF_STATIC = "/tf_static"
+TF, TF_STATIC = "/tf", "/tf_static"
 VERTICAL_ANGLE_CORRECTION = "/kitti/vertical_angle_correction_deg"
 """std_msgs/Float64, latched: degrees to add to the elevation of each point, which the recording itself lacks."""
 
