@@ -78,9 +78,9 @@ class VisualScanRegistration:
     def _told(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
         """The result moved along its open direction by the intensities, which need no calibration, or else by the
         image; as uncertain as these are apart where they exclude each other."""
-        by_image = self._by_image(scan, result, information)
+        reach, of_speed = self._reach(result, information)
+        by_image = self._by_image(scan, result, reach, of_speed)
         seen = by_image.method == "visual"
-        reach, _ = self._reach(result, information)
         by_intensity = self._intensity.along(result if seen else by_image, scan.points, reach)
         if by_intensity.method != "intensity":
             return by_image if seen else by_intensity
@@ -89,7 +89,7 @@ class VisualScanRegistration:
             return by_intensity.doubted(way).because(f"image and intensities {np.linalg.norm(way[3:]):.2f} m apart")
         return by_intensity
 
-    def _by_image(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
+    def _by_image(self, scan: Scan, result: Registration, reach: float, of_speed: float) -> Registration:
         """The result moved along its open direction to where the images agree; unchanged if they do not.
 
         The camera is elsewhere at an image that was taken later, relative to the scans, than that of the earlier scan.
@@ -107,7 +107,6 @@ class VisualScanRegistration:
         # Only the difference: the twist itself follows from the images, so that moving the camera by its whole offset
         # feeds an error back, and it grows from half a period on. What is left is the offset times the change of speed.
         late = image.time_offset - before.time_offset
-        reach, of_speed = self._reach(result, information)
         image_now = replace(textured(placed(image, late, scan.twist)), sigma=of_speed * abs(late))
         return along(self._settings, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
 
