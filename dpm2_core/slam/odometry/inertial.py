@@ -22,7 +22,7 @@ from dpm2_core.data.imu import KEPT
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.turning import turned
-from dpm2_core.slam.odometry.other import Step
+from dpm2_core.slam.odometry.other import Doubt, Step
 from dpm2_core.slam.odometry.vertical import Vertical, metric
 
 _MOST = 25_000  # samples, at most
@@ -34,10 +34,8 @@ _BIAS, _BIAS_DRIFT = 0.03, 1e-4  # rad/s of an unknown one, and its change in 1 
 _BIAS_AT_REST = 0.003  # rad/s of one that was measured at rest: "rest" may be a slow turn
 _LARGEST_BIAS = 0.2  # rad/s
 _SPAN = 1.0  # s over which scans and gyroscope are compared for the bias
-_USUAL = 3.0  # squared sigmas of a turn that count as one in the doubt
-_CREDIBLE = 4.0  # doubt up to which it is used
 _MEMORY = 0.15  # fraction of the newest turn in the doubt
-_WORST, _UNSEEN = 25.0, 10.0  # so much a turn counts at most, and one at whose end the scan fits nowhere
+_UNSEEN = 30.0  # squared sigmas: so much a turn counts at whose end the scan fits nowhere
 _TURNING = 0.1  # rad/s: slower turns prove nothing
 
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
@@ -83,22 +81,22 @@ class InertialMotion:
         self._measured: Array | None = None  # the same, believed or not
         self._before: int | None = None  # stamp of the last registered frame
         self.turns = False
-        self._doubt = 1.0
+        self._doubt = Doubt(_MEMORY)
         self._span = _Span(np.eye(3))
         self._vertical = Vertical()
 
     def look(self, frame: Frame) -> Frame:
         """Take in a new frame's samples; returns the frame with those around its sweep, without their bias, or none."""
         if self.turns:  # the last frame was not registered
-            self._remember(_UNSEEN)
+            self._doubt.add(_UNSEEN)
         self._join(frame)
-        self.turning = self._measured = None
+        self.turning, self._measured, self.turns = None, None, False
         if self._before is None:
             self.problem = "" if len(self._samples) else "no samples"
         else:
             self._measured = self._turned(frame.stamp, self._before)
             self.problem = "" if self._measured is not None else "no samples at the time of the scan"
-        if not self.problem and self._doubt > _CREDIBLE:
+        if not self.problem and not self._doubt.is_credible:
             self.problem = (
                 "its turns are not those of the scans, and odom may be tilted: is its orientation or unit right?"
             )
@@ -169,7 +167,7 @@ class InertialMotion:
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
         forces = self._forces(before, stamp)[1]
-        if not len(forces) or self._doubt > _CREDIBLE or led:
+        if not len(forces) or not self._doubt.is_credible or led:
             self._vertical.pause()
             return
         self._vertical.add(T_before[:3, :3] @ forces.mean(0), T[:3, :3] @ twist[3:], seconds)
@@ -222,15 +220,12 @@ class InertialMotion:
         if max(angle, _angle(scans)) < _TURNING * seconds:
             return
         variance = (3 * _TURN) ** 2 + (0.05 * angle) ** 2 + self._variance * seconds**2
-        self._remember(min(_angle(measured.T @ scans) ** 2 / variance / _USUAL, _WORST))
-
-    def _remember(self, squared: float) -> None:
-        self.turns, self._doubt = False, (1 - _MEMORY) * self._doubt + _MEMORY * squared
+        self._doubt.add(_angle(measured.T @ scans) ** 2 / variance)
 
     def _correct(self, R: Array) -> None:
         """The bias, by what the scans say of the last second or more; the last of them has the axes R (3, 3)."""
         span, self._span = self._span, _Span(R)
-        if self._doubt > _CREDIBLE:
+        if not self._doubt.is_credible:
             return
         off = se3.rotation_vector(R.T @ span.R_start @ span.R_start_now) / span.seconds
         variance = (2 * _TURN**2 + (_SHARE * span.angle) ** 2) / span.seconds**2

@@ -25,9 +25,31 @@ _SHARE = 0.05
 _POSSIBLE = 9.0  # squared sigmas from the scan, or from the motion before, of which one is hard braking already
 _JUDGED = (0.5, 1.0)  # m or s: a shorter way of a slow robot is within what a step may be off, whatever is wrong
 _MEMORY = 0.1  # fraction of the newest way in how far the steps are doubted
-_WORST = 25.0  # squared sigmas of one way count so much: a single jump is forgiven
+_USUAL = 3.0  # squared sigmas that a measurement may be off; more makes the sensor doubtful,
+_WORST = 25.0  # up to so many times that: a single jump is forgiven
 _CREDIBLE = 4.0  # doubt up to which it is used
-_USUAL = 3.0  # squared sigmas that it may be off; more makes it doubtful
+
+
+class Doubt:
+    """How far off a sensor beside the scans has been of late, relative to what is usual; 1 at the start.
+
+    Attributes:
+        value: weighted mean of the squares.
+    """
+
+    def __init__(self, memory: float, least: float = 0.0) -> None:
+        """`memory`: fraction of the newest measurement in it. `least`: no less, however right the sensor is."""
+        self._memory, self._least, self.value = memory, least, 1.0
+
+    def add(self, squared: float) -> None:
+        """A measurement was off by so many squared sigmas."""
+        newest = min(squared / _USUAL, _WORST)
+        self.value = max(self._least, (1 - self._memory) * self.value + self._memory * newest)
+
+    @property
+    def is_credible(self) -> bool:
+        """Whether it is used."""
+        return self.value <= _CREDIBLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +104,7 @@ class OtherMotion:
         self._before: Guess | None = None  # the last one, and how long that is after `_last`, s, and its motion (6,)
         self._seconds, self._twist = 0.0, np.zeros(6)
         self._way: _Way | None = None  # since it was last judged
-        self._doubt = 1.0  # squared sigmas by which it has been off of late
+        self._doubt = Doubt(_MEMORY, least=1.0)
 
     def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
         """Of a new frame, `seconds` after the last registered one.
@@ -103,7 +125,7 @@ class OtherMotion:
             impossible = se3.squared_sigmas(T_predicted, T, covariance + of_prediction) > _POSSIBLE
             same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
             self._jumped = impossible or (lost and unsteady) or (self._jumped and (lost or same))
-            if self._jumped or self._doubt > _CREDIBLE:
+            if self._jumped or not self._doubt.is_credible:
                 return
             self._unsure = bool(np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
             if self._unsure:
@@ -135,10 +157,9 @@ class OtherMotion:
         way = self._way = step if self._way is None else self._way.and_then(step)
         if way.is_judged:
             covariance = way.of_scans + _spread(way.T_other) + MAP_NOISE
-            squared = se3.squared_sigmas(way.T_other, way.T_scans, covariance) / _USUAL
-            self._doubt = max(1.0, (1 - _MEMORY) * self._doubt + _MEMORY * min(squared, _WORST))
+            self._doubt.add(se3.squared_sigmas(way.T_other, way.T_scans, covariance))
             self._way = None
-        self.comparison = Comparison(self._raw, T_scans, used, self._doubt**0.5, self._unsure)
+        self.comparison = Comparison(self._raw, T_scans, used, self._doubt.value**0.5, self._unsure)
 
     def keep(self) -> None:
         """This frame was registered: the next step begins here."""
