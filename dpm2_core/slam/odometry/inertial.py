@@ -146,15 +146,15 @@ class InertialMotion:
         covariance[3:, 3:] = self.turn.T @ along @ self.turn + 0.25 * (way @ way) * of_turn
         return Reckoned(se3.make(self.turn, way), covariance, gained, sigma)
 
-    def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None, led: bool = False) -> None:
+    def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None, by_imu: bool = False) -> None:
         """A frame was registered at T (4, 4), the last one at T_before.
 
         Args:
             twist: (6,) [rad/s, m/s] the motion between the two; None: nothing is known of it, T begins a map.
-            led: its velocity is that of `step`, in part.
+            by_imu: its velocity is that of `step`, in part.
         """
         measured, before, self._before, self.turns = self._measured, self._before, stamp, False
-        if before is None and twist is None:
+        if self._starts:
             self._start_at_rest(T)
         if measured is None or before is None or twist is None:
             self._span = _Span(T[:3, :3])
@@ -167,7 +167,7 @@ class InertialMotion:
         if self._span.seconds >= _SPAN:
             self._correct(T[:3, :3])
         forces = self._forces(before, stamp)[1]
-        if not len(forces) or not self._doubt.is_credible or led:
+        if not len(forces) or not self._doubt.is_credible or by_imu:
             self._vertical.pause()
             return
         self._vertical.add(T_before[:3, :3] @ forces.mean(0), T[:3, :3] @ twist[3:], seconds)
@@ -175,9 +175,7 @@ class InertialMotion:
 
     def _start_at_rest(self, T: Array) -> None:
         """Where a drive begins at rest, the samples before the first frame show the bias and which way is up."""
-        s, starts, self._starts = self._samples, self._starts, False
-        if not starts:
-            return
+        s, self._starts = self._samples, False
         s = s[s.stamps > s.stamps.max(initial=0) - _AT_REST]
         if len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
             return

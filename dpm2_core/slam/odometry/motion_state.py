@@ -187,11 +187,11 @@ class MotionState:
             swept: the motion during its sweep, where that is known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
-        leads = False
+        by_imu = False
         if moved:
-            registration, swept, leads = self._along_open(registration, swept, seconds, led)
+            registration, swept, by_imu = self._along_open(registration, swept, seconds, led)
             self._move(registration, seconds, led, swept)
-        self.register(registration, stamp, moved, leads)
+        self.register(registration, stamp, moved, by_imu)
         self.sweep = swept
         self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
         self.left_open = np.zeros((3, 3))
@@ -260,14 +260,14 @@ class MotionState:
         along[3:, 3:] = R.T @ np.diag([_ASIDE, _ASIDE, _UP]) ** 2 @ R
         self.covariance = self.covariance + along
 
-    def register(self, registration: Registration, stamp: int | None, moved: bool, led: bool = False) -> None:
-        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way; `led`: an IMU
-        did, along what the scene leaves open."""
+    def register(self, registration: Registration, stamp: int | None, moved: bool, by_imu: bool = False) -> None:
+        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way; `by_imu`: it
+        is that of an IMU along what the scene leaves open."""
         T_before, self.T = self.T_registered, registration.T_target_source
         if not moved:
             self._open_way = None
         if self.inertial is not None and stamp is not None:
-            self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None, led)
+            self.inertial.registered(T_before, self.T, stamp, self.twist if moved else None, by_imu)
         self.T_registered, self.seconds, self.sweep, self.reckoned = self.T, 0.0, None, None
         if self.other is not None:
             self.other.keep()
