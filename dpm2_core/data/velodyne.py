@@ -85,9 +85,7 @@ def azimuth_time(points: Points) -> Points:
     """(N,) s from facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that turns clockwise, seen from above.
 
     What is on the left was measured before what is on the right: so it is in KITTI-360's devkit (kitti360Scripts,
-    `curl_velodyne_data` moves a point on the left by a part of the way back to the previous pose) and in KISS-ICP's
-    reader of KITTI raw. In real scans of KITTI odometry, the same sensor, the rings have been moved that way by what
-    KITTI untwisted, and the world agrees best from scan to scan with it. Other converters call the rotation
-    counter-clockwise. No scan of KITTI-360 itself was at hand.
+    `curl_velodyne_data`) and in KISS-ICP's reader of KITTI raw, and so scans of KITTI odometry, of the same sensor,
+    agree best with each other. Other converters call the rotation counter-clockwise.
     """
     return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)

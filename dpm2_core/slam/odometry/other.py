@@ -91,7 +91,7 @@ class OtherMotion:
         comparison: of this frame, if there was a step and the frame was registered.
     """
 
-    def __init__(self, steadiness: float = 10.0) -> None:
+    def __init__(self, steadiness: float) -> None:
         """`steadiness`: standard deviation of the acceleration, m/s2 and rad/s2."""
         self._steadiness = steadiness
         self.step: Step | None = None

@@ -45,7 +45,7 @@ def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
 
 def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
     """As of a driver that goes on sending: where all is open the speed is soon unknown, and the halt was believed."""
-    other, twist = OtherMotion(), np.array([0, 0, 0, 8.0, 0, 0])
+    other, twist = OtherMotion(steadiness=10.0), np.array([0, 0, 0, 8.0, 0, 0])
     sent, sigmas = [0.0, 0.8, 0.8, 0.8, 1.6], [0.1, 0.1, 0.1, 1.0, 1.0]  # m; of the way by the motion before
     led = []
     for x, sigma in zip(sent, sigmas, strict=True):
@@ -58,7 +58,7 @@ def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
 @pytest.mark.parametrize(("sent", "used"), [(0.0, False), (-0.05, False), (0.05, True)])
 def test_of_a_slow_robot_it_is_judged_over_a_longer_way(sent: float, used: bool) -> None:
     """0.05 m per scan is what a step may be off: wheels that stand, or turn backwards, were believed for good."""
-    other, step = OtherMotion(), se3.make(np.eye(3), [0.05, 0, 0])
+    other, step = OtherMotion(steadiness=10.0), se3.make(np.eye(3), [0.05, 0, 0])
     known = 0.01**2 * np.eye(6)
     for i in range(60):
         other.look(Guess(se3.make(np.eye(3), [sent * i, 0, 0])), np.array([0, 0, 0, 0.5, 0, 0]), 0.1, known)
