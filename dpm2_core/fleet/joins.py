@@ -86,11 +86,14 @@ def verify(
         clouds = _Clouds([first, second])
         keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])
         parts = np.concatenate([first.parts, second.parts + len(first.data)])  # no part of the two in common
+        own = np.concatenate([first.own, second.own])
         tried: dict[tuple[int, int], Edge] = {}
         for count, keyframe in enumerate(second.keyframes, 1):
             keyframes.append(keyframe)
             end = len(keyframes)
-            for loop in closer.close(keyframes, clouds, poses[:end], parts[:end]):
+            # One that borrows would confirm the loop of its lender, whose cloud it shows: a single witness.
+            found = closer.close(keyframes, clouds, poses[:end], parts[:end], own[:end]) if own[end - 1] else []
+            for loop in found:
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
                     tried[ends] = loop.between(*ends)  # later: confirmed by another one
@@ -100,12 +103,14 @@ def verify(
 
 @dataclass(frozen=True, eq=False)
 class _Excerpt:
-    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), parts (N,), all clouds."""
+    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), parts (N,), whether their
+    cloud is their own (N,), and all of the map."""
 
     nodes: list[int]
     keyframes: list[Keyframe]
     poses: Array
     parts: NDArray[np.integer]
+    own: NDArray[np.bool_]
     data: MapData
 
 
@@ -121,7 +126,7 @@ def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
         follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
         # Their own names keep the odometry of the two apart; a gap begins another stretch of it.
         keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if follows else None))
-    return _Excerpt(chosen, keyframes, data.poses[chosen], parts_of(data)[chosen], data)
+    return _Excerpt(chosen, keyframes, data.poses[chosen], parts_of(data)[chosen], data.clouds.own[chosen], data)
 
 
 class _Clouds(LazySequence[Points]):

@@ -53,7 +53,7 @@ def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int])
         data = load_map(store)
     vectors = np.zeros((len(data), WIDTH), np.float32)
     for node, keyframe in enumerate(data.keyframes):
-        if keyframe.descriptors is not None:
+        if keyframe.descriptors is not None and data.clouds.loan(node) is None:  # else all that is found is one place
             vectors[node] = pooled(keyframe.descriptors)
     if not vectors.any():
         raise Dpm2Error(f"{path}: no keyframe has descriptors, by which it could be found in the others")
@@ -62,7 +62,7 @@ def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int])
 
 
 def vectors_of(out: Path, name: str) -> Vector:
-    """(N, 528) of a drive whose part is done; zeros where a keyframe has none."""
+    """(N, 528) of a drive whose part is done; zeros where a keyframe has none of its own."""
     return np.asarray(np.load(out / _PLACES / name / _VECTORS), np.float32)
 
 

@@ -94,14 +94,16 @@ def loops_by(closer: LoopCloser) -> FindLoops:
 
     def find(a: MapData, b: MapData) -> list[Edge]:
         both = merge_maps(a, b, np.eye(4))
-        keyframes, parts = list(a.keyframes), parts_of(both)
+        keyframes, parts, own = list(a.keyframes), parts_of(both), both.clouds.own
         out = []
         for node, keyframe in enumerate(b.keyframes):
             # Another name keeps the odometry of the two apart.
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             clouds: Sequence[Points] = both.clouds
             end = len(keyframes)
-            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end], both.clouds.own[:end]):
+            if not own[end - 1]:  # it would confirm the loop of its lender, whose cloud it shows: a single witness
+                continue
+            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end], own[:end]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
                     out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops between two drives that were driven in laps: what is seen once, by one cloud, counts once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dpm2_core.descriptors import Descriptors
+from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.fleet import joins
+from dpm2_core.fleet.places import describe, places_part, vectors_of
+from dpm2_core.frame import NO_POINTS, Array, Points
+from dpm2_core.geometry import se3
+from dpm2_core.network.pretrained import load_network
+from dpm2_core.sim.lidar import Lidar
+from dpm2_core.sim.settings import LidarConfig
+from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.loops.place_recognition import PlaceRecognition
+from dpm2_core.slam.mapping.merge import loops_by
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.cloud_store import Loan
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_store import MapStore
+from dpm2_core.slam.store.rows import Session
+
+from ...helpers.drives import street
+from ...helpers.maps import stored
+
+FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+LIDAR = Lidar(LidarConfig(columns=1024))
+
+
+def in_laps(clouds: Sequence[Points], poses: Array, laps: int, seen: Sequence[Descriptors]) -> MapData:
+    """A map of so many laps past the first places, of which the later ones borrow, and past the other places once.
+
+    `poses`: (N, 4, 4) of all keyframes, of which there are fewer clouds (M, 4), and descriptors `seen`, at the first.
+    """
+    count = len(clouds)
+    keyframes = [Keyframe(i, i, i, T, NO_POINTS, None, "", seen[i % count], session=1) for i, T in enumerate(poses)]
+    store = stored(clouds[node % count] for node in range(len(poses)))
+    for node in range(count, laps * count):
+        store.borrow(node, Loan(node % count, np.eye(4)))
+    ways = [Registration(se3.inverse(one) @ other, FIRM) for one, other in pairwise(poses)]
+    steps = [Edge("odometry", node, node + 1, way) for node, way in enumerate(ways)]
+    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", SlamSettings().weights_id())]
+    return MapData(keyframes, poses, steps, [], sessions, store)
+
+
+class Asked(LoopCloser):
+    """Finds no loop, and notes for which keyframe one was looked for, among which that are their own."""
+
+    channels = None
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, list[int]]] = []
+
+    def close(
+        self,
+        keyframes: Sequence[Keyframe],
+        clouds: Sequence[Points],
+        poses: Array,
+        parts: NDArray[np.integer],
+        own: NDArray[np.bool_] | None = None,
+    ) -> list[Edge]:
+        assert own is not None
+        self.asked.append((len(keyframes) - 1, np.flatnonzero(own).tolist()))
+        return []
+
+
+def test_a_keyframe_that_borrows_neither_looks_for_a_loop_nor_is_one_looked_for_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, noise: np.random.Generator
+) -> None:
+    """Two drives of three laps past four places, all of whose later keyframes show what the first lap has seen."""
+    clouds = [noise.normal(size=(50, 4)).astype(np.float32) for _ in range(4)]
+    looks = [Descriptors.of(*(noise.normal(size=(80, n)).astype(np.float32) for n in (3, 32))) for _ in range(4)]
+    save_as(in_laps(clouds, np.tile(np.eye(4), (12, 1, 1)), 3, looks), path := tmp_path / "map.dpm2map")
+    expected = [(12 + node, [0, 1, 2, 3, *range(12, 13 + node)]) for node in range(4)]
+    closer = Asked()
+    monkeypatch.setattr(joins, "make_loops", lambda settings: closer)
+    joins.verify(tmp_path, lambda done, total: None, {"path": path}, {"path": path}, [range(12)] * 2, SlamSettings())
+    assert closer.asked == expected
+    closer = Asked()
+    with MapStore.open(path) as store:
+        assert loops_by(closer)(load_map(store), load_map(store)) == []
+    assert closer.asked == expected
+    part = places_part("a", path)
+    (folder := tmp_path / part.name).mkdir(parents=True)
+    describe(folder, lambda done, total: None, **part.arguments)
+    assert vectors_of(tmp_path, "a").any(1).tolist() == [True] * 4 + [False] * 8
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_a_drive_is_not_joined_where_another_place_that_was_passed_once_looks_alike(tmp_path: Path) -> None:
+    """The street stands twice in the map of the first drive, driven eight times, and once, where the other drive was:
+    all its keyframes were joined to the first, 500 m off."""
+    at, world, describe = np.arange(55.0, 66.0, 5.0), street("suburb", 8), PlaceRecognition(load_network("small", 1))
+
+    def seen(s: float, lateral: float, time: float) -> Points:
+        return LIDAR.scan(world, world.pose_at(s, lateral), time, np.random.default_rng(int(10 * s))).points
+
+    def made(name: str, places: Array, lateral: float, time: float, poses: Array, laps: int) -> dict[str, Path]:
+        clouds = [seen(s, lateral, time) for s in places]
+        looks = [describe.descriptors(Keyframe(0, 0, 0, np.eye(4), cloud)) for cloud in clouds]
+        save_as(in_laps(clouds, poses, laps, looks), tmp_path / name)
+        return {"path": tmp_path / name}
+
+    streets, far = np.array([world.pose_at(s) for s in at]), se3.make(np.eye(3), np.array([0, 500.0, 0]))
+    one = made("one", at, 0.0, 0.0, np.concatenate([*[streets] * 8, far @ streets]), 8)
+    there = far @ np.array([world.pose_at(s + 1, 0.5) for s in at])
+    other = made("other", at + 1, 0.5, 7.0, there, 1)
+    nodes = [range(9 * len(at)), range(len(at))]
+    found = joins.verify(tmp_path, lambda done, total: None, one, other, nodes, SlamSettings())["loops"]
+    assert [loop["ends"][1] for loop in found] == [0, 1, 2]
+    assert all(loop["reason"].startswith("two places of the map fit alike") for loop in found)
