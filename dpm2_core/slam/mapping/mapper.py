@@ -200,15 +200,20 @@ class Mapper:
         return self.loops[before:]
 
     def _lend(self, node: int, to_before: list[Edge], loops: list[Edge]) -> None:
-        """Let a keyframe that came back to an older one borrow that one's cloud."""
+        """Let keyframes that came back to older ones borrow their clouds: the new one, and any whose loop waited."""
         odometry = [edge for edge in to_before if edge.kind == "odometry"]
         again = odometry if node == self.session_start else []  # the frame with which the session before ended
-        loan = lender(node, [*again, *self.kept(loops)], self.clouds.loan, self._settings.redundancy)
-        if loan is not None:
-            before = self.clouds.borrow(node, loan)
-            if self._writer is not None and before is not None:
-                self._writer.give_up(before)
-            self.keyframes[node] = borrowing(self.keyframes[node], self.keyframes, loan)
+        ties = [*again, *self.kept(loops)]
+        for back in sorted({edge.to_node for edge in ties}):
+            loan = None if self.clouds.lends(back) else lender(back, ties, self.clouds.loan, self._settings.redundancy)
+            if loan is None or self.clouds.loan(back) is not None:
+                continue
+            given_up = self.clouds.borrow(back, loan)
+            self.keyframes[back] = borrowing(self.keyframes[back], self.keyframes, loan)
+            if self._writer is not None and given_up is not None:
+                self._writer.give_up(given_up)
+            if self._writer is not None and back != node:
+                self._writer.add(back, self.keyframes[back], None, [])
 
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
         """Bring the map file, if there is one, up to date with a new keyframe."""

@@ -109,14 +109,20 @@ class CloudStore(LazySequence[Points]):
         self._where[index] = None
 
     def borrow(self, index: int, loan: Loan) -> int | None:
-        """Let the newest keyframe borrow the cloud of another one, which does not; returns whose own cloud is gone."""
+        """Let a keyframe borrow the cloud of an older one, which does not; returns whose own cloud is gone."""
         before = self._newest.get(loan.lender)
         self._loans[index] = loan
-        self._newest[loan.lender] = index
-        if before is not None:
-            self._where[before] = None
-            self._moving.pop(before, None)
-        return before
+        if before is None:
+            self._newest[loan.lender] = index
+            return None
+        gone, self._newest[loan.lender] = sorted((before, index))
+        self._where[gone] = None
+        self._moving.pop(gone, None)
+        return gone
+
+    def lends(self, index: int) -> bool:
+        """Whether another keyframe borrows from this one."""
+        return index in self._newest
 
     def loan(self, index: int) -> Loan | None:
         """Whose cloud it shows, where that is not its own."""

@@ -38,7 +38,8 @@ class MapWriter:
         self._given_up: set[int] = set()
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
-        """A keyframe, whose cloud is in the cloud store, and the edges that came with it."""
+        """A keyframe, whose cloud is in the cloud store, and the edges that came with it; or one anew, which borrows by
+        now."""
         self._keyframes.append((node, keyframe, thumbnail))
         self._edges += edges
 
@@ -68,7 +69,7 @@ class MapWriter:
         self, keyframes: list[tuple[int, Keyframe, bytes | None]], poses: Array, georeference: Georeference | None
     ) -> None:
         """The first of the keyframes that are new, with all that is new of them and of those before."""
-        ends = keyframes[-1][0] + 1 if keyframes else len(self._written)
+        ends = max([len(self._written), *(node + 1 for node, *_ in keyframes)])
         change, poses = Change(georeference=georeference), poses[:ends]
         for node, keyframe, thumbnail in keyframes:
             change.keyframes.append((node, keyframe, self._clouds.packed(node), thumbnail))
