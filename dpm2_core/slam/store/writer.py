@@ -97,8 +97,9 @@ class MapWriter:
         # By the measurement, too: the search may have rejected another loop between the same two keyframes.
         now = {_key(loop): loop for loop in judged if loop.kind == "loop"}
         rows = self._store.rows("edges", where="kind = 'loop'") if now else ()
-        file = [(int(row[0]), edge_of(row)) for row in rows]
-        known = [(number, loop, now[_key(loop)]) for number, loop in file if _key(loop) in now]
+        # The last of those: one that waited for a second loop stands there as it was rejected, and as it was accepted.
+        file = {_key(edge): (int(row[0]), edge) for row in rows for edge in [edge_of(row)]}
+        known = [(number, loop, now[key]) for key, (number, loop) in file.items() if key in now]
         if changed := {number: new for number, loop, new in known if new.ok != loop.ok}:
             self._store.write(Change(judged=changed))
 

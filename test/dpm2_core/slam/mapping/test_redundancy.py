@@ -77,3 +77,18 @@ def test_sessions_that_begin_where_others_did_have_the_clouds_of_one(
         for node in range(4 * LENGTH):
             loan, expected = data.clouds.loan(node), written.clouds.loan(node)
             assert (loan and loan.lender) == (expected and expected.lender)
+
+
+def test_a_loop_that_waited_for_another_one_is_one_constraint_of_the_file(
+    tmp_path: Path, noise: np.random.Generator
+) -> None:
+    """Its rejection, of the same measurement, was turned into an acceptance at the end: the map had the loop twice."""
+    path = tmp_path / "a.dpm2map"
+    for _ in range(2):
+        mapper = add_session(path, noise)
+    with MapStore.open(path) as store:
+        loops = [edge for edge in load_map(store).edges if edge.kind == "loop"]
+    accepted = [(edge.from_node, edge.to_node) for edge in loops if edge.ok]
+    assert sorted(accepted) == [(node, node + LENGTH) for node in range(LENGTH)]
+    assert len(mapper.graph.loops) == LENGTH
+    assert [edge.registration.reason for edge in loops if not edge.ok] == ["waits for a second loop that agrees"]
