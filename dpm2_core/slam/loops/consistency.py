@@ -28,6 +28,7 @@ it is 3.7 to 5.1. The odometry promises little: at right loops of whole drives i
 _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off by without such an edge
 _TURN = 3.0, 0.02  # degrees, and per meter of path: a loop may correct the odometry so much
 _CIRCLE = 0.01  # m, per meter of path: the circle of two loops may miss its start by so much more
+_COMPARED = 200  # loops, the newest: one that is farther along the path than `reach` agrees with none; 5 ms
 
 
 class ConsistencySettings(Settings):
@@ -167,11 +168,11 @@ class Consistency:
                 return [loop.rejected(f"{meters:.1f} m, {sigmas:.0f} standard deviations from the odometry")]
         if confirmed or self._agrees_with_accepted(loop, s):
             return self._accept([loop, *confirmed])
-        self._waiting.append(loop)
+        self._waiting = [*self._waiting, loop][-_COMPARED:]
         return [loop.rejected(f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
 
     def _agrees_with_accepted(self, loop: Edge, s: ConsistencySettings) -> bool:
-        return any(self._agree(loop, accepted, s) for accepted in self._accepted[-200:])
+        return any(self._agree(loop, accepted, s) for accepted in self._accepted[-_COMPARED:])
 
     def _accept(self, loops: Sequence[Edge]) -> list[Edge]:
         self._accepted += loops
