@@ -31,4 +31,5 @@ def report(
     text = runs_page(", ".join(folder.resolve().name for folder in folders), runs, tables)
     with atomic_write(out) as file:
         file.write(text)
-    note(f"{out}: {len(runs)} runs, {len(text) / 1e6:.1f} MB")
+    size = f"{len(text) / 1e6:.1f} MB" if len(text) >= 1e6 else f"{len(text) / 1e3:.0f} kB"
+    note(f"{out}: {len(runs)} runs, {size}")

@@ -206,7 +206,7 @@ def _begin(
 ) -> None:
     """Ready `out` for a training on packed drives, see `begin_or_resume`."""
     from dpm2_core.data.packed import open_packed, packed_digest, scans_of
-    from dpm2_core.learning.begun import begin_or_resume
+    from dpm2_core.learning.begun import begin_or_resume, is_first_process
     from dpm2_core.network.pretrained import weights_path
 
     drives = {folder: open_packed(Path(folder)) for folder in settings.data.packed}
@@ -214,7 +214,8 @@ def _begin(
     content = {folder: packed_digest(found) for folder, found in drives.items()}
     read = [weights_path(settings.start)] if settings.start else []
     begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
-    if validation := getattr(settings, "validation", ""):  # the training of the image branch has none
+    validation = getattr(settings, "validation", "")  # the training of the image branch has none
+    if validation and is_first_process():
         learned = scans_of(d for folder, found in drives.items() if settings.data.packed[folder] for d in found)
         say_packed(f"validation {validation}", Path(validation), learned)
 

@@ -82,6 +82,11 @@ def check_one_process(command: str) -> None:
         raise UsageError(f"dpm2 {command}: works in one process; torchrun is for dpm2 train image, phase1 and phase2")
 
 
+def is_first_process() -> bool:
+    """Whether this one says what is to be said once: the first of those that torchrun started, or the only one."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def _processes() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 

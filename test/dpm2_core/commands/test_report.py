@@ -54,7 +54,7 @@ def test_experiments_below_a_folder_have_their_tables_by_its_name(tmp_path: Path
     for name, value in (("first", "0.250"), ("second", "1.250")):
         assert f"<h2>{name}: Table of &lt;kitti&gt;</h2>" in page
         assert value in page
-    assert "2 runs" in done.stderr
+    assert done.stderr.endswith(f": 2 runs, {len(page) / 1e3:.0f} kB\n")  # it was 0.0 MB
     (tmp_path / "out" / "second" / "kitti.json").write_text("{")
     done, _ = report(tmp_path / "r.html", tmp_path / "out")
     assert (done.returncode, "second/kitti.json: no record of an experiment" in done.stderr) == (2, True)

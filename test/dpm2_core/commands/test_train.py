@@ -70,9 +70,10 @@ def test_pairs_that_are_measured_on_and_learned_from_are_named(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
-    packed: Path, samples: list[Sample], tmp_path: Path
+    packed: Path, samples: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not those of no weight; but a part that was packed anew: the same scans, whose figures said nothing."""
+    """Not those of no weight; but a part that was packed anew: the same scans, whose figures said nothing. Of the
+    processes that torchrun starts the first says so."""
     elsewhere, again = tmp_path / "elsewhere", tmp_path / "again"
     north = se3.exp([0, 0, 0, 0, 100, 0])
     write_packed(elsewhere / "world", [s._replace(pose=north @ s.pose) for s in samples], {"source": "boxes"})
@@ -82,8 +83,9 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
         "optimiser": {"steps": 1, "compile": False, "warmup": 0},
     }  # fmt: skip
     (tmp_path / "asked.yaml").write_text(json.dumps(tree))
-    cases = [(1, packed, 1), (0, packed, 0), (1, elsewhere, 0), (1, again, 1)]
-    for number, (weight, validation, said) in enumerate(cases):
+    cases = [(1, packed, 0, 1), (0, packed, 0, 0), (1, elsewhere, 0, 0), (1, again, 0, 1), (1, again, 1, 0)]
+    for number, (weight, validation, rank, said) in enumerate(cases):
+        monkeypatch.setenv("RANK", str(rank))
         drives = json.dumps({str(packed): weight, **({} if weight else {str(elsewhere): 1})})
         call = ("train", "phase1", "--config", tmp_path / "asked.yaml", "--out", tmp_path / f"out{number}")
         done = succeeded(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
