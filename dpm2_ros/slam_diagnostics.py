@@ -223,6 +223,7 @@ class Diagnostics:
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
+        problem = problem or _silence("sample", topic, inputs.imu_last)  # where no cloud comes either
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
@@ -246,7 +247,7 @@ class Diagnostics:
     def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
         """Of a sensor beside the LiDAR and its messages, in words, and their topic."""
         sensor = self._inputs.synchronizer.sensors[topic]
-        figures = {"received": sensor.received, "used": sensor.matched, "late": sensor.late}
+        figures = {"received": sensor.received, "matched": sensor.matched, "late": sensor.late}
         if unheard := self._inputs.problem(topic):
             level, text = ERROR, unheard
         elif silence := _silence(what, topic, sensor.last_arrival):

@@ -47,7 +47,7 @@ class Inputs:
     """Clouds, images, an IMU, a GNSS receiver and calibration as they come in. The callbacks only put them into queues.
 
     Attributes:
-        imu: its samples; None where none is wanted. imu_received: messages so far.
+        imu: its samples; None where none is wanted. imu_received: messages so far. imu_last: when, s.
         gnss: its fixes; None where none are wanted. gnss_received: messages so far. gnss_last: stamp, ns, and arrival,
             s, of the last fix.
         calibration: what is known by now; its topics are full names, after remapping.
@@ -66,6 +66,7 @@ class Inputs:
         self.calibration = known or _named(node, given)
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
+        self.imu_last: float | None = None
         self.gnss, self.gnss_received = FixBuffer() if settings.gnss_topic else None, 0
         self.gnss_last: tuple[int, float] | None = None
         self._image_shift = round(settings.image_time_offset * 1e9)
@@ -231,7 +232,7 @@ class Inputs:
             stamp = self._stamp(message)
             self.calibration.check_sensor(self.calibration.imu_topic, message.header.frame_id, stamp)
             self.imu.add(stamp, message)
-            self.imu_received += 1
+            self.imu_received, self.imu_last = self.imu_received + 1, time.monotonic()
 
     def _on_fix(self, message: NavSatFix) -> None:
         check_header(message.header)

@@ -58,6 +58,7 @@ class Robot(Rig):
 @pytest.fixture
 def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 300.0)  # a busy machine may take its time
     return lambda *parameters, **other: Robot(ros, drive, *parameters, **other)
 
 
@@ -85,6 +86,17 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
     for message in r.odom:
         T = se3.inverse(first) @ transform_matrix(message.pose.pose)
         assert se3.magnitude(T)[0] < 0.02
+
+
+def test_one_that_stops_together_with_the_clouds_is_missed(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No cloud says so any more: it stayed in use."""
+    r = robot()
+    r.stand(0, 1)
+    assert r.status("imu", saying("in use"))
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
+    assert r.status("imu", saying("no sample on /imu for")).level == DiagnosticStatus.WARN
 
 
 def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) -> None:
