@@ -130,7 +130,7 @@ class ActiveMap:
         except BaseException:
             store.close()
             raise
-        self._path, self._store, self._folders = store.path, store, {}
+        self._path, self._store, self._folders, self.file_problem = store.path, store, {}, ""
         self.located = self._T_map_odom = None
         self._unreadable = False
         self.slam.use(*made)
@@ -164,11 +164,13 @@ class ActiveMap:
     def keep(self) -> str:
         """All that `reset` would end is in the file and in the folder, as far as there is one; says so in words.
 
+        A map whose file could not be made is in the folder alone: the next one may have a file.
+
         Raises:
             Dpm2Error: it cannot be written.
         """
         self._complete()
-        return self.save() if self.saves and self.mapper.keyframes else ""
+        return self._saved("") if self.saves and self.mapper.keyframes else ""
 
     def reset(self) -> None:
         """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
@@ -192,9 +194,16 @@ class ActiveMap:
             name: of the folder, and then also of a copy of the map file; with a number, where another drive has it.
 
         Raises:
-            UsageError: there is nothing to save. Dpm2Error: it cannot be written, or its file is incomplete: then the
-                folder is written, and no copy.
+            UsageError: there is nothing to save. Dpm2Error: it cannot be written, or its file is incomplete, or could
+                not be made: then the folder is written, and no copy.
         """
+        text = self._saved(name)
+        if self.file_problem:
+            raise Dpm2Error(text)
+        return text
+
+    def _saved(self, name: str) -> str:
+        """As `save`; of a file that could not be made the text says why."""
         if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
         if self.localizer is not None:
@@ -217,6 +226,8 @@ class ActiveMap:
             path = file_beside(folder)
             self._store.copy_to(path)
         file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
+        if self.file_problem:
+            file = f", but there is no map file: {self.file_problem}"
         untied = int((~self.mapper.placed).sum())
         without = f"; map.ply and trajectory.tum without {untied} that no loop ties to the first" if untied else ""
         return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}{without}"

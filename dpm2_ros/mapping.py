@@ -187,6 +187,8 @@ class MapperThread:
                 self._node.get_logger().error(str(error))
         if self.store_problem:
             raise Dpm2Error(f"map file incomplete: {self.store_problem}")
+        if self.active.file_problem and self.keyframes:  # of a map that is in no folder, either
+            raise Dpm2Error(f"no map file: {self.active.file_problem}")
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
         future = self._thread.submit(work)

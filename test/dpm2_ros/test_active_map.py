@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sqlite3
 import threading
 from contextlib import closing
@@ -175,6 +176,21 @@ def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) 
     directory.unlink()
     active.reset()
     assert active.file_problem == ""
+    active.close()
+
+
+def test_a_map_whose_file_could_not_be_made_is_not_said_to_be_saved(tmp_path: Path) -> None:
+    """The disk was full when the drive began: `town` was "saved", and there was no town.dpm2map to find oneself in."""
+    (tmp_path / "full").write_text("no folder")
+    active = driven(2, map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "full" / "a.dpm2map"))
+    with pytest.raises(Dpm2Error, match=r"map of 2 keyframes saved in .*town, but there is no map file: .*full"):
+        active.save("town")
+    assert [path.name for path in (tmp_path / "maps").iterdir()] == ["town"]
+    (tmp_path / "full").unlink()
+    assert "but there is no map file: " in active.keep()
+    active.reset()  # with which there is one
+    active.add(keyframes(1)[0])
+    assert re.search(r"map of 1 keyframes saved in .*, and as .*a-2\.dpm2map", active.save())
     active.close()
 
 

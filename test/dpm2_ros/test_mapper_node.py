@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from std_srvs.srv import Trigger
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Fix
 from dpm2_core.geometry import se3
@@ -29,6 +31,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros import mapper_node
 from dpm2_ros.conversions import edge_to_msg, keyframe_name
 from dpm2_ros.keyframe_messages import descriptors_to_msg, payload_to_msgs
+from dpm2_ros.mapper_node import MapperNode
 from dpm2_ros.subscriptions import LAST_ONE
 
 from ..helpers.mapping import S, Wires, core, keyframes, mapped, placed, points, rejections, send_all
@@ -87,6 +90,19 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
     mapper.wait(lambda: keyframes(mapper) == 1 and stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
     assert stored("drive.dpm2map") == 3
     assert core(mapper).store_problem == ""
+
+
+def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[..., Any], tmp_path: Path) -> None:
+    """The file could not be made when the drive began: the node ended as if there had been none to make."""
+    (tmp_path / "full").write_text("no folder")
+    harness = ros(f"ros.map_file:={tmp_path / 'full' / 'town.dpm2map'}")
+    harness.mapper = harness.add(MapperNode())
+    wires = Wires(harness)
+    wires.wait()
+    wires.send(Keyframe(0, 1000, 0, np.eye(4), points(0)), keyframe_name("", 0))
+    harness.wait(lambda: keyframes(harness) == 1, "the keyframe")
+    with pytest.raises(Dpm2Error, match=r"no map file: .*full"):
+        harness.remove(harness.mapper)
 
 
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(mapper: Any) -> None:
