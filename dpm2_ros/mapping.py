@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -35,8 +36,8 @@ from dpm2_ros.tf import TransformBroadcaster
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 _GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
-
-
+RETRY = 10.0
+"""s after which a map file that is incomplete is written to again, also where no keyframe comes."""
 BEHIND = 10
 """Keyframes that a map may lack before /diagnostics warns; a few are always on their way."""
 
@@ -82,6 +83,7 @@ class MapperThread:
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
         self._of_no_use = ""  # why it is, in words
         self._settled: Future[None] = self._submit(lambda: None)  # done: nobody looks for what has been solved
+        self._settled_at = time.monotonic()
         node.create_timer(0.1, self._show)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
@@ -213,6 +215,9 @@ class MapperThread:
     def _settle(self) -> None:
         if self.active.settle():
             self._changes += 1
+        if not self.store_problem:
+            self.written = self._taken
+        self._settled_at = time.monotonic()
 
     def _take_in(self, number: int, make: Callable[[], Keyframe]) -> None:
         before, behind = self.keyframes, self.store_problem
@@ -253,7 +258,8 @@ class MapperThread:
         return response
 
     def _show(self) -> None:
-        if self._settled.done() and self.active.mapper.graph.busy:
+        again = bool(self.store_problem) and time.monotonic() - self._settled_at >= RETRY
+        if self._settled.done() and (again or self.active.mapper.graph.busy):
             self._settled = self._submit(self._settle)
         for display in self._displays:
             if display.due(self._changes):

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.display import path_to_msg
 from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.runtime import lower_priority
@@ -77,6 +80,25 @@ def test_a_loop_after_which_the_robot_stands_still_counts(
     move(1)
     mapper.wait(lambda: transforms, "a transform")
     assert transforms[-1].transforms[0].transform.translation.x == pytest.approx(0.02, abs=1e-3)
+
+
+def test_a_map_file_catches_up_while_the_robot_stands(
+    mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It was written to with the next keyframe alone: of a robot that charged, what a full disk had kept out of it was
+    lost with the power, hours after there was room. Another program that writes is, after 5 s, as a full disk."""
+    monkeypatch.setattr("dpm2_ros.mapping.RETRY", 0.2)
+    send_all(mapper, 0)
+    mapped(mapper, 1)
+    path = tmp_path / "map" / "drive.dpm2map"
+    with closing(sqlite3.connect(path, isolation_level=None, timeout=30)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        send_all(mapper, 1)
+        mapper.wait(lambda: core(mapper).store_problem, "a keyframe that is in memory only")
+        other.execute("ROLLBACK")
+    mapper.wait(lambda: not core(mapper).store_problem, "the file, without another keyframe")
+    with MapStore.open(path) as store:
+        assert store.size == 2
 
 
 class Failing(GuardedNode):

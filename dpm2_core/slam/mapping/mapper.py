@@ -228,13 +228,14 @@ class Mapper:
 
     def settle(self, wait: bool = False) -> bool:
         """Take in what another process has solved since the last keyframe: where the robot has stopped none follows.
+        And write what the file lacks, if it can be by now.
 
         `wait`: for all that is to be solved. Returns whether anything was.
         """
         if unsolved := wait and self.graph.unsolved:
             self._optimize(changed=True)
         changed = self.graph.collect(wait) or unsolved
-        if changed and self._writer is not None:
+        if self._writer is not None and (changed or self._writer.problem):
             self._writer.sync(self.poses, self.graph.georeference)
         return changed
 
