@@ -33,17 +33,19 @@ class Vertical:
         self._seconds = 0.0  # that `_up` is the mean of
         self._velocity: Array | None = None
         self._without = False  # gravity, as a start at rest has shown
+        self._unit = 0.0  # of the forces, m/s2; 0 while gravity is not known
         self._started = False  # at rest as it seems, and no velocity is known yet
         self.sigma = _UNPROVEN[0]
         self.pause()
 
     def start(self, force: Array, axis: Array) -> bool:
         """At rest at the start; `axis` (3,) is to be up. False: the force is not gravity, and shows no vertical."""
-        up = metric(force)
+        unit = _unit_of(force)
+        up = unit * force
         self._without = not _is_gravity(up)
         if self._without:
             return False
-        self._up, self._axis, self._seconds, self._started = up, axis, _WEIGHT, True
+        self._unit, self._up, self._axis, self._seconds, self._started = unit, up, axis, _WEIGHT, True
         return True
 
     def pause(self) -> None:
@@ -53,7 +55,7 @@ class Vertical:
     def add(self, force: Array, velocity: Array, seconds: float) -> None:
         """A step with its mean force (3,) m/s2, and the mean velocity (3,) m/s."""
         if self._started:
-            gained = float(np.linalg.norm(metric(force) - self._up)) * seconds
+            gained = float(np.linalg.norm(self._unit * force - self._up)) * seconds
             stood = float(np.linalg.norm(velocity)) < _STANDS + gained
             self.sigma, self._started = _UNPROVEN[int(stood)], False
         if self._velocity is None:
@@ -65,10 +67,12 @@ class Vertical:
         mean, change, time = self._sum / self._time, (velocity - self._velocity) / self._time, self._time
         self.pause()
         self._velocity = velocity
-        up = metric(mean) - change
+        unit = self._unit or _unit_of(mean)
+        up = unit * mean - change
         # An acceleration of 1 m/s2 without gravity looks as gravity in g: then the forces are the change of velocity.
         if self._without or not _is_gravity(up) or np.linalg.norm(mean - change) < _NO_GRAVITY:
             return
+        self._unit = unit
         if self._axis is not None:
             off = up - self._up
             self.sigma = float(np.sqrt((1 - _MEMORY) * self.sigma**2 + _MEMORY * (off @ off / 3 + _LEAST**2)))
@@ -79,7 +83,7 @@ class Vertical:
 
     def accelerations(self, forces: Array) -> Array | None:
         """Those (N, 3) m/s2 of forces (N, 3) along the odometry's axes; None while gravity is not known."""
-        return None if self._axis is None else metric(forces) - self._up
+        return None if self._axis is None else self._unit * forces - self._up
 
     @property
     def turn(self) -> Array:
@@ -88,9 +92,14 @@ class Vertical:
 
 
 def metric(forces: Array) -> Array:
-    """Forces (N, 3), or a mean one (3,), in m/s2; some drivers count in g, in which their mean is 1 then."""
-    mean = np.atleast_2d(forces).mean(0)
-    return forces * _GRAVITY if _is_gravity(_GRAVITY * mean) else forces
+    """Forces (N, 3) of a second or so at rest, in m/s2."""
+    return forces * _unit_of(forces.mean(0))
+
+
+def _unit_of(mean: Array) -> float:
+    """Of forces with that mean (3,) over a second or more, m/s2: some drivers count in g, in which it is 1 then. A bump
+    of 0.1 s may make it anything."""
+    return _GRAVITY if _is_gravity(_GRAVITY * mean) else 1.0
 
 
 def _is_gravity(up: Array) -> bool:

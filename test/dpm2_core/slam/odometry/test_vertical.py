@@ -28,6 +28,19 @@ def test_after_a_start_at_rest_accelerations_are_what_gravity_leaves(unit: float
     np.testing.assert_allclose(found, [[2.0, 0, 0], [0, -1.0, 0]], atol=1e-6)
 
 
+@pytest.mark.parametrize("stood", [True, False])
+@pytest.mark.parametrize("unit", [1.0, 1 / 9.81], ids=["m/s2", "g"])
+def test_a_bump_is_no_other_unit(unit: float, stood: bool) -> None:
+    """Of one period the mean force may be 0.8 or 1.3 g, on a rough road: the unit is that of all before."""
+    vertical = Vertical()
+    if stood:
+        vertical.start(unit * GRAVITY, UP)
+    driven(vertical, 15.0, unit * GRAVITY, np.zeros(3))
+    for bump in (-9.0, -8.81, -3.0, 0.0, 3.0):
+        found = vertical.accelerations(unit * (GRAVITY + bump * UP)[None])
+        np.testing.assert_allclose(found, bump * UP[None], atol=1e-6)
+
+
 def test_they_are_unknown_before_gravity_is_and_where_the_forces_have_none() -> None:
     vertical = Vertical()
     assert vertical.accelerations(GRAVITY[None]) is None
