@@ -14,7 +14,7 @@ from typing import Any
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.files import file_digest, json_text, make_folder, write_json
-from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
+from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS, held
 
 _ASKED = "begun.json"
 """What was asked for when the training in this folder began."""
@@ -33,8 +33,12 @@ def begin_training(
     Args:
         read, data: as of `begin_or_resume`.
         start: folder of a training whose checkpoint and log a new one goes on from.
+
+    Raises:
+        UsageError: another training is writing there.
     """
     make_folder(folder)
+    _check_free(folder)
     asked, now = folder / _ASKED, _asked(settings, [*read, *([] if start is None else [start / CHECKPOINT])], data)
     if not asked.is_file() or _before(asked) != now:
         for old in (CHECKPOINT, LOG, WEIGHTS):
@@ -58,9 +62,10 @@ def begin_or_resume(
         data: what it learns from, beside the settings.
 
     Raises:
-        UsageError: there is a training that is not to be resumed, there is none to resume, or it was asked for
-            something else; the message names the first setting that differs, and both values.
+        UsageError: another training is writing there, there is one that is not to be resumed, there is none to resume,
+            or it was asked for something else; the message names the first setting that differs, and both values.
     """
+    _check_free(folder)
     asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
     if there and not resume:
         raise UsageError(f"{folder}: holds a training; --resume continues it, another --out keeps it")
@@ -85,6 +90,13 @@ def check_one_process(command: str) -> None:
 def is_first_process() -> bool:
     """Whether this one says what is to be said once: the first of those that torchrun started, or the only one."""
     return os.environ.get("RANK", "0") == "0"
+
+
+def _check_free(folder: Path) -> None:
+    """Raise UsageError where a training is writing in a folder. The processes of one look before any of them writes."""
+    if folder.is_dir():
+        with held(folder, looking=True):
+            pass
 
 
 def _processes() -> int:

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
-from contextlib import suppress
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +22,32 @@ from dpm2_core.files import atomic_write, make_folder
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.jsonl", "weights.safetensors"
 """What a training leaves in its folder."""
+
+
+@contextmanager
+def held(folder: Path, looking: bool = False) -> Iterator[None]:
+    """A folder that no other training writes in until the block ends, also if it is killed; where the file system has
+    locks.
+
+    `looking`: nothing is written but by a training that holds it then, so that several may look at once.
+
+    Raises:
+        UsageError: another training holds it.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, (fcntl.LOCK_SH if looking else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise UsageError(f"{folder}: another training is writing here; another --out keeps both") from None
+    except OSError:  # without locks, such as some network shares
+        pass
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_UN)  # also for processes that load data, which have it from this one
+        os.close(handle)
 
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:

@@ -9,7 +9,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
@@ -22,7 +22,8 @@ from torch.nn.parallel import DistributedDataParallel
 from dpm2_core.config import Settings
 from dpm2_core.console import QUIET, progress_bar
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.learning.checkpoint import CHECKPOINT, Log, load_checkpoint, save_checkpoint
+from dpm2_core.files import make_folder
+from dpm2_core.learning.checkpoint import CHECKPOINT, Log, held, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
@@ -168,11 +169,13 @@ class Trainer(Generic[M]):
         """Train, from the checkpoint on if there is one; `until`: stop after this step, with a checkpoint.
 
         Raises:
-            UsageError: a checkpoint of another training, or of more steps than are wanted.
+            UsageError: a checkpoint of another training, or of more steps than are wanted; or another training is
+                writing in the folder.
             Dpm2Error: no step had a finite gradient, or none of the last hundred.
         """
         keep_memory()
-        with process_group() as (rank, world, device):
+        make_folder(self.out)
+        with process_group() as (rank, world, device), nullcontext() if rank else held(self.out):
             module = self.module.to(device).train()  # it says itself what of it is frozen
             ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
             optimizer = make_optimizer(module, self.settings)

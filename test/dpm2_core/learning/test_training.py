@@ -10,7 +10,7 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import accumulate, count, repeat
 from pathlib import Path
@@ -29,6 +29,7 @@ from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.geometry import se3
 from dpm2_core.learning.augment import AugmentSettings
+from dpm2_core.learning.begun import begin_or_resume, begin_training
 from dpm2_core.learning.checkpoint import Log, load_checkpoint, read_log, save_checkpoint
 from dpm2_core.learning.dataset import DataSettings, GroupDataset
 from dpm2_core.learning.registration_loss import LossSettings
@@ -164,6 +165,28 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
     with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
         trainer(line(lambda x, y: y.sum() * torch.nan), tmp_path, saved, steps=3).run()
     assert not saved
+
+
+def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
+    """Until its first checkpoint a second one began in it, also with other settings: one log was of both or of either,
+    one checkpoint and one set of weights were left of two trainings, which both had ended well."""
+    steps, kept = OptimizerSettings(steps=3, seed=1), tmp_path / "begun.json"
+    begin_or_resume(tmp_path, False, OptimizerSettings(steps=3))
+    before = kept.read_text()
+
+    def batches(start: int, rank: int) -> Iterator[tuple[torch.Tensor]]:
+        with pytest.raises(UsageError, match=f"{tmp_path}: another training is writing here"):
+            begin_or_resume(tmp_path, False, steps)
+        with pytest.raises(UsageError, match="another training is writing here"):
+            begin_training(tmp_path, steps)
+        with pytest.raises(UsageError, match="another training is writing here"):
+            trainer(line(), tmp_path, steps=3).run()
+        yield from repeat((torch.ones(8, 2),))
+
+    replace(trainer(line(), tmp_path, steps=3), batches=batches).run()
+    assert kept.read_text() == before
+    assert list(losses(tmp_path)) == [0, 1, 2]
+    begin_or_resume(tmp_path, True, OptimizerSettings(steps=3))  # it is free again
 
 
 def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
