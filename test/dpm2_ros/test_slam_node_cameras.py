@@ -88,7 +88,7 @@ def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypat
     camera.send(4)
     r.send_and_wait(4)
     rear.send(4)  # too late
-    r.status("second camera", having(received=5, used=4, late=1))
+    r.status("second camera", having(received=5, matched=4, late=1))
     topics = [[image.camera.name for image in frame.images] for frame in frames]
     assert topics == [[IMAGE], [IMAGE, "/rear/image"], [IMAGE, "/rear/image"], ["/rear/image"], [IMAGE]]
     np.testing.assert_allclose(frames[1].images[1].camera.T_lidar_cam, T, atol=1e-9)
@@ -171,7 +171,7 @@ def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
     r.send_and_wait(5)  # alone
     assert len(frames[5].points) == len(scan(pose(5)))
     r.processed(6)
-    r.status("second lidar", having(received=5, used=5, late=0))
+    r.status("second lidar", having(received=5, matched=5, late=0))
 
 
 def test_a_camera_that_never_comes_comes_late_and_stops(
