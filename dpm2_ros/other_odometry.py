@@ -33,7 +33,7 @@ from dpm2_ros.transform_history import TransformHistory
 WAIT = 0.1
 """s that a cloud waits for the odometry that comes after it."""
 _MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
-_SLIPS = 0.01  # so much is said
+_SLIPS = 0.05  # so much is said, of what is assumed no more; a wheel's radius is often wrong by 2 %, which does no harm
 _DOUBTFUL = 1.5  # times as far off as assumed
 _RECENT = 10.0  # s
 
