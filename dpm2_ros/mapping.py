@@ -34,7 +34,10 @@ from dpm2_ros.settings import NodeConfig
 from dpm2_ros.subscriptions import LAST_ONE
 from dpm2_ros.tf import TransformBroadcaster
 
+LOOPS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""Not all: of whoever hangs, DDS keeps 5000 and then makes each later one wait, in vain."""
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+"""Of who listens, to miss none."""
 _GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
 RETRY = 10.0
 """s after which a map file that is incomplete is written to again, also where no keyframe comes."""
@@ -69,8 +72,8 @@ class MapperThread:
         self.tf = TransformBroadcaster(
             node, ros.map_frame, ros.publish_tf_map, ros.invert_odom_tf and ros.odom_source == "own"
         )
-        self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", KEEP_ALL)
-        self._loop_closures = node.create_publisher(Odometry, "dpm2/loop_closure", KEEP_ALL)
+        self._loop_candidates = node.create_publisher(DiagnosticArray, "dpm2/loop_candidates", LOOPS)
+        self._loop_closures = node.create_publisher(Odometry, "dpm2/loop_closure", LOOPS)
         self._displays = [
             Display(node.create_publisher(kind, topic, LAST_ONE), period, make)
             for kind, topic, period, make in (

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMsg
 from std_srvs.srv import Trigger
 
@@ -23,9 +25,11 @@ from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.geometry import se3
+from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.display import path_to_msg
 from dpm2_ros.guard import GuardedNode, respond, slow_service
+from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.runtime import lower_priority
 
 from ..helpers.mapping import core, mapped, placed, send_all
@@ -99,6 +103,24 @@ def test_a_map_file_catches_up_while_the_robot_stands(
     mapper.wait(lambda: not core(mapper).store_problem, "the file, without another keyframe")
     with MapStore.open(path) as store:
         assert store.size == 2
+
+
+def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once 10,000 loops waited for it in DDS, each later keyframe with loops kept the map waiting for 0.1 s, and was an
+    internal error, after which neither path nor map nor grid was due for it."""
+    hung = rclpy.create_node("hung", use_global_arguments=False)  # nobody calls back
+    hung.create_subscription(DiagnosticArray, "/dpm2/loop_candidates", lambda message: None, KEEP_ALL)
+    mapper.wait(lambda: mapper.mapper.count_subscribers("/dpm2/loop_candidates"), "the one that hangs")
+    send_all(mapper, 0)
+    mapped(mapper, 1)
+    tried = Edge("loop", 0, 1, Registration(np.eye(4), np.eye(6)).rejected("does not fit"))
+    monkeypatch.setattr(LoopCloser, "close", lambda *_: [tried] * 10_300)
+    path = mapper.hear(PathMsg, "/dpm2/path", 10)
+    send_all(mapper, 1)
+    mapper.wait(lambda: path and len(path[-1].poses) == 2, "the path with both")
+    mapped(mapper, 2)
+    assert mapper.mapper.errors == 0
+    hung.destroy_node()
 
 
 class Failing(GuardedNode):
