@@ -112,7 +112,7 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
     except Exception as error:  # rclpy raises RCLError, UnknownROSArgsError and RuntimeError by the kind of mistake
         what = "unknown ROS arguments" if type(error).__name__ == "UnknownROSArgsError" else "ROS does not start"
         text = str(error).splitlines()[0]
-        hint = "; set ROS_LOG_DIR or HOME" if re.search(r"log(ging)? directory", text) else ""
+        hint = "; set ROS_LOG_DIR or HOME" if re.search(r"log(ging)? directory|\.log for writing", text) else ""
         raise UsageError(f"{what}: {text}{hint}") from None
 
 

@@ -142,9 +142,12 @@ def test_who_waits_is_woken_and_later_waits_end_at_once() -> None:
     assert stop.is_set()
 
 
-def test_without_a_folder_for_logs_it_says_what_to_set(domain: int) -> None:
-    """As in a systemd unit, which has no HOME."""
+@pytest.mark.parametrize("given", [{}, {"ROS_LOG_DIR": "/proc"}])
+def test_without_a_folder_for_logs_it_says_what_to_set(domain: int, given: dict[str, str]) -> None:
+    """As in a systemd unit, which has no HOME; or where there is one that cannot be written, as after a start by root,
+    which nobody can in /proc."""
     environment = {name: text for name, text in ros_environment(domain).items() if name not in ("HOME", "ROS_LOG_DIR")}
+    environment |= given
     command = [sys.executable, "-m", "dpm2_ros.executables", "bag_player"]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
     assert ended.returncode == 2
