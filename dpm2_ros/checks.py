@@ -75,7 +75,7 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
             check_frame(child)
             T_parent_child = transform_matrix(stamped.transform)
             check_pose(T_parent_child)
-            if len(tree) >= _MOST_FRAMES and not tree.has(child):
+            if len(tree) >= _MOST_FRAMES and tree.parent(child) is None:
                 raise RejectedError("frame", f"there are {_MOST_FRAMES} frames already")
         except UsageError as error:
             problem = f"tf {parent[:80]!r} -> {child[:80]!r}: {error}"

@@ -54,10 +54,6 @@ class TransformTree:
     def __len__(self) -> int:
         return len(self._parents)
 
-    def has(self, frame: str) -> bool:
-        """Whether the frame has a parent."""
-        return _name(frame) in self._parents
-
     def parent(self, frame: str) -> tuple[str, Array] | None:
         """What the frame is placed in, and T_parent_frame (4, 4); None where it is not."""
         return self._parents.get(_name(frame))
