@@ -45,7 +45,7 @@ class KeyframeFile:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._connection, self.stored = _opened(path, "rwc")
 
-    def _opened(self) -> Connection:
+    def _connected(self) -> Connection:
         """The file, opened again if need be."""
         if self._connection is None:
             assert self.path is not None
@@ -82,7 +82,7 @@ class KeyframeFile:
         return not self.problem
 
     def _insert(self, parts: Sequence[bytes]) -> None:
-        self._opened().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
+        self._connected().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
         self.stored += 1
 
     def read(self, id: int) -> list[bytes]:
@@ -94,7 +94,7 @@ class KeyframeFile:
         if id >= self.stored:
             return [self._spill.read(number) for number in self._others[id - self.stored]]
         query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
-        parts: tuple[object, ...] | None = self._opened().execute(query, (id,)).fetchone()
+        parts: tuple[object, ...] | None = self._connected().execute(query, (id,)).fetchone()
         found = [part for part in parts or () if isinstance(part, bytes)]
         if len(found) != 3:
             raise sqlite3.DatabaseError(f"keyframe {id} is damaged")
