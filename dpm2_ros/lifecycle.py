@@ -14,6 +14,7 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.time_source import CLOCK_TOPIC
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_ros.guard import GuardedNode, until
@@ -197,7 +198,8 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         )
         for entities, destroy in ways:
             for entity in list(entities):
-                if id(entity) not in kept:
+                # Not what follows /clock, since use_sim_time was set: that is of the node, whatever its state.
+                if id(entity) not in kept and getattr(entity, "topic_name", "") != CLOCK_TOPIC:
                     destroy(entity)
         for name in vars(self).keys() - names:
             delattr(self, name)

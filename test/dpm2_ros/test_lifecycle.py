@@ -16,8 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
@@ -172,6 +176,27 @@ def test_time_that_goes_back_while_it_is_inactive_is_noticed(
     assert m.change(ACTIVATE)
     lidar.send(0, 1)
     assert lidar.odom[-1].pose.pose.position.x == pytest.approx(drive.pose(1)[0, 3], abs=0.1)  # m, as of any scan
+
+
+def test_a_clock_that_is_asked_for_while_it_is_active_goes_on(ros: Callable[..., Any]) -> None:
+    """`ros2 param set use_sim_time true`: it stood still after the next deactivation, and clouds without a stamp, which
+    get its time, were rejected as repeated."""
+    managed = Managed(ros(*FAST), SlamNode)
+    harness, clock = managed.harness, managed.harness.publisher(Clock, "/clock")
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+    assert managed.change(CONFIGURE)
+    assert managed.change(ACTIVATE)
+    given = [Parameter(name="use_sim_time", value=value)]
+    assert harness.call(SetParameters, "/slam_node/set_parameters", parameters=given).results[0].successful
+
+    def follows(seconds: int) -> bool:
+        clock.publish(Clock(clock=Time(sec=seconds)))
+        return bool(managed.node.get_clock().now().nanoseconds == seconds * 10**9)
+
+    harness.wait(lambda: follows(100), "/clock")
+    assert managed.change(DEACTIVATE)
+    assert managed.change(ACTIVATE)
+    harness.wait(lambda: follows(200), "/clock again", timeout=10)
 
 
 @pytest.mark.slow
