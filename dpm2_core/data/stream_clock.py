@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import deque
 
 NOMINAL = 0.1
-"""Period of a stream of which none is known, and between two stamps that do not advance, s."""
+"""Period of a stream of which none is known, s."""
 _FASTEST = 0.005  # s: no stream has a shorter period; frames that arrived together and were stamped then have
 SLOWEST = 2.0
 """No stream has a longer period, s."""
@@ -26,19 +26,20 @@ class StreamClock:
         self.stamp: int | None = None
         self.now = 0.0
         self._jumped_from: int | None = None
+        self._counted = NOMINAL  # s, for the jump
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
 
     def advance(self, stamp: int) -> float:
-        """Seconds since the frame before; stamps that repeat or jump back count as one nominal period.
+        """Seconds since the frame before; stamps that repeat or jump back count as one usual period.
 
         Where only one stamp jumped back, the next is later than the one before it, from which it is then measured.
         """
         dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
         if self._jumped_from is not None and stamp > self._jumped_from:
-            dt = (stamp - self._jumped_from) * 1e-9 - NOMINAL  # which the jump has counted
+            dt = (stamp - self._jumped_from) * 1e-9 - self._counted
         self._jumped_from = self.stamp if self.stamp is not None and stamp < self.stamp else None
         if dt < _FASTEST:
-            dt = NOMINAL
+            dt = self._counted = self.usual or NOMINAL
         if self.stamp is not None:
             self.now += dt
             self._periods.append(dt)

@@ -17,6 +17,20 @@ def test_stamps_that_do_not_advance_count_as_a_period() -> None:
     assert clock.stamp == 4_000_000_000
 
 
+def test_two_stamps_of_a_fast_stream_that_come_close_count_as_one_of_its_periods() -> None:
+    """Of 100 Hz, stamped on arrival: two that were 4 ms apart counted as 0.1 s."""
+    clock = StreamClock()
+    for stamp in range(0, 100, 10):
+        clock.advance(stamp * 10**6)
+    assert [clock.advance(stamp * 10**6) for stamp in (106, 110, 120)] == pytest.approx([0.016, 0.01, 0.01])
+
+
+def test_of_a_fast_stream_a_stamp_that_jumps_back_counts_as_one_of_its_periods() -> None:
+    clock = StreamClock()
+    stamps = [*range(0, 500, 50), 100, 550, 600]
+    assert [clock.advance(stamp * 10**6) for stamp in stamps][-3:] == pytest.approx([0.05] * 3)
+
+
 @pytest.mark.parametrize("back", [150, 300, 1000, 5000, 3_600_000])
 def test_one_stamp_that_jumps_back_makes_no_pause(back: int) -> None:
     """Back by so many ms; a clock that is set back goes on from there."""
