@@ -65,7 +65,8 @@ class Bridge:
     def __init__(self, registration: ScanRegistration, motion: MotionState, left: float) -> None:
         """The last pose before the pause is the registered one of `motion`, at `left` s by the clock of the stream."""
         self.registration = registration
-        self.twist = motion.twist
+        self.twist, self._motion = motion.twist, motion.known_twist
+        self._speed = float(np.linalg.norm(self._motion[3:]))
         self.tries, self.agreed = 0, False
         self.held = self._stepped = False
         self._T, self._of_velocity, self._left = motion.T_registered, motion.of_velocity, left
@@ -166,18 +167,10 @@ class Bridge:
         return poses
 
     @property
-    def _motion(self) -> Array:
-        return np.zeros(6) if self.twist is None else self.twist
-
-    @property
     def _motions(self) -> tuple[Array, Array]:
         """Before the pause and after it (6,); each for the other while that is not known."""
         known = [twist for twist in (self.twist, self._after) if twist is not None] or [self._motion]
         return known[0], known[-1]
-
-    @property
-    def _speed(self) -> float:
-        return float(np.linalg.norm(self._motion[3:]))
 
     def _problem(self, result: Registration) -> str:
         """Why a result says nothing."""
