@@ -25,7 +25,8 @@ _LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
-    """Keyframes without a cloud of their own, and those near an older one that stays; never the last of a part.
+    """Keyframes without a cloud of their own, and those near an older one that stays and does not borrow; never the
+    last of a part.
 
     Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known. Nor
     does one with descriptors go for one without: nobody would be found there any more.
@@ -41,6 +42,7 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
     needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
     stays, described = np.ones(len(data), np.bool_), np.array([k.descriptors is not None for k in data.keyframes])
+    own = data.clouds.own
     for node in range(len(data)):
         if node in needed:
             continue
@@ -48,7 +50,8 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
             stays[node] = data.clouds.keeps(node) and loan.lender < node and stays[loan.lender]
             continue
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
-        near = near[(near < node) & stays[near] & (parts[near] == parts[node])]
+        # Not one that borrows: its cloud is no part of the map, and nobody is found there.
+        near = near[(near < node) & stays[near] & own[near] & (parts[near] == parts[node])]
         near = near[(node - near >= _LAP) | (session[near] != session[node])]
         near = near[described[near] >= described[node]]
         turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf

@@ -205,6 +205,18 @@ def test_borrowers_go_before_their_lenders() -> None:
         prune(data, [39])
 
 
+def test_what_is_near_a_borrower_only_stays() -> None:
+    """A third lap 2.5 m beside the second, which borrows from the first: the map has nothing within 3 m of it."""
+    data = laps(3)
+    poses = data.poses.copy()
+    poses[:, 2, 3] += np.repeat([0, 2.5, 5.0], 40) / 4  # height counts for four
+    for node in range(40, 80):
+        data.clouds.borrow(node, Loan(node - 40, np.eye(4)))
+    assert redundant_nodes(replace(data, poses=poses), 3.0, 30.0) == []
+    poses[80:, 2, 3] = 2.5 / 4
+    assert redundant_nodes(replace(data, poses=poses), 3.0, 30.0) == list(range(80, 119))
+
+
 def test_merged_side_by_side(tmp_path: Path, map_file: Path) -> None:
     T = se3.exp([0, 0, 0.5, 100, 0, 0])
     with MapStore.open(map_file) as a, MapStore.open(map_file) as b:
