@@ -56,6 +56,7 @@ class MotionState:
         self.inertial: InertialMotion | None = None
         self.reckoned: Reckoned | None = None
         self._open_way: OpenWay | None = None
+        self._speed_shown = True  # along what the scene leaves open, when the IMU began to tell the way there
         self.other: OtherMotion | None = None
         self._open = 0.0  # s, for which the scene has left a direction open
         self._started = False
@@ -83,7 +84,7 @@ class MotionState:
 
     def begin(self, T: Array) -> None:
         """A map begins with a frame at T (4, 4), to which no motion has led, and which is registered next."""
-        self.T, self.twist, self.of_velocity = T, None, ANY_VELOCITY
+        self.T, self.twist, self.of_velocity, self._speed_shown = T, None, ANY_VELOCITY, False
 
     @property
     def known_twist(self) -> Array:
@@ -206,7 +207,7 @@ class MotionState:
         """
         of_velocity, way = along_open(of_scene, self.of_velocity), self._open_way
         whole, step = of_velocity * self._open**2, of_velocity * seconds**2
-        if way is None:
+        if way is None or not self._speed_shown:
             return whole, step
         along = along_open(of_scene, np.eye(3))
         return min(whole, along * way.sigma**2, key=np.trace), min(step, along * way.gained**2, key=np.trace)
@@ -216,8 +217,10 @@ class MotionState:
     ) -> tuple[Registration, Swept | None, bool]:
         """A registration and the motion during its sweep; and whether an IMU has led them, which it does along what the
         scene leaves open where it contradicts the scan."""
-        if led or self.reckoned is None or registration.worst_sigma < OPEN:
-            self._open_way = None
+        shown = led or registration.worst_sigma < OPEN
+        if shown or self.reckoned is None:
+            # Of an IMU that falls silent and speaks again: scans alone, which may be wrong, say how fast it is by then.
+            self._open_way, self._speed_shown = None, shown or (self._speed_shown and self.twist is None)
             return registration, swept, False
         if self._open_way is None:
             self._open_way = OpenWay(self.T_registered, self.known_twist[3:])

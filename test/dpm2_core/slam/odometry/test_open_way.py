@@ -9,14 +9,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import OdometryResult, State
+from dpm2_core.estimates import OdometryResult, Registration, State
 from dpm2_core.frame import Array, Frame, Guess
 from dpm2_core.geometry import se3
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
 from dpm2_core.sim.simulated_drive import Ride, TurningRobot
 from dpm2_core.sim.world import build_world
 from dpm2_core.slam.odometry.inertial import Reckoned
+from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.open_way import OpenWay
+from dpm2_core.slam.odometry.settings import OdometrySettings
 
 from ....helpers.drives import off, track
 
@@ -77,6 +79,26 @@ def test_its_sigma_covers_scans_that_pull_to_one_side(pull: float) -> None:
         assert way.gained >= 0
         whole += way.gained
     assert whole == pytest.approx(way.sigma)
+
+
+def left_open(speaks: list[bool]) -> float:
+    """Standard deviation, m, along what has been open since the second of these scans at 5 m/s, in the end; of which
+    an IMU knows the way or does not."""
+    motion, sigma = MotionState(OdometrySettings()), np.array([0.01, 0.01, 0.01, 1.0, 0.01, 0.01])
+    for n, known in enumerate([False, False, *speaks]):
+        T = se3.make(np.eye(3), np.array([0.5 * n, 0, 0]))
+        covariance = np.diag(np.where(n < 2, 0.01, sigma) ** 2)
+        motion.reckoned = reckoned(0.0) if known else None
+        motion.advance(Registration(T, covariance, method="" if n else "first"), 0.1 if n else 0.0, None, False)
+    return float(motion.covariance[3, 3] ** 0.5)
+
+
+def test_an_imu_that_falls_silent_and_speaks_again_does_not_know_the_way_meanwhile() -> None:
+    """Nor the speed, which scans alone say by then: they may have been pulled back for seconds."""
+    known, unknown = left_open([True] * 30), left_open([False] * 30)
+    assert known < 0.2 * unknown
+    again = left_open([True] * 10 + [False] * 10 + [True] * 10)
+    assert again == pytest.approx(unknown, rel=0.05)
 
 
 def smooth(preset: PresetName, seed: int, count: int) -> tuple[list[Frame], Array]:
