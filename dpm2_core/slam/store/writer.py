@@ -79,7 +79,8 @@ class MapWriter:
         change.poses = self._moved(poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
-        change.given_up = [node for node in self._given_up if node < ends]
+        if len(keyframes) == len(self._keyframes):  # else those for which they are given up are not in the file yet
+            change.given_up = list(self._given_up)
         self._store.write(change)
         for node, *_ in keyframes:
             self._clouds.set_stored(node)
