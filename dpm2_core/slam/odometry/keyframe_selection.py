@@ -107,7 +107,8 @@ class KeyframeSelector:
         if self._weakest is None or registration.worst_sigma > self._weakest.worst_sigma:
             self._weakest = registration
         s, last, edge = self._settings, self._last, None
-        self._spacing.registered(registration.rmse)
+        if s.residual:
+            self._spacing.registered(registration.rmse)
         if last is not None:
             if self._is_known(T_odom_lidar) and not self._requested:
                 return None
