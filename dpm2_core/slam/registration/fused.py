@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from dpm2_core.descriptors import LazyDescriptors
 from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -57,7 +59,10 @@ class FusedScanRegistration:
         return FusedScanRegistration(self._neural.fresh(), self._geometric.fresh(), self._always)
 
     def prepare(self, frame: Frame, motion: Array) -> Scan:
-        return self._neural.described(self._geometric.prepare(frame, motion), frame)
+        scan = self._geometric.prepare(frame, motion)
+        images = frame.images if self.uses_images else ()
+        description = LazyDescriptors(partial(self._neural.describe, scan.points, images, frame.up))
+        return replace(scan, description=description, images=images, up=frame.up)
 
     def rejection(self, scan: Scan) -> str:
         return self._geometric.rejection(scan)

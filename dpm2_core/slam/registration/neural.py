@@ -75,15 +75,15 @@ class NeuralScanRegistration:
 
     def prepare(self, frame: Frame, motion: Array) -> Scan:
         points, _ = self._preprocessor.measured(frame, motion)
-        return self.described(Scan(points), frame)
-
-    def described(self, scan: Scan, frame: Frame) -> Scan:
-        """A scan of a frame with what its descriptors are made of once they are asked for."""
         images = frame.images if self.uses_images else ()
-        description = LazyDescriptors(partial(self._describe, scan.points, images, frame.up))
-        return replace(scan, description=description, images=images, up=frame.up)
+        return Scan(
+            points,
+            description=LazyDescriptors(partial(self.describe, points, images, frame.up)),
+            images=images,
+            up=frame.up,
+        )
 
-    def _describe(self, points: Points, images: tuple[Image, ...], up: Up | None) -> Descriptors:
+    def describe(self, points: Points, images: tuple[Image, ...] = (), up: Up | None = None) -> Descriptors:
         """The descriptors of a prepared scan (P, 4), `up` in it as in `Frame`.
 
         Raises:
@@ -148,5 +148,5 @@ class NeuralScanRegistration:
             few = scan.points[voxel_first(scan.points, network.points.voxel)]
             images = scan.images if self.uses_images else ()
             small = tuple(small_image(image, network.image) for image in images)
-            description = LazyDescriptors(partial(self._describe, few, small, scan.up))
+            description = LazyDescriptors(partial(self.describe, few, small, scan.up))
         self._map.insert(description, T_odom_lidar)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.estimates import Registration
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Preprocessor, PreprocessSettings, Scan
 from dpm2_core.slam.registration.fused import FusedScanRegistration
@@ -39,8 +39,8 @@ class Oracle:
     def __len__(self) -> int:
         return self.size
 
-    def described(self, scan: Scan, frame: Frame) -> Scan:
-        return replace(scan, images=frame.images if self.uses_images else ())
+    def describe(self, points: Points, images: tuple[Image, ...]) -> None:
+        return None
 
     def keep(self, scan: Scan, T_odom_lidar: Array) -> None:
         self.size += 1
