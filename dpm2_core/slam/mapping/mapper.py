@@ -205,8 +205,8 @@ class Mapper:
         again = odometry if node == self.session_start else []  # the frame with which the session before ended
         ties = [*again, *self.kept(loops)]
         for back in sorted({edge.to_node for edge in ties}):
-            loan = None if self.clouds.lends(back) else lender(back, ties, self.clouds.loan, self._settings.redundancy)
-            if loan is None or self.clouds.loan(back) is not None:
+            loan = lender(back, ties, self.clouds.loan, self._settings.redundancy)
+            if loan is None or not self.clouds.may_borrow(back):
                 continue
             given_up = self.clouds.borrow(back, loan)
             self.keyframes[back] = borrowing(self.keyframes[back], self.keyframes, loan)

@@ -2,7 +2,7 @@
 """A map as a grid of free and occupied cells, in the format of Nav2's map_server.
 
 Each keyframe says what it sees: in every direction the ground up to the first thing that stands on it. A cell is
-occupied where more keyframes see something standing in it than see through it.
+occupied where more keyframes see something standing in it than see through it; newer ones count for more.
 """
 
 from __future__ import annotations

@@ -24,14 +24,14 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import compiled
 from dpm2_core.geometry.ground import ground_below
+from dpm2_core.slam.mapping.redundancy import LAP
 from dpm2_core.slam.store.cloud_store import CloudStore
 
 _DIRECTIONS = 720
 _MARGIN = 20.0  # m around what is needed: the next keyframes fit as well
 _BORDER = 2.0  # m: what is seen is rounded
 _PLACE = np.array([6.0, 6.0, 3.0])  # m: keyframes in a box of this size see about the same
-_BOX_NUMBER = 1 << np.array([42, 21, 0])
-_LAP = 10  # keyframes: so many later it is there again
+_BOX_NUMBER = 1 << np.array([42, 21, 0])  # a box as one number, by which keyframes are sorted
 _NEWER, _VISITS = 3, 3  # a fan counts for three of the visit before; beyond the third all count the same
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray values of map_server
 
@@ -251,7 +251,7 @@ def _counts(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
         box = np.floor(poses[nodes, :3, 3] / _PLACE + np.array(shift) / 2).astype(np.int64) @ _BOX_NUMBER
         order = np.argsort(box, kind="stable")
         first = np.diff(box[order], prepend=box[order[:1]] - 1) != 0
-        visit = np.cumsum(first | (np.diff(nodes[order], prepend=0) > _LAP))
+        visit = np.cumsum(first | (np.diff(nodes[order], prepend=0) > LAP))
         last = np.append(visit[np.flatnonzero(first)[1:] - 1], visit[-1:])[np.cumsum(first) - 1]
         later[order] = np.maximum(later[order], last - visit)
     counts[nodes] = _NEWER ** (_VISITS - np.minimum(later, _VISITS))

@@ -17,10 +17,10 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.graph_data import Index
 from dpm2_core.slam.loops.relocalization import HEIGHT
 from dpm2_core.slam.mapping.parts import parts_of
+from dpm2_core.slam.mapping.redundancy import LAP
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
 
-_LAP = 10  # keyframes: neighbors along the drive are no revisit
 _LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's heading than of its place
 
 
@@ -52,7 +52,7 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
         # Not one that borrows: its cloud is no part of the map, and nobody is found there.
         near = near[(near < node) & stays[near] & own[near] & (parts[near] == parts[node])]
-        near = near[(node - near >= _LAP) | (session[near] != session[node])]
+        near = near[(node - near >= LAP) | (session[near] != session[node])]
         near = near[described[near] >= described[node]]
         turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
         stays[node] = np.min(turned) > np.radians(angle)

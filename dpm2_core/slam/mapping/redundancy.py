@@ -16,6 +16,9 @@ from dpm2_core.estimates import Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 
+LAP = 10
+"""Keyframes: those nearer along the drive are its neighbors, and no revisit."""
+
 
 class RedundancySettings(Settings):
     """Which keyframes of a revisit are given up: their pose stays in the graph, cloud and descriptors go."""

@@ -120,9 +120,9 @@ class CloudStore(LazySequence[Points]):
         self._moving.pop(gone, None)
         return gone
 
-    def lends(self, index: int) -> bool:
-        """Whether another keyframe borrows from this one."""
-        return index in self._newest
+    def may_borrow(self, index: int) -> bool:
+        """Whether a keyframe neither borrows nor lends."""
+        return index not in self._loans and index not in self._newest
 
     def loan(self, index: int) -> Loan | None:
         """Whose cloud it shows, where that is not its own."""
