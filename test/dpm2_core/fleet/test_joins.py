@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
@@ -60,14 +60,8 @@ class Asked(LoopCloser):
     def __init__(self) -> None:
         self.asked: list[tuple[int, list[int]]] = []
 
-    def close(
-        self,
-        keyframes: Sequence[Keyframe],
-        clouds: Sequence[Points],
-        poses: Array,
-        parts: NDArray[np.integer],
-        own: NDArray[np.bool_] | None = None,
-    ) -> list[Edge]:
+    def close(self, keyframes: Sequence[Keyframe], *given: Any) -> list[Edge]:
+        *_, own = given
         assert own is not None
         self.asked.append((len(keyframes) - 1, np.flatnonzero(own).tolist()))
         return []

@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,39 +16,31 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
-from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.full_disk import largest_file
+from test.helpers.loops import KnownLoops
 
 SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LAP = 20
 WRONG = LAP + 4  # a node with a wrong loop
 
 
-class KnownLoops(LoopCloser):
-    """Finds each keyframe of the lap before: the search itself is tested elsewhere."""
-
-    channels = None
-
-    def __init__(self) -> None:
-        pass
-
-    def described(self, keyframe: Keyframe) -> Keyframe:
-        return keyframe
-
-    def close(self, keyframes: Sequence[Keyframe], *given: Any) -> list[Edge]:
-        node = len(keyframes) - 1
-        if node < LAP:
-            return []
-        T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
-        loop = Edge("loop", node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known"))
-        return [loop if node % 7 else loop.rejected("no")]
+def of_the_lap_before(node: int) -> list[Edge]:
+    """Each keyframe's of the lap before; every seventh is rejected."""
+    if node < LAP:
+        return []
+    T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
+    loop = Edge("loop", node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known"))
+    return [loop if node % 7 else loop.rejected("no")]
 
 
 def make(store: MapStore | None = None, **settings: object) -> Mapper:
-    return Mapper(MapSettings.model_validate(settings), PoseGraph(RobustSettings()), KnownLoops(), store)
+    return Mapper(
+        MapSettings.model_validate(settings), PoseGraph(RobustSettings()), KnownLoops(of_the_lap_before), store
+    )
 
 
 @contextmanager
@@ -92,17 +81,14 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
             np.testing.assert_array_equal(after, before)
 
 
-class OneWrong(KnownLoops):
-    """One of its loops is far off, and is accepted all the same."""
-
-    def close(self, *given: Any) -> list[Edge]:
-        wrong = se3.exp([0, 0, 0.3, 9.0, 0, 0])
-        return [
-            replace(loop, registration=replace(loop.registration, T_target_source=loop.T_from_to @ wrong))
-            if loop.to_node == WRONG
-            else loop
-            for loop in super().close(*given)
-        ]
+def one_wrong(node: int) -> list[Edge]:
+    """The same, of which one is far off, and is accepted all the same."""
+    loops, wrong = of_the_lap_before(node), se3.exp([0, 0, 0.3, 9.0, 0, 0])
+    if node != WRONG:
+        return loops
+    return [
+        replace(loop, registration=replace(loop.registration, T_target_source=loop.T_from_to @ wrong)) for loop in loops
+    ]
 
 
 def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> None:
@@ -110,7 +96,7 @@ def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> N
     path = tmp_path / "a.dpm2map"
     with MapStore.create(path) as store:
         store.begin_session()
-        mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), OneWrong(), store)
+        mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), KnownLoops(one_wrong), store)
         for keyframe in laps(2):
             mapper.add(keyframe)
         mapper.finish()
@@ -259,49 +245,28 @@ def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> 
         assert store.size == 2
 
 
-FULL_DISK = """
-import resource, signal, sys
-sys.path.insert(0, sys.argv[2])
-from pathlib import Path
-from test_mapper_store import laps, make
-from dpm2_core.slam.store.map_data import load_map
-from dpm2_core.slam.store.map_store import MapStore
-path = Path(sys.argv[1])
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-store = MapStore.create(path)
-store.begin_session()
-mapper = make(store)
-drive = laps(1)
-limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-problems = []
-for number, keyframe in enumerate(drive):
-    if number == 5:
-        room = Path(f"{path}-wal").stat().st_size + 10000
-        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))
-    if number == 15:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    mapper.add(keyframe)
-    problems.append(mapper.store_problem)
-    assert len(mapper.clouds[number]) == 500
-assert not any(problems[:5]), problems
-assert all(problems[8:15]) and str(path) in problems[10] and "in memory only" in problems[10], problems
-assert not any(problems[15:]), problems
-assert len(mapper.cloud())
-store.close()
-with MapStore.open(path) as store:
-    data = load_map(store)
-    assert len(data) == 20 and len(data.edges) == 19
-print(problems[10])
-"""
-
-
 @pytest.mark.slow
 def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None:
-    """In a process that for ten keyframes may write no more than it has."""
-    arguments = [str(tmp_path / "a.dpm2map"), str(Path(__file__).parent)]
-    done = subprocess.run([sys.executable, "-c", FULL_DISK, *arguments], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 1
+    """For ten keyframes no file may have more than the log of the map has before them, and 10 kB."""
+    path, room, problems = tmp_path / "a.dpm2map", 0, list[str]()
+    with begun(path) as mapper:
+        for number, keyframe in enumerate(laps(1)):
+            if number == 5:
+                room = Path(f"{path}-wal").stat().st_size + 10000
+            with largest_file(room) if 5 <= number < 15 else nullcontext():
+                mapper.add(keyframe)
+                problems.append(mapper.store_problem)
+                assert len(mapper.clouds[number]) == 500
+        assert not any(problems[:5]), problems
+        assert all(problems[8:15])
+        assert str(path) in problems[10]
+        assert "in memory only" in problems[10]
+        assert len(problems[10].splitlines()) == 1
+        assert not any(problems[15:]), problems
+        assert len(mapper.cloud())
+    with MapStore.open(path) as store:
+        data = load_map(store)
+        assert (len(data), len(data.edges)) == (20, 19)
 
 
 def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None:
@@ -329,5 +294,5 @@ def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) ->
     for read_only in (True, False):
         with MapStore.open(map_file, read_only) as store:
             with pytest.raises(UsageError, match="descriptors of 16 channels, the network makes 128") as caught:
-                Mapper(MapSettings(), PoseGraph(RobustSettings()), Network(), store)
+                Mapper(MapSettings(), PoseGraph(RobustSettings()), Network(of_the_lap_before), store)
             assert str(map_file) in str(caught.value)

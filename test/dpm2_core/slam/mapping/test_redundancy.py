@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,43 +11,32 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.graph.robust import RobustSettings
-from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.mapper import Mapper, MapSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.loops import KnownLoops
 
 SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LENGTH = 6
 """Keyframes of a session."""
 
 
-class FirstWaits(LoopCloser):
-    """Finds each keyframe of the session before. The first loop waits for the second, and is accepted with it."""
-
-    channels = None
-
-    def __init__(self) -> None:
-        pass
-
-    def described(self, keyframe: Keyframe) -> Keyframe:
-        return keyframe
-
-    def close(self, keyframes: Sequence[Keyframe], *given: Any) -> list[Edge]:
-        node = len(keyframes) - 1
-        if node < LENGTH:
-            return []
-        found = Edge("loop", node - LENGTH, node, Registration(np.eye(4), SIGMA, 0.9, 0.05, "known"))
-        if node % LENGTH == 0:
-            return [found.rejected("waits for a second loop that agrees")]
-        return [found, found.between(node - 1 - LENGTH, node - 1)] if node % LENGTH == 1 else [found]
+def first_waits(node: int) -> list[Edge]:
+    """The keyframe of the session before. The first loop waits for the second, and is accepted with it."""
+    if node < LENGTH:
+        return []
+    found = Edge("loop", node - LENGTH, node, Registration(np.eye(4), SIGMA, 0.9, 0.05, "known"))
+    if node % LENGTH == 0:
+        return [found.rejected("waits for a second loop that agrees")]
+    return [found, found.between(node - 1 - LENGTH, node - 1)] if node % LENGTH == 1 else [found]
 
 
 def add_session(path: Path, noise: np.random.Generator) -> Mapper:
     """A straight drive of `LENGTH` keyframes into a map file."""
     with MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path) as store:
         store.begin_session()
-        mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), FirstWaits(), store)
+        mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), KnownLoops(first_waits), store)
         way = Registration(se3.make(np.eye(3), np.array([5.0, 0, 0])), SIGMA, 0.9, 0.05, "test")
         for i in range(LENGTH):
             T, points = se3.make(np.eye(3), np.array([5.0 * i, 0, 0])), noise.uniform(-30, 30, (100, 4))
