@@ -30,6 +30,7 @@ _PLACES, _VECTORS = "places", "places.npy"
 _INDEX, _LISTED = "index.faiss", "index.json"
 _LATE = 20_000
 """Places up to which each is compared: 100 keyframes cost 30 ms then, and 0.3 s to take them into the graph."""
+_AT_ONCE = 256  # queries: of all cosines of a long drive there would be gigabytes
 _LINKS, _BUILD, _SEARCH = 32, 80, 64
 """Of the graph: neighbors of a place; how many are looked at when one is added, and when one is searched for."""
 
@@ -137,8 +138,8 @@ class FleetIndex:
             found = self._graph.search(queries, count)
             cosines.append(found[0])
             places.append(found[1])
-        if most := min(count, len(self._late)):
-            found = self._faiss.knn(queries, self._late, most, metric=self._faiss.METRIC_INNER_PRODUCT)
+        if len(self._late):
+            found = _compared(queries, self._late, min(count, len(self._late)))
             cosines.append(found[0])
             places.append(found[1] + self._linked)
         best = np.argsort(-np.hstack(cosines), axis=1, kind="stable")[:, :count]
@@ -176,3 +177,16 @@ class FleetIndex:
             self._relinked = False
         listed = {"drives": self.drives, "mean": self._mean.tolist(), "linked": self._linked}
         write_json(self._folder / _LISTED, listed)
+
+
+def _compared(queries: Vector, places: Vector, count: int) -> tuple[Vector, NDArray[np.int64]]:
+    """Cosines (M, count) of the places that look most like each of the queries (M, 528), in no order, and which they
+    are."""
+    cosines = np.empty((len(queries), count), np.float32)
+    which = np.empty((len(queries), count), np.int64)
+    for start in range(0, len(queries), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        each = queries[rows] @ places.T
+        which[rows] = np.argpartition(each, -count, axis=1)[:, -count:]
+        cosines[rows] = np.take_along_axis(each, which[rows], 1)
+    return cosines, which
