@@ -86,6 +86,7 @@ bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (
 
 measure: setup  ## every record that stands on the weights, again, at a clean commit; continues where it was stopped
 	$(call with,bench,kiss_icp)
+	$(call with,fleet,ray)
 	$(BIN)/python -m tools.measure $(ARGS)
 
 # On a machine that does nothing else OpenMP threads may spin while they wait: a fifth faster.

@@ -23,7 +23,8 @@ RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
     "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": (),
     "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": ("--pairs", "200"),
-    "map": (), "roads": (), "indoor": (), "motion": (), "beside": (), "imu": ("--threads", "1"), "finetune": (),
+    "pose-graph": (), "map": (), "roads": (), "fleet": (), "indoor": (), "motion": (), "beside": (),
+    "imu": ("--threads", "1"), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, the quick ones first."""
 TARGETS = {"livox": "bench-livox"}
