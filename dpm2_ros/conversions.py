@@ -18,7 +18,6 @@ import numpy as np
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
@@ -57,9 +56,7 @@ def pose_to_msg(T: Array) -> Pose:
 
 def poses_to_msgs(T: Array) -> list[Pose]:
     """(N, 4, 4) to geometry_msgs/Pose: many rotations take little longer than one."""
-    if not len(T):
-        return []
-    quaternions, positions = Rotation.from_matrix(T[:, :3, :3]).as_quat().tolist(), T[:, :3, 3].tolist()
+    quaternions, positions = se3.quaternion(T).tolist(), T[:, :3, 3].tolist()
     return [
         Pose(position=Point(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
         for (tx, ty, tz), (x, y, z, w) in zip(positions, quaternions, strict=True)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from dpm2_core.data import topics
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.frame import Array, Camera, Fix, Frame
+from dpm2_core.geometry import se3
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
@@ -24,7 +24,7 @@ def header(stamp: int, frame: str) -> Any:
 
 
 def _parts(T: Array) -> tuple[list[float], list[float]]:
-    return T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    return T[:3, 3].tolist(), se3.quaternion(T).tolist()
 
 
 def _transform(stamp: int, parent: str, child: str, T: Array) -> Any:

@@ -64,7 +64,7 @@ def write_kitti(path: Path | str, poses: Array, index: Sequence[int] | Keys | No
 def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> None:
     """`stamp x y z qx qy qz qw` a line; stamps in ns become seconds with nine decimals, which a float loses."""
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
-    numbers = np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    numbers = np.hstack([poses[:, :3, 3], se3.quaternion(poses)])
     with atomic_write(path) as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for stamp, row in zip(stamps, numbers, strict=True):

@@ -77,6 +77,13 @@ def rotation_vector(R: Array) -> Array:
     return log(make(R, np.zeros(3)))[..., :3]
 
 
+def quaternion(T: Array) -> Array:
+    """The rotation of (..., 4, 4) as (..., 4) x, y, z, w with w >= 0."""
+    w = log(T)[..., :3]
+    half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
+    return np.concatenate([w * np.sinc(half / np.pi) / 2, np.cos(half)], -1)
+
+
 @compiled("void(f8[:, ::1], f8[:, :, ::1])")
 def _exp(xi: Array, T: Array) -> None:
     """`exp` of (N, 6), into (N, 4, 4): Rodrigues' formula, by half the angle, where 1 - cos does not cancel."""

@@ -256,8 +256,7 @@ def _numbers(T: Array, planar: bool) -> Array:
     """(N, 3) x y yaw or (N, 7) x y z qx qy qz qw with qw >= 0."""
     if planar:
         return np.column_stack([T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
-    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
-    return np.column_stack([T[:, :3, 3], q])
+    return np.column_stack([T[:, :3, 3], se3.quaternion(T)])
 
 
 def _text(numbers: Iterable[float] | Sequence[float]) -> str:

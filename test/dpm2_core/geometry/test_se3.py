@@ -66,6 +66,7 @@ def test_rotations_are_those_of_scipy(xi: np.ndarray) -> None:
     of_scipy = Rotation.from_rotvec(xi[:3])
     np.testing.assert_allclose(se3.rotation(xi[:3]), of_scipy.as_matrix(), atol=1e-14)
     np.testing.assert_allclose(se3.rotation_vector(of_scipy.as_matrix()), of_scipy.as_rotvec(), atol=1e-12)
+    np.testing.assert_allclose(se3.quaternion(se3.exp(xi)), of_scipy.as_quat(canonical=True), atol=1e-14)
 
 
 @given(tangents(), tangents())
@@ -124,7 +125,8 @@ def test_every_function_takes_any_batch(shape: tuple[int, ...]) -> None:
     xi = np.random.default_rng(0).normal(size=(*shape, 6))
     T = se3.exp(xi)
     assert T.shape == (*shape, 4, 4)
-    for function, tail in ((se3.inverse, (4, 4)), (se3.log, (6,)), (se3.adjoint, (6, 6)), (se3.angle, ())):
+    results = (se3.inverse, (4, 4)), (se3.log, (6,)), (se3.adjoint, (6, 6)), (se3.angle, ()), (se3.quaternion, (4,))
+    for function, tail in results:
         assert function(T).shape == (*shape, *tail)
         for i in np.ndindex(shape):
             np.testing.assert_allclose(function(T)[i], function(T[i]), atol=1e-14)
