@@ -17,7 +17,7 @@ from rich.progress import Progress
 from benchmarks.harness import Options, Report, drives, installed, processors, quantiles_ms, settings_of, truth_of
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
-from dpm2_core.experiments.peers import cloud_and_times, kiss_icp_config
+from dpm2_core.experiments.peers import at_stamps, cloud_and_times, end_of, kiss_icp_config
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -82,26 +82,31 @@ def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Trial, Mapp
 
 
 def kiss_icp(options: Options) -> Method:
-    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it, for KITTI, whose scans are deskewed
-    already.
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it. It deskews where ours does: scans
+    whose points have times, as those of most bags; KITTI's are deskewed already, and have none.
 
     Raises:
         MissingPackageError: it is not installed.
     """
-    config = kiss_icp_config(options.threads, deskew=False)
+    wanted = settings_of(options).preprocess.deskew
+    configs = {deskew: kiss_icp_config(options.threads, deskew) for deskew in (False, True)}
     from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Trial:
-        clouds = [cloud_and_times(frame)[0] for frame in frames]
-        odometry = KissICP(config)
+        sweeps = [cloud_and_times(frame) for frame in frames]
+        deskew = wanted and any(frame.time_offset is not None for frame in frames)
+        odometry = KissICP(configs[deskew])
         poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
         cpu = process_time()
-        for i, cloud in enumerate(clouds):
+        for i, (cloud, times) in enumerate(sweeps):
             started = perf_counter()
-            odometry.register_frame(cloud, np.array([]))
+            odometry.register_frame(cloud, times if deskew else np.array([]))
             seconds[i] = perf_counter() - started
             poses[i] = odometry.last_pose
-        return Trial(poses, seconds, process_time() - cpu)
+        cpu = process_time() - cpu
+        if deskew:  # then its poses are those at the last points, and the truth is that at the stamps
+            poses = at_stamps(poses, [end_of(frame) for frame in frames], [frame.stamp for frame in frames])
+        return Trial(poses, seconds, cpu)
 
     return run
 

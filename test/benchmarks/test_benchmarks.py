@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import get_type_hints
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks import BENCHES
+from benchmarks.geometric import kiss_icp
 from benchmarks.harness import Options, drives, processors
 from benchmarks.memory import levelling
 from benchmarks.pairs import FITTED, fitted_poses, pairs_of, summarized
@@ -23,6 +25,8 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.experiments.peers import KissIcp, at_stamps, end_of
+from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import save_weights
@@ -114,6 +118,33 @@ def test_kiss_icp_runs_beside_it_on_the_same_scans(sequence: Path, tmp_path: Pat
     ratio = methods["ratio"]
     assert ratio["fps"] == pytest.approx(methods["dpm2"]["fps"] / methods["kiss-icp"]["fps"], rel=0.01)
     assert ratio["ape_rmse_m"] == pytest.approx(methods["dpm2"]["ape_rmse_m"] / methods["kiss-icp"]["ape_rmse_m"])
+
+
+def test_kiss_icp_deskews_scans_whose_points_have_times_as_ours_does() -> None:
+    """As its pipeline does; its poses are then compared at the stamps. Else a bag's raw sweeps are a handicap to it."""
+    pytest.importorskip("kiss_icp")
+    world = np.random.default_rng(0).uniform(-30, 30, (4000, 3))
+    offset = np.linspace(-0.05, 0.05, len(world))
+
+    def swept(t: float) -> Frame:
+        T = se3.exp(np.outer(t + offset, [0, 0, -0.3, -8, 0, 0]))  # T_lidar_world as each point is measured
+        points = (T[:, :3, :3] @ world[..., None])[..., 0] + T[:, :3, 3]
+        cloud = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+        return Frame(round(t * 1e9), cloud, offset.astype(np.float32))
+
+    frames = [swept(0.1 * number) for number in range(4)]
+    deskewing, as_given = KissIcp(1, deskew=True), KissIcp(1, deskew=False)
+    for frame in frames:
+        deskewing.add(frame)
+        as_given.add(frame)
+    ends, stamps = [end_of(frame) for frame in frames], [frame.stamp for frame in frames]
+    assert kiss_icp(Options(threads=1))(frames).poses == pytest.approx(
+        at_stamps(deskewing.poses(), ends, stamps), abs=1e-9
+    )
+    known = Options(threads=1, overrides=("slam.preprocess.deskew=false",))
+    assert kiss_icp(known)(frames).poses == pytest.approx(as_given.poses(), abs=1e-9)
+    without = [replace(frame, time_offset=None) for frame in frames]
+    assert kiss_icp(Options(threads=1))(without).poses == pytest.approx(as_given.poses(), abs=1e-9)
 
 
 @pytest.mark.slow
