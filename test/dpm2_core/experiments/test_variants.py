@@ -12,11 +12,12 @@ import torch
 
 from dpm2_core.errors import UsageError
 from dpm2_core.experiments.request import Request
-from dpm2_core.experiments.variant_part import TRAIN
-from dpm2_core.experiments.variants import TABLE_3, fusion
+from dpm2_core.experiments.variant_part import TRAIN, training_of
+from dpm2_core.experiments.variants import TABLE_3, fusion, reference_points
 from dpm2_core.files import file_digest
 from dpm2_core.fleet.part import DONE, Part, figures_of
 from dpm2_core.network.model import DeepPointMap2
+from dpm2_core.network.settings import preset
 from dpm2_core.network.weights import save_weights
 
 from ...helpers.command import dpm2
@@ -116,6 +117,17 @@ def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, wei
     packs, _, driven = fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=asked))
     assert [part.arguments["settings"] for part in packs] == [["input.sequence='00'", "input.images=false"]]
     assert "input.images=false" in driven[0].arguments["drive"]["settings"]
+
+
+def test_a_row_of_table_3_has_as_many_reference_points_as_its_name_says(kitti: Path, tmp_path: Path) -> None:
+    """Two rows of 256 had those of the weights: 320 of `small`, a quarter more than the rows that they stand beside."""
+    _, trained, _ = reference_points.parts(Request(kitti, tmp_path, weights="small"))
+    found = {}
+    for part in trained:
+        training = training_of(**part.arguments["training"], network=part.arguments["network"], packed=[])
+        found[part.name] = preset(training.preset, training.network).fusion.points
+    assert found == {part.name: int(part.name.rpartition("_")[2]) for part in trained}
+    assert len(found) == len(TABLE_3)
 
 
 @pytest.mark.long
