@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dpm2_core.config import load_settings
 from dpm2_core.data.source import frame_at
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.image_attention import attention_png, image_attention
@@ -31,6 +32,7 @@ from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.learning.checkpoint import WEIGHTS
 from dpm2_core.network.pretrained import weights_path
 from dpm2_core.network.weights import load_model
+from dpm2_core.slam.settings import Config
 
 LEARNED = ("00", "01", "02", "03", "04", "05")
 AS_PAPER: dict[str, Any] = {
@@ -59,6 +61,7 @@ _PAPER_4 = {
 }  # fmt: skip
 TABLE_4 = {name: TRAINED_ALIKE[name] for name in _PAPER_4}
 _FOR_SLAM = ("slam.", "input.")  # settings of the user that are not of the training
+_ALONE = ("slam.registration=neural", "slam.visual.enabled=false")  # the network, as in the paper
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class VariantTable:
             "start": start,
         }
         training_of(**training, network={}, packed=())
+        _check_drive(request)
         arguments = {"training": training, "packed": [request.out / pack.name / DRIVE for pack in packs]}
         content = " ".join(pack.content for pack in packs)
         inputs = [weights_path(start), *request.config_files]
@@ -132,10 +136,8 @@ class VariantTable:
 
     def _run(self, request: Request, variant: str, sequence: str) -> Part:
         weights = request.out / self._training(variant) / WEIGHTS
-        settings = ["slam.registration=neural", "slam.visual.enabled=false"]  # the network alone, as in the paper
-        slam = tuple(text for text in request.overrides if text.startswith(_FOR_SLAM))
-        own = replace(request, weights=str(weights), overrides=slam)
-        return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *settings])
+        own = replace(request, weights=str(weights), overrides=_for_slam(request))
+        return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *_ALONE])
 
     def _panel(self, request: Request, sequence: str, notes: list[str]) -> None:
         """The paper's figure 7: what one reference point reads from the image, by every variant that attends."""
@@ -159,6 +161,25 @@ class VariantTable:
 
     def _training(self, variant: str) -> str:
         return f"trained/{variant.replace(' ', '_')}"
+
+
+def _for_slam(request: Request) -> tuple[str, ...]:
+    return tuple(text for text in request.overrides if text.startswith(_FOR_SLAM))
+
+
+def _check_drive(request: Request) -> None:
+    """Else every row would be of the same weights, or of none.
+
+    Raises:
+        UsageError: the user's settings put others in the place of a variant's.
+    """
+    own = "those of the variant"
+    slam = load_settings(Config, None, [*_ALONE, f"slam.neural.weights={own}", *_for_slam(request)]).slam
+    if slam.neural.weights != own:
+        raise UsageError(f"slam.neural.weights={slam.neural.weights}: each variant is driven with its own weights;"
+                         " what all start from is named by --weights")  # fmt: skip
+    if slam.registration != "neural":
+        raise UsageError(f"slam.registration={slam.registration}: the variants are driven with the network alone")
 
 
 def _joined(change: Mapping[str, Any]) -> dict[str, Any]:

@@ -100,12 +100,15 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
     ("preset=paper", "preset paper: the network is that of --weights .*tiny.safetensors, of preset tiny"),
     ("start=small", "start small: what all variants start from is named by --weights"),
     ("optimiser.stepps=3", "unknown key optimiser.stepps"),
+    ("slam.neural.weights=small", "weights=small: each variant is driven with its own weights; .* by --weights"),
+    ("slam.neural={weights: small}", "weights=small: each variant"),
+    ("slam.registration=geometric", "registration=geometric: the variants are driven with the network alone"),
 ])  # fmt: skip
 def test_settings_that_no_variant_is_trained_by_are_errors(
     asked: str, said: str, kitti: Path, weights: Path, tmp_path: Path
 ) -> None:
     """Another preset, and other weights to start from, changed nothing, without a word: the table was of `small`. What
-    is mistyped was an error only after all drives had been packed."""
+    is mistyped was an error only after all drives had been packed. With weights to drive all rows were of these."""
     with pytest.raises(UsageError, match=said):
         fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=(asked,)))
     fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=("preset=tiny",)))  # what it is anyway
