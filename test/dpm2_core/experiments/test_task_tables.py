@@ -17,6 +17,7 @@ from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.task_part import Training, train
 from dpm2_core.experiments.task_tables import GNDNET
+from dpm2_core.learning.trainer import OptimizerSettings, learning_rate
 from dpm2_core.tasks.task import task_type
 
 from ...helpers.command import dpm2
@@ -211,6 +212,19 @@ def test_the_last_loss_of_a_part_of_the_epochs_is_of_the_last_that_was_trained(t
     rows = [json.loads(line) for line in (tmp_path / "out/log.jsonl").read_text().splitlines()]
     assert len(rows) >= 4
     assert found["last_task_loss"] == pytest.approx(np.median([row["task_loss"] for row in rows]))
+
+
+@pytest.mark.parametrize(("name", "rates"), [
+    ("gndnet", [1e-2, 1e-2, 8e-3, 1e-2 * 0.8**5, 1e-2 * 0.8**9]), ("dslr", [1e-3] * 5), ("ae_lidar", [5e-4] * 5)
+])  # fmt: skip
+def test_the_authors_recipes_have_the_authors_rates(name: str, rates: list[float]) -> None:
+    """In steps for GndNet, the same all along for the others; the third stage of DSLR, where the SLAM loss counts,
+    began at a tenth of it and ended at a hundredth, by a cosine that is not theirs."""
+    path = Path(__file__).resolve().parents[3] / "config" / f"{name}_authors.yaml"
+    settings = load_settings(task_type(name).training_type, path)
+    of_epochs = OptimizerSettings(**settings.optimiser.model_dump(), steps=settings.epochs)
+    epochs = [0, 14, 15, settings.epochs // 2, settings.epochs - 1]
+    assert [learning_rate(of_epochs, epoch) for epoch in epochs] == pytest.approx(rates)
 
 
 @pytest.mark.parametrize(
