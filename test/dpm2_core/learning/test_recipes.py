@@ -10,6 +10,7 @@ import pytest
 from dpm2_core.config import Settings, load_settings
 from dpm2_core.experiments.ablation import AblationSettings
 from dpm2_core.experiments.variants import AS_PAPER, TABLE_4
+from dpm2_core.learning.augment import UNCHANGED
 from dpm2_core.learning.train_image import ImageTrainingSettings
 from dpm2_core.learning.train_overlap import OverlapTrainingSettings
 from dpm2_core.learning.train_registration import RegistrationTrainingSettings
@@ -74,6 +75,14 @@ def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> Non
     assert second.optimiser.rate == pytest.approx(first.optimiser.rate / 10)
     assert second.optimiser.decay == pytest.approx(first.optimiser.decay / 10)
     assert (first.loss.pairing, first.loss.coarse, first.loss.backbone, first.loss.offset) == (1, 0.1, 0.1, 1)
+
+
+@pytest.mark.parametrize("name", ["train_paper_registration", "train_paper_overlap"])
+def test_the_recipes_of_the_paper_change_scans_as_its_predecessor_and_leave_images_as_they_are(name: str) -> None:
+    """Exposure, colors and calibration were changed at random, too, by what is usual here."""
+    settings = load_settings(READ_BY[name], CONFIG / f"{name}.yaml").data.augment
+    changed = {key for key, value in settings if value != getattr(UNCHANGED, key)}
+    assert changed == {"drop", "occlusion", "jitter", "yaw", "tilt", "shift"}
 
 
 def test_the_papers_network_has_its_reference_points() -> None:
