@@ -176,7 +176,7 @@ class Result:
             poses = self.sensor_poses
             truth = camera_poses(truth, self.source.T_cam_lidar)
         metrics = evaluate(truth, poses, self.lengths, stamps=stamps, failed_frames=self.methods["failed"])
-        own = {"truth": self.ground_truth_name, "breaks": self.recorder.breaks, "fps": self.fps}
+        own = {"truth": self.ground_truth_name, "frames": len(self), "breaks": self.recorder.breaks, "fps": self.fps}
         return metrics.model_copy(update=own)
 
     def save(self, out: Path | str, cloud: bool = True) -> list[str]:

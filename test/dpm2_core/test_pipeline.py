@@ -222,6 +222,13 @@ def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: P
     assert stamped.rpe_trans_m == pytest.approx(given.rpe_trans_m, abs=2e-3)
 
 
+def test_the_frames_of_a_drive_are_counted_whatever_its_truth_is_sampled_at(result: Result) -> None:
+    """Failed frames are of all frames; beside a truth of 2 Hz there were more of them than frames."""
+    stamps = np.array(result.recorder.stamps)
+    slower = replace(result, ground_truth=Trajectory(result.poses[::5], stamps[::5], "tum"))
+    assert (slower.metrics.frames, slower.metrics.failed_frames) == (len(result), result.methods["failed"])
+
+
 def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "drive.dpm2map"
     with OfflineRun(recording, CONFIG, (0, 4), map_file=path) as begun:
