@@ -13,7 +13,7 @@ import numpy as np
 
 from dpm2_core.data.trajectory import matched
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.kitti_metric import known
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
 from dpm2_core.evaluation.metrics import align
 from dpm2_core.evaluation.page import asset, escape, page
 from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
@@ -21,10 +21,11 @@ from dpm2_core.frame import Array
 from dpm2_core.tables import FigureTable, cells_of
 
 _BINS = 300  # of the time along a drive
+_KITTI = {"t_err %": "{t_err_percent:.3f}", "r_err deg/100 m": "{r_err_deg_per_100m:.3f}"}
 _FIGURES = {
-    "t_err %": "{t_err_percent:.3f}", "r_err deg/100 m": "{r_err_deg_per_100m:.3f}", "APE rmse m": "{ape_rmse_m:.3f}",
-    "APE mean m": "{ape_mean_m:.3f}", "RPE m": "{rpe_trans_m:.4f}", "drift %": "{final_drift_percent:.3f}",
-    "failed": "{failed_frames:d}", "breaks": "{breaks:d}", "frames/s": "{timing[fps]:.1f}",
+    "APE rmse m": "{ape_rmse_m:.3f}", "APE mean m": "{ape_mean_m:.3f}", "RPE m": "{rpe_trans_m:.4f}",
+    "drift %": "{final_drift_percent:.3f}", "failed": "{failed_frames:d}", "breaks": "{breaks:d}",
+    "frames/s": "{timing[fps]:.1f}",
 }  # fmt: skip
 
 
@@ -138,14 +139,32 @@ def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
 
 
 def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
-    headings = ["frames", *_FIGURES, "loops", "rejected"]
-    caption = "APE after SE(3) alignment, RPE and the KITTI metric unaligned."
-    table = FigureTable("Runs", names=["run"], figures=headings, caption=caption)
+    # The KITTI metric of other segments is another figure: each set of lengths has columns of its own.
+    measured = dict.fromkeys(_lengths(run) for _, run in runs if run.metrics.get("t_err_percent") is not None)
+    kitti = sorted(measured, key=lambda lengths: lengths != OFFICIAL_LENGTHS) or [OFFICIAL_LENGTHS]
+    headings = [name + _of(lengths) for lengths in kitti for name in _KITTI]
+    caption = (
+        "APE after SE(3) alignment, RPE and the KITTI metric unaligned, this of segments of 100 to 800 m if no other"
+    )
+    table = FigureTable("Runs", names=["run"], figures=["frames", *headings, *_FIGURES, "loops", "rejected"],
+                        caption=f"{caption} lengths are named.")  # fmt: skip
     for name, run in runs:
+        errors = [
+            cell for of in kitti for cell in cells_of(run.metrics if _lengths(run) == of else {}, _KITTI.values())
+        ]
         figures = cells_of({**run.metrics, "timing": run.timing}, _FIGURES.values())
         accepted = sum(loop.accepted for loop in run.loops)
-        table.add_row(name, str(len(run.trajectory)), *figures, str(accepted), str(len(run.loops) - accepted))
+        table.add_row(name, str(len(run.trajectory)), *errors, *figures, str(accepted), str(len(run.loops) - accepted))
     return table
+
+
+def _lengths(run: RunFolder) -> tuple[float, ...]:
+    """Segment lengths of its KITTI metric, m."""
+    return tuple(run.metrics.get("lengths_m") or OFFICIAL_LENGTHS)
+
+
+def _of(lengths: Sequence[float]) -> str:
+    return "" if lengths == OFFICIAL_LENGTHS else f" of {', '.join(f'{length:g}' for length in lengths)} m"
 
 
 def _table(table: FigureTable) -> str:

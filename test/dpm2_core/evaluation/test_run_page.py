@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.data.trajectory import write_tum
+from dpm2_core.data.trajectory import read_trajectory, write_tum
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.evaluation.metrics import evaluate
@@ -78,6 +78,21 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
     assert [row[0] for row in both["runs"][1]["byLength"]] == [20.0, 50.0]
     assert EVIL not in text
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "").replace("http://example.org", "")
+
+
+def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Path) -> None:
+    """What was measured over 20 and 50 m stood in the column of what was over 100 to 800 m, and looked twice as bad."""
+    short, official = (write_run(tmp_path / name, 240, 1.02) for name in ("short", "official"))
+    truth, est = (read_trajectory(official / f"{name}.tum").poses for name in ("ground_truth", "trajectory"))
+    whole = evaluate(truth, est)
+    (official / "metrics.json").write_text(json.dumps(whole.model_dump()))
+    known = json.loads((short / "metrics.json").read_text())
+    text = runs_page("A report", find_runs([tmp_path]))
+    headings, *rows = (re.findall("<t[hd]>(.*?)</t[hd]>", row) for row in re.findall("<tr>.*?</tr>", text))
+    table = {row[0]: dict(zip(headings, row, strict=True)) for row in rows}
+    here, other = "t_err %", "t_err % of 20, 50 m"
+    assert (table["official"][here], table["official"][other]) == (f"{whole.t_err_percent:.3f}", "-")
+    assert (table["short"][here], table["short"][other]) == ("-", f"{known['t_err_percent']:.3f}")
 
 
 @pytest.mark.parametrize("known", [False, True])
