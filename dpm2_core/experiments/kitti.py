@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,13 +16,14 @@ from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
     add_runs,
-    missing_note,
     own_part,
+    paper_notes,
     peer_names,
     peer_parts,
     present,
     registrations,
     run_folders,
+    segments,
 )
 from dpm2_core.experiments.table import MEAN, Cells, ResultTable
 from dpm2_core.fleet.part import Figures, Part
@@ -56,7 +58,8 @@ def _parts(request: Request, paper: Sequence[str], settings: Sequence[str] = ())
 def _kitti_findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     sequences = present(request, TESTED, ORIGINAL_POSES)
     title = "KITTI odometry: t_err % / r_err deg per 100 m"
-    caption = f"KITTI metric of the left camera's poses, mean over all segments; mean: over the sequences. {FAILED}"
+    over = segments(request)
+    caption = f"KITTI metric of the left camera's poses, mean over {over}; mean: over the sequences. {FAILED}"
     table = ResultTable(title, [*sequences, MEAN], SHOWN, caption)
     speed = ResultTable("APE rmse m / frames per s", [*sequences, MEAN], _SPEED,
                         "APE: positions after SE(3) alignment; frames per second: processing alone, of each of"
@@ -66,9 +69,7 @@ def _kitti_findings(request: Request, figures: Mapping[str, Figures]) -> Finding
         for rows in (table, speed):
             add_runs(rows, name, sequences, figures)
     table.add("DeepPointMap2", PAPER, "the paper")
-    notes = missing_note(sequences, TESTED)
-    if not all(sequence in PAPER for sequence in sequences) or request.frames or request.lengths:
-        notes.append("other sequences, frames or lengths than the paper's: its row is no comparison")
+    notes = paper_notes(request, sequences, TESTED)
     runs = run_folders(names, sequences, request.out)
     trajectory_pictures(runs, request.out, notes)
     return Findings([table, speed], notes, runs)
@@ -77,7 +78,9 @@ def _kitti_findings(request: Request, figures: Mapping[str, Figures]) -> Finding
 def _kitti360_findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     sequences = present(request, TESTED_360)
     title = "KITTI-360: APE mean m / APE rmse m / t_err % / r_err deg per 100 m"
-    caption = f"APE: positions after SE(3) alignment, of the known poses. {FAILED}"
+    caption = (
+        f"APE: positions after SE(3) alignment, of the known poses. KITTI metric: over {segments(request)}. {FAILED}"
+    )
     table = ResultTable(title, [*sequences, MEAN], _APE, caption)
     names = [name for name, _ in registrations(request)] + peer_names(request)
     for name in names:
@@ -85,7 +88,7 @@ def _kitti360_findings(request: Request, figures: Mapping[str, Figures]) -> Find
     for name, ape in (("DeepPointMap2", 26.00), ("DeepPointMap", 93.77)):
         table.add(name, {"0007": {"ape_mean_m": ape}}, "the paper", "of 0009 it says: accurate")
     runs = run_folders(names, sequences, request.out)
-    notes = missing_note(sequences, TESTED_360)
+    notes = paper_notes(replace(request, lengths=None), sequences, TESTED_360)  # its figures are positions
     trajectory_pictures(runs, request.out, notes)
     return Findings([table], notes, runs)
 

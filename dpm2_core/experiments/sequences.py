@@ -46,10 +46,20 @@ def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) ->
     return found
 
 
-def missing_note(found: Sequence[str], paper: Sequence[str]) -> list[str]:
-    """What is to be said where sequences of the paper are missing."""
+def paper_notes(request: Request, found: Sequence[str], paper: Sequence[str]) -> list[str]:
+    """What is to be said where other sequences, frames or segments are measured than the paper's, or not all."""
     missing = [sequence for sequence in paper if sequence not in found]
-    return [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
+    notes = [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
+    if not set(found) <= set(paper) or request.frames or request.lengths:
+        notes.append("other sequences, frames or lengths than the paper's: its rows are no comparison")
+    return notes
+
+
+def segments(request: Request) -> str:
+    """What the KITTI metric of a table is the mean over, for its caption."""
+    if request.lengths is None:
+        return "all segments"
+    return f"all segments of {', '.join(f'{length:g}' for length in request.lengths)} m"
 
 
 def learned_note(learned: Sequence[str], tested: Sequence[str]) -> list[str]:

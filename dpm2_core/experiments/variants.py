@@ -19,11 +19,12 @@ from dpm2_core.experiments.sequences import (
     SHOWN,
     add_runs,
     learned_note,
-    missing_note,
     own_part,
+    paper_notes,
     present,
     reading,
     run_folders,
+    segments,
 )
 from dpm2_core.experiments.slam_part import drive_content, open_drive
 from dpm2_core.experiments.table import MEAN, ResultTable
@@ -117,7 +118,7 @@ class VariantTable:
         notes = learned_note(_learned(request), sequences)
         tables = []
         if self.judged:
-            caption = f"t_err % / r_err deg per 100 m, network alone. {FAILED}"
+            caption = f"t_err % / r_err deg per 100 m, mean over {segments(request)}, network alone. {FAILED}"
             table = ResultTable(self.title, [*sequences, MEAN], SHOWN, caption)
             for variant in self.variants:
                 random = len(figures[self._training(variant)]["random_at_start"])
@@ -127,7 +128,7 @@ class VariantTable:
                 table.add(variant, {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True)}, "the paper")
             tables.append(table)
             notes.append("every variant was fine-tuned from the same weights, as far as they fit it")
-            notes += missing_note(sequences, TESTED)
+            notes += paper_notes(request, sequences, TESTED)
         names = [self._name(variant) for variant in self.variants] if self.judged else []
         runs = run_folders(names, sequences, request.out)
         if self.variants is not TABLE_3:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.experiments.kitti import KITTI
 from dpm2_core.experiments.request import Request
+from dpm2_core.experiments.sequences import paper_notes, segments
 from dpm2_core.experiments.slam_part import Drive, given
 from dpm2_core.geometry import se3
 
@@ -28,6 +30,20 @@ QUICK = ("--registration", "geometric", "--set", "slam.loops.enabled=false", "--
 def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sequences 06 and 10, six scans each, with images."""
     return kitti_odometry(recording, tmp_path_factory.mktemp("kitti"), ("06", "10"), 6, images=True)
+
+
+def test_what_is_measured_otherwise_than_in_the_paper_is_said(tmp_path: Path) -> None:
+    """Only KITTI's table said that the paper's rows are no comparison, and none of which segments its figures are."""
+    request, paper = Request(tmp_path, tmp_path), ("06", "10")
+    assert (paper_notes(request, paper, paper), segments(request)) == ([], "all segments")
+    (missing,) = paper_notes(request, ("10",), paper)
+    assert missing.endswith("asked for: 06")
+    for other in (replace(request, lengths=(50.0, 100.0)), replace(request, frames=(0, 400))):
+        (note,) = paper_notes(other, paper, paper)
+        assert note.endswith("its rows are no comparison")
+    (note,) = paper_notes(request, (*paper, "07"), paper)
+    assert note.endswith("its rows are no comparison")
+    assert segments(replace(request, lengths=(50.0, 100.0))) == "all segments of 50, 100 m"
 
 
 @pytest.mark.slow
@@ -115,6 +131,9 @@ def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
     assert record["parts"]["dpm2_geometric_camera_black_100_/10"]["ape_rmse_m"] == whole["ape_rmse_m"]
     assert record["parts"]["dpm2_geometric_box_before_the_LiDAR_100_/10"]["ape_rmse_m"] != whole["ape_rmse_m"]
     assert set(record["change_percent"]) == set(ours[1:])
+    assert "all segments of 2 m;" in record["tables"][0]["caption"]
+    assert "the paper's means are of 06, 07, 08, 09, 10" in record["notes"]
+    assert any("no comparison" in note for note in record["notes"])
     assert (tmp_path / "corrupted_10.png").stat().st_size > 5000
 
 
