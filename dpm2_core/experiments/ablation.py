@@ -53,7 +53,7 @@ class AblationSettings(Settings):
     variants: dict[str, dict[str, Any]] = Field({**TABLE_4, **MIXTURES}, min_length=1)
     """Name and change to the network of each; the others are compared with the first."""
     seeds: int = Field(1, gt=0)
-    """Trainings of each: weights and data from seed 0, 1, ... on."""
+    """Trainings of each, with `training.optimiser.seed` and those after it."""
     measure: dict[str, str] = Field({})
     """Name and folder of the packed drives that all are measured on."""
     pairs: int = Field(300, gt=0)
@@ -83,7 +83,8 @@ def ablation(settings: AblationSettings, out: Path) -> Table:
 def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> dict[str, dict[str, float]]:
     """Figures by drives of one training."""
     network = merged(settings.training.network, settings.variants[name])
-    optimiser = settings.training.optimiser.model_copy(update={"seed": seed})
+    first = settings.training.optimiser
+    optimiser = first.model_copy(update={"seed": first.seed + seed})
     training = settings.training.model_copy(update={"network": network, "optimiser": optimiser})
     folder = out / name.replace(" ", "_") / str(seed)
     weights, known = folder / WEIGHTS, folder / "figures.json"

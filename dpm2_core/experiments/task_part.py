@@ -29,7 +29,8 @@ Scans = tuple[Path, Sequence[str]]
 
 
 class Training(TypedDict):
-    """What an arm is trained by: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, seed."""
+    """What an arm is trained by: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, and its
+    seed, counted from that of the settings."""
 
     task: str
     data: Path
@@ -46,9 +47,10 @@ def settings_of(training: Training) -> SlamTaskTraining:
     assert isinstance(chosen, SlamTaskTraining)
     arm = training["arm"]
     gamma = 0.0 if arm == "without" else chosen.slam.gamma
+    seed = chosen.optimiser.seed + training["seed"]
     return chosen.model_copy(
         update={
-            "optimiser": chosen.optimiser.model_copy(update={"seed": training["seed"]}),
+            "optimiser": chosen.optimiser.model_copy(update={"seed": seed}),
             "slam": chosen.slam.model_copy(update={"gamma": gamma}),
             "slam_loss": chosen.slam_loss.model_copy(update={"placebo": arm == "placebo"}),
         }

@@ -15,7 +15,7 @@ from dpm2_core.config import load_settings
 from dpm2_core.errors import UsageError
 from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Request
-from dpm2_core.experiments.task_part import Training, train
+from dpm2_core.experiments.task_part import Training, settings_of, train
 from dpm2_core.experiments.task_tables import GNDNET
 from dpm2_core.learning.trainer import OptimizerSettings, learning_rate
 from dpm2_core.tasks.task import task_type
@@ -201,6 +201,18 @@ def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: 
     found = train(tmp_path / "out", lambda done, total: None, arm)
     assert found["last_task_loss"] is None
     assert found["skipped_steps"] > 0
+
+
+def test_seeds_count_from_that_of_the_settings(tmp_path: Path) -> None:
+    """`--set optimiser.seed=100` trained seeds 0, 1, 2 once more, and the second table was the first to the last digit,
+    as if both were sure."""
+
+    def seeds(*settings: str) -> list[int]:
+        of = (Training(task="gndnet", data=tmp_path, learn=[], config=None, settings=settings, seed=seed, arm="with")
+              for seed in range(2))  # fmt: skip
+        return [settings_of(training).optimiser.seed for training in of]
+
+    assert (seeds(), seeds("optimiser.seed=100")) == ([0, 1], [100, 101])
 
 
 def test_the_last_loss_of_a_part_of_the_epochs_is_of_the_last_that_was_trained(tmp_path: Path) -> None:
