@@ -17,6 +17,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.tiles import TiledMap
 from dpm2_core.slam.output import save_map
 from dpm2_core.slam.session import check_for_localization, open_for_localization, open_session
+from dpm2_core.slam.store.map_file import left_log, remove_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
@@ -242,7 +243,7 @@ class ActiveMap:
         if self._store is not None:
             self._store.close()
             if self._path is not None and not self._store.read_only and not self.mapper.keyframes:
-                self._path.unlink(missing_ok=True)
+                remove_map(self._path)
                 with suppress(OSError):  # it is not empty
                     self._path.parent.rmdir()
             self._store = None
@@ -261,7 +262,8 @@ class ActiveMap:
         """A map file; a warning where that which was asked for exists, as after a crash: it does not go on."""
         store, name = self._new_file(), self._config.ros.map_file
         if store is not None and name != AUTO and self._path != (asked := self._maps.of_robot(Path(name))):
-            self._log.warning(f"{asked} is there already and stays as it is: {self._path} begins without its drives")
+            there = asked if asked.exists() else left_log(asked) or asked
+            self._log.warning(f"{there} is there already and stays as it is: {self._path} begins without its drives")
         return store
 
     def _new_file(self) -> MapStore | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dpm2_core.errors import UsageError
 from dpm2_core.files import numbered
+from dpm2_core.slam.store.map_file import left_log
 
 _NAME = "drive"
 _SUFFIX = ".dpm2map"
@@ -45,9 +46,11 @@ class MapFolder:
         return requested.with_name(self._of_robot(requested.stem) + requested.suffix)
 
     def free(self, requested: Path) -> Iterator[Path]:
-        """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds."""
+        """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds, nor what
+        is left of a map that did."""
         for path in numbered(self.of_robot(requested), requested.suffix):
-            if not path.exists() and (self.folder is None or not (self.folder / path.stem).exists()):
+            taken = path.exists() or left_log(path) is not None
+            if not taken and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
     def claimed(self, name: str, file: Path | None) -> Path:

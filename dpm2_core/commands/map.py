@@ -88,7 +88,8 @@ def prune(
     from dpm2_core.slam.mapping.prune import prune as pruned
     from dpm2_core.slam.mapping.prune import redundant_nodes
     from dpm2_core.slam.mapping.redundancy import RedundancySettings
-    from dpm2_core.slam.store.map_data import check_new, load_map, save_as
+    from dpm2_core.slam.store.map_data import load_map, save_as
+    from dpm2_core.slam.store.map_file import check_new
     from dpm2_core.slam.store.map_store import MapStore
 
     check_new(out)

@@ -19,7 +19,8 @@ from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.mapping.merge import align, loops_by, merge_maps, off_by_satellites, optimized, tie_of
 from dpm2_core.slam.settings import Config, SlamSettings
-from dpm2_core.slam.store.map_data import MapData, check_new, load_map, save_as
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_file import check_new
 from dpm2_core.slam.store.map_store import MapStore
 
 _OFF = 30.0  # m from where satellites have a map: receivers err by meters, and over its length so does a heading

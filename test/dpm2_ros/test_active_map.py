@@ -98,6 +98,19 @@ def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
     assert caplog.text == ""
 
 
+def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It would hold that one's keyframes, or be malformed: the next number is taken."""
+    log = tmp_path / "drive.dpm2map-wal"
+    log.write_bytes(b"log")
+    drive(tmp_path)
+    assert check_map(tmp_path / "drive-2.dpm2map").keyframes == 3
+    drive(tmp_path, map_file=str(tmp_path / "drive.dpm2map"))
+    assert f"{log} is there already and stays as it is" in caplog.text
+    assert log.read_bytes() == b"log"
+
+
 def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
     """As `ros.map_file:=''` leaves one, or dpm2 0.1."""
     drive(tmp_path, map_file="")

@@ -39,7 +39,7 @@ def create_map(path: Path) -> MapConnection:
     """Make a new, empty map file, and open it to write. A kill on the way leaves no file of that name.
 
     Raises:
-        UsageError: there is a file already. Dpm2Error: it cannot be made.
+        UsageError: see `check_new`. Dpm2Error: it cannot be made.
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_file import already_there, name_map, remove_map
+from dpm2_core.slam.store.map_file import check_new, name_map, remove_map
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -178,7 +178,7 @@ def save_as(data: MapData, path: Path) -> None:
     """Write a map to a new file, which appears whole or not at all; clouds pass through one at a time.
 
     Raises:
-        UsageError: there is a file already. Dpm2Error: it could not be written.
+        UsageError: see `check_new`. Dpm2Error: it could not be written.
     """
     check_new(path)
     part = part_beside(path)
@@ -188,12 +188,6 @@ def save_as(data: MapData, path: Path) -> None:
         name_map(part, path)  # another program may have made one meanwhile
     finally:
         remove_map(part)
-
-
-def check_new(path: Path) -> None:
-    """Raises UsageError if there is a file already."""
-    if path.exists():
-        raise already_there(path)
 
 
 def append_map(store: MapStore, data: MapData) -> None:

@@ -60,9 +60,10 @@ def name_map(source: Path, target: Path) -> None:
     """Give a map that was closed a name that no file has; of two programs that want the same one, one gets it.
 
     Raises:
-        UsageError: there is a file already. Dpm2Error: as `move_map`.
+        UsageError: there is a file already, or what SQLite kept beside one. Dpm2Error: as `move_map`.
     """
     _check_whole(source, target)
+    check_new(target)
     try:
         os.link(source, target)
         source.unlink()
@@ -72,6 +73,25 @@ def name_map(source: Path, target: Path) -> None:
         if target.exists():
             raise already_there(target) from None
         move_map(source, target)
+
+
+def check_new(path: Path) -> None:
+    """Raises UsageError if a map that is made there would not be new: there is a file already, or what SQLite kept
+    beside one, which it would take for the new one's."""
+    left = left_log(path)  # first: of a map that another program makes now the file is there before its log
+    if path.exists():
+        raise already_there(path)
+    if left is not None:
+        raise UsageError(
+            f"{left}: the last keyframes of a map that was killed, moved or removed without them; move it to where "
+            "that map is, or remove it"
+        )
+
+
+def left_log(path: Path) -> Path | None:
+    """What SQLite kept beside a map file, if there is any of it."""
+    logs = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-journal"))
+    return next((log for log in logs if log.exists() and log.stat().st_size), None)
 
 
 def already_there(path: Path) -> UsageError:

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map file and its log belong together: neither is taken for that of another map."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dpm2_core.cli import main
+from dpm2_core.errors import UsageError
+from dpm2_core.estimates import Keyframe
+from dpm2_core.slam.session import open_session
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.store.check import check_map
+from dpm2_core.slam.store.map_data import load_map, save_as
+from dpm2_core.slam.store.map_store import MapStore
+from test.helpers.maps import change
+
+
+def begun(source: Path, path: Path) -> None:
+    """As a drive or a robot makes one."""
+    open_session(path, SlamSettings(registration="geometric", loops={"descriptors": False}), "", resume=False).close()
+
+
+def saved(source: Path, path: Path) -> None:
+    """As prune, merge and check --recover make one."""
+    with MapStore.open(source) as store:
+        save_as(load_map(store), path)
+
+
+@pytest.mark.parametrize("make", [begun, saved])
+def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
+    tmp_path: Path, map_file: Path, keyframes: list[Keyframe], make: Callable[[Path, Path], None]
+) -> None:
+    """Of a killed one that was removed or moved: SQLite took it for the new map's, which then held the keyframes of the
+    old one, or was malformed."""
+    path = tmp_path / "new.dpm2map"
+    log = path.with_name("new.dpm2map-wal")
+    with MapStore.create(tmp_path / "killed") as store:
+        store.begin_session()
+        store.write(change(0, keyframes[0]))
+        shutil.copyfile(tmp_path / "killed-wal", log)  # as `kill -9`, and then `rm` or `mv` of the map, leave it
+    before = log.read_bytes()
+    with pytest.raises(UsageError, match=r"new\.dpm2map-wal: the last keyframes of a map .* or remove it"):
+        make(map_file, path)
+    assert not path.exists()
+    assert log.read_bytes() == before  # the map that was moved needs it
+    log.unlink()
+    make(map_file, path)
+    assert check_map(path).problems == []
+    assert check_map(path).keyframes == (0 if make is begun else check_map(map_file).keyframes)
+
+
+def test_prune_says_so_before_it_has_worked(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the exit code of a mistake, as where there is a file."""
+    (tmp_path / "less.dpm2map-wal").write_bytes(b"log")
+    with pytest.raises(SystemExit, match="2"):
+        main(["map", "prune", str(map_file), "--out", str(tmp_path / "less.dpm2map")])
+    assert "less.dpm2map-wal: the last keyframes" in capsys.readouterr().err
