@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C where work must not stop in the middle; and SIGTERM, where that is as Ctrl-C."""
+"""Ctrl-C where work must not stop in the middle; SIGTERM, where that is as Ctrl-C; and a terminal that is closed."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -13,8 +14,28 @@ _Handler = Callable[[int, FrameType | None], None]
 
 
 def terminate_as_interrupt() -> None:
-    """From here on SIGTERM is as Ctrl-C: by itself it would leave temporary files, and of a drive nothing."""
+    """From here on SIGTERM is as Ctrl-C: by itself it would leave temporary files, and of a drive nothing. So is a
+    terminal that is closed."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hang_up_as_terminated()
+
+
+def hang_up_as_terminated() -> None:
+    """From here on a terminal that is closed, or whose connection breaks, is as one SIGTERM; what would then be written
+    there is lost. A process that ignores it, as by nohup, goes on doing so."""
+    if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
+        return
+    terminals = [stream for stream in range(3) if os.isatty(stream)]  # afterwards they no longer are
+
+    def hung_up(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the system sends it, and then the shell: two would not wait
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in terminals:
+            os.dup2(nowhere, stream)
+        os.close(nowhere)
+        signal.raise_signal(signal.SIGTERM)
+
+    signal.signal(signal.SIGHUP, hung_up)
 
 
 _taken: list[int] = []  # Ctrl-C since each `interrupt_deferred` began that is under way, the innermost last
@@ -27,7 +48,7 @@ def interrupt_deferred() -> Iterator[Callable[[], bool]]:
     KeyboardInterrupt at any other place would leave a frame half processed, and out of compiled code it comes as
     SystemError. The second Ctrl-C raises it, for work that hangs. A handler other than Python's own stays as it is,
     and so does that of a process that ignores Ctrl-C; outside of the main thread none is ever called.
-    With SIGTERM it is the same. Within another one, each takes its own first Ctrl-C.
+    With SIGTERM and a terminal that is closed it is the same. Within another one, each takes its own first Ctrl-C.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The life of a process: signals, spinning, which thread comes first. One or several SIGINT or SIGTERM end it cleanly.
+"""The life of a process: signals, spinning, which thread comes first. One or several SIGINT or SIGTERM end it cleanly,
+and so does a terminal that is closed.
 
 rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, and with them a map that is being saved.
 """
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.interrupt import hang_up_as_terminated
 from dpm2_ros.share import share_directory
 from dpm2_ros.shared_memory import free_shared_memory
 
@@ -68,9 +70,10 @@ STOP = Stop()
 
 
 def catch_signals() -> None:
-    """From here on SIGINT and SIGTERM set `STOP` and nothing else."""
+    """From here on SIGINT, SIGTERM and a terminal that is closed set `STOP` and nothing else."""
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: STOP.set())
+    hang_up_as_terminated()
 
 
 def ignore_signals() -> None:

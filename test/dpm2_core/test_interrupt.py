@@ -3,9 +3,16 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import signal
+import subprocess
+import sys
+import termios
 import threading
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -15,9 +22,11 @@ from dpm2_core.interrupt import interrupt_deferred, terminate_as_interrupt
 @pytest.fixture(autouse=True)
 def python_handles_it() -> Iterator[None]:
     """A test in the background may have it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    for name, handler in before.items():
+        signal.signal(name, handler)
 
 
 def test_the_first_waits_and_the_second_raises() -> None:
@@ -45,18 +54,55 @@ def test_within_another_one_each_takes_its_own() -> None:
 
 
 def test_sigterm_is_as_ctrl_c() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        terminate_as_interrupt()
-        with interrupt_deferred() as interrupted:
-            signal.raise_signal(signal.SIGTERM)
-            assert interrupted()
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
+    terminate_as_interrupt()
+    with interrupt_deferred() as interrupted:
+        signal.raise_signal(signal.SIGTERM)
+        assert interrupted()
         with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGTERM)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+            signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+
+
+HUNG_UP = """
+import sys, time
+from pathlib import Path
+from dpm2_core.interrupt import interrupt_deferred, terminate_as_interrupt
+terminate_as_interrupt()
+with interrupt_deferred() as interrupted:
+    print("begun", flush=True)
+    while not interrupted():
+        time.sleep(0.01)
+    for stream in (sys.stdout, sys.stderr):
+        print("nobody reads this", file=stream, flush=True)
+    while not Path("again").exists():
+        time.sleep(0.01)
+    Path("results").touch()
+"""
+
+
+def test_a_terminal_that_is_closed_is_as_one_ctrl_c(tmp_path: Path) -> None:
+    """By itself it ends a drive and leaves nothing of it, and what is written there is an error from then on. The shell
+    sends the signal once more, which is no second Ctrl-C."""
+    screen, terminal = os.openpty()
+    attach = partial(fcntl.ioctl, terminal, termios.TIOCSCTTY, 0)
+    with subprocess.Popen(
+        [sys.executable, "-c", HUNG_UP], cwd=tmp_path, stdin=terminal, stdout=terminal, stderr=terminal,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, start_new_session=True, preexec_fn=attach,
+    ) as process:  # fmt: skip
+        os.close(terminal)
+        assert os.read(screen, 100).strip() == b"begun"
+        os.close(screen)
+        process.send_signal(signal.SIGHUP)
+        (tmp_path / "again").touch()
+        assert process.wait(60) == 0
+    assert (tmp_path / "results").exists()
+
+
+def test_under_nohup_a_terminal_that_is_closed_ends_nothing() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    terminate_as_interrupt()
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
 
 
 @pytest.mark.parametrize("fails", [False, True])
