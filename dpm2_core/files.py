@@ -30,7 +30,6 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """
     path = Path(path)
     target = path.resolve()  # a symbolic link stays one
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")  # same folder: replacing is then atomic
     encoding = None if "b" in mode else "utf-8"
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
@@ -38,16 +37,18 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
                 yield file
             return
         target.parent.mkdir(parents=True, exist_ok=True)
-        with part.open(mode, encoding=encoding) as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
+        part = part_beside(target)  # same folder: replacing is then atomic
+        try:
+            with part.open(mode, encoding=encoding) as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(target)
+        finally:
+            with suppress(OSError):
+                part.unlink()
     except OSError as error:
         raise not_written(path, error) from error
-    finally:
-        with suppress(OSError):
-            part.unlink()
 
 
 def part_beside(path: Path) -> Path:
@@ -57,7 +58,8 @@ def part_beside(path: Path) -> Path:
     """
     own = os.getpid()
     for left in path.parent.glob(".*.part*"):
-        part = re.fullmatch(rf"\.{re.escape(path.name)}\.(\d+)\.part(-\w+)?", left.name)
+        # a map that was to take that name began as another part, of this one
+        part = re.fullmatch(rf"\.+{re.escape(path.name)}(?:\.\d+\.part)?\.(\d+)\.part(-\w+)?", left.name)
         if part and (int(part[1]) == own or not _alive(int(part[1]))):
             with suppress(OSError):
                 shutil.rmtree(left) if left.is_dir() else left.unlink()

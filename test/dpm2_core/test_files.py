@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,19 @@ def test_an_interrupted_writer_leaves_the_old_file_and_nothing_else(
         write()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_killed_writers_have_left_goes_with_the_next_file_of_the_name(tmp_path: Path) -> None:
+    """Else every kill costs the disk once more what was being written: of a checkpoint or a map.ply its size."""
+    path, others = tmp_path / "result.txt", [".other.txt.{}.part", "result.txt.{}.part"]
+    with subprocess.Popen([sys.executable, "-c", ""]) as killed:
+        pass
+    for name in (".result.txt.{}.part", "..result.txt.{0}.part.{0}.part", *others):
+        (tmp_path / name.format(killed.pid)).touch()
+    (living := tmp_path / f".result.txt.{os.getppid()}.part").touch()
+    with atomic_write(path) as file:
+        file.write("new")
+    assert set(tmp_path.iterdir()) == {path, living, *(tmp_path / name.format(killed.pid) for name in others)}
 
 
 def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
