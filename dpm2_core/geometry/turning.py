@@ -11,6 +11,8 @@ from dpm2_core.geometry import se3
 
 _LONGEST = 0.1  # s between two samples, across which the rate is taken to change evenly
 _BEYOND = 0.05  # s before the first sample or after the last, for which its rate is taken to go on
+_SLOWEST = 0.11  # s between the samples of the slowest IMU: those of 10 Hz, as of kitti2bag, have 0.104 s
+_UNEVEN = 1.25  # of their usual distance: so much may be between two samples of a slow one
 
 
 def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array | None:
@@ -22,24 +24,26 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
         seconds: (K,) increasing times of the samples. rates: (K, 3) rad/s about the sensor's own axes.
 
     Returns:
-        None where the samples do not tell: none within 0.1 s of each other, or of the times to within 0.05 s.
+        None where the samples do not tell: none within 0.1 s of each other, or of the times to within 0.05 s; of an
+        IMU of 10 Hz within a quarter more than its period.
     """
     at = np.asarray(at, np.float64)
     low, high = min(0.0, float(at.min())), max(0.0, float(at.max()))
-    near = (seconds > low - _LONGEST) & (seconds < high + _LONGEST)
+    longest, beyond = _limits(seconds)
+    near = (seconds > low - longest) & (seconds < high + longest)
     seconds, rates = seconds[near], rates[near]
     if len(seconds) > 1 and seconds[1] <= low:  # of those before, the last one alone
         first = int(np.searchsorted(seconds, low, "right")) - 1
         seconds, rates = seconds[first:], rates[first:]
-    if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > _LONGEST:
+    if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > longest:
         seconds, rates = seconds[1:], rates[1:]  # it stopped and has come back
     last = int(np.searchsorted(seconds, high)) + 1
     seconds, rates = seconds[:last], rates[:last]
-    if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > _LONGEST:
+    if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > longest:
         seconds, rates = seconds[:-1], rates[:-1]
-    if not len(seconds) or seconds[0] > low + _BEYOND or seconds[-1] < high - _BEYOND:
+    if not len(seconds) or seconds[0] > low + beyond or seconds[-1] < high - beyond:
         return None
-    if len(seconds) > 1 and np.diff(seconds).max() > _LONGEST:
+    if len(seconds) > 1 and np.diff(seconds).max() > longest:
         return None
     before, after = min(low, float(seconds[0])), max(high, float(seconds[-1]))
     seconds = np.concatenate([[before - 1e-9], seconds, [after + 1e-9]])
@@ -58,6 +62,13 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
         return nodes[k] @ se3.rotation(mean * since)
 
     return np.asarray(rotation(np.zeros(1))[0].T @ rotation(at))
+
+
+def _limits(seconds: NDArray[np.floating]) -> tuple[float, float]:
+    """s between two samples, and beyond the first and the last, by how far apart they (K,) usually are."""
+    usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    allowed = _UNEVEN * usual if usual < _SLOWEST else 0.0
+    return max(_LONGEST, allowed), max(_BEYOND, allowed)
 
 
 def leveled(up: ArrayLike, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:

@@ -95,6 +95,19 @@ def test_what_the_samples_do_not_tell_is_not_made_up(seconds: Array, known: bool
         assert worst(R, axes(np.zeros(1)).inv() * axes(np.array([-0.1, 0.1]))) < 1.0
 
 
+@pytest.mark.parametrize("last", [0.4, 0.33], ids=["at the end", "most of a period before"])
+@pytest.mark.parametrize("period", [0.1, 0.1036])
+def test_ten_samples_a_second_are_enough_though_they_come_unevenly(period: float, last: float) -> None:
+    """As in bags of kitti2bag, 0.1036 s apart: they told nothing of any turn. Missing ones are still not made up."""
+    uneven = np.random.default_rng(0).uniform(-0.005, 0.005, 20)
+    seconds, at = last + period * np.arange(-19, 1) + np.append(uneven[:-1], 0.0), np.array([0.0, 0.2, 0.4])
+    R = turned(seconds, rates(seconds), at)
+    assert R is not None
+    assert worst(R, axes(np.zeros(1)).inv() * axes(at)) < 2.0  # 0.1 s at 5 rad/s2 are 1.5 degrees
+    for some in (seconds[np.arange(20) != 17], seconds[1::2]):
+        assert turned(some, rates(some), at) is None
+
+
 @given(vectors.filter(lambda v: np.linalg.norm(v) > 0.1), vectors.filter(lambda v: np.linalg.norm(v) > 0.1))
 def test_leveling_is_the_smallest_turn_there(up: Array, axis: Array) -> None:
     R, u, z = leveled(up, axis), up / np.linalg.norm(up), axis / np.linalg.norm(axis)
