@@ -91,9 +91,7 @@ def verify(
         for count, keyframe in enumerate(second.keyframes, 1):
             keyframes.append(keyframe)
             end = len(keyframes)
-            # One that borrows would confirm the loop of its lender, whose cloud it shows: a single witness.
-            found = closer.close(keyframes, clouds, poses[:end], parts[:end], own[:end]) if own[end - 1] else []
-            for loop in found:
+            for loop in closer.close(keyframes, clouds, poses[:end], parts[:end], own[:end]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
                     tried[ends] = loop.between(*ends)  # later: confirmed by another one

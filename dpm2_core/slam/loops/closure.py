@@ -106,7 +106,8 @@ class LoopCloser:
         Args:
             keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
             parts: (N,) the part of the map that each is in: where two of them are to each other is not known.
-            own: (N,) which descriptors are their own: those that borrow look like nothing but the lender. None: all.
+            own: (N,) which descriptors are their own: those that borrow look like nothing but the lender, whose loop
+                they would confirm, a single witness. None: all.
 
         Returns:
             Every candidate, accepted or rejected with its reason; and earlier ones of which it took a second to be
@@ -116,13 +117,13 @@ class LoopCloser:
             self._path.append(keyframes[node])
         if self._places is not None:
             self._places.update(keyframes)
-        if not self._settings.enabled or len(keyframes) < 2:
-            return []
         node = len(keyframes) - 1
+        own = np.ones(len(keyframes), np.bool_) if own is None else own
+        if not self._settings.enabled or node < 1 or not own[node]:
+            return []
         self._settings, self._verifier = self._ways.suited_to(clouds[node])
         self._consistency.update(poses, parts)
         since = self._path.since(node)
-        own = np.ones(len(keyframes), np.bool_) if own is None else own
         tried, proposals = self._proposals(since, keyframes, poses, own)
         if self._by_head:
             return tried + proposals[:1]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dpm2_core.estimates import Edge, Registration, isotropic
-from dpm2_core.frame import Array, Georeference, Points
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.pose_graph import PoseGraph
 from dpm2_core.slam.loops.closure import LoopCloser
@@ -99,11 +99,8 @@ def loops_by(closer: LoopCloser) -> FindLoops:
         for node, keyframe in enumerate(b.keyframes):
             # Another name keeps the odometry of the two apart.
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
-            clouds: Sequence[Points] = both.clouds
             end = len(keyframes)
-            if not own[end - 1]:  # it would confirm the loop of its lender, whose cloud it shows: a single witness
-                continue
-            for loop in closer.close(keyframes, clouds, both.poses[:end], parts[:end], own[:end]):
+            for loop in closer.close(keyframes, both.clouds, both.poses[:end], parts[:end], own[:end]):
                 if loop.ok and loop.from_node < len(a) <= loop.to_node:
                     out.append(loop.between(loop.from_node, loop.to_node - len(a)))
         return out

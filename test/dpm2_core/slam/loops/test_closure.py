@@ -224,7 +224,8 @@ def test_what_the_odometry_would_reject_is_not_asked_for(monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
+def test_without_descriptors_the_pose_alone_leads_to_loops_but_of_one_that_borrows() -> None:
+    """What it shows is the cloud of another one, which is no second witness."""
     jump = se3.exp(np.array([0, 0, 0, 0.5, 0.5, 0]))
     at = [(s, 0.0, 0.0) for s in STREET] + [(62.0, 1.0, 0.0)]
     truth = np.array([where(*place) for place in at])
@@ -237,6 +238,8 @@ def test_without_descriptors_the_pose_alone_leads_to_loops() -> None:
         for i in range(len(at))
     ]
     assert search.described(keyframes[0]).descriptors is None
+    own = np.arange(len(poses)) < len(STREET)
+    assert closer(with_network=False, gap=30.0).close(keyframes, clouds, poses, ONE_PART[: len(poses)], own) == []
     (loop,) = search.close(keyframes, clouds, poses, ONE_PART[: len(poses)])
     assert loop.registration.ok, loop.registration.reason
     assert errors([loop], truth)[0] < 0.1
