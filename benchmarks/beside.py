@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
 from benchmarks.imu import LIDAR
+from dpm2_core.console import progress_bar
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array, Frame, Guess
 from dpm2_core.sim.sensors import real_sensor
@@ -44,7 +44,7 @@ WAYS: dict[str, tuple[float, float, int] | None] = {
 def bench_beside(options: Options) -> Report:
     """Each world once, with map and loops; no IMU."""
     settings, results = settings_of(options), dict[str, Any]()
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         for name, (road, preset, seed, speed) in WORLDS.items():
             robot = TurningRobot(build_world(road, preset, seed), FRAMES, Ride(speed), real_sensor(LIDAR))
             frames = list(progress.track(robot.frames(), total=FRAMES, description=name))

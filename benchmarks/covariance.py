@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group
-from rich.progress import Progress
 from scipy.special import chdtri
 
 from benchmarks.harness import Options, Report, drives, processors, requested, rounded, settings_of, truth_of
 from benchmarks.pairs import pairs_of
+from dpm2_core.console import progress_bar
 from dpm2_core.data.open import open_source
 from dpm2_core.data.source import Source
 from dpm2_core.estimates import Registration
@@ -47,7 +47,7 @@ def bench_covariance(options: Options) -> Report:
         UsageError: there is no drive, or one has no ground truth.
     """
     results: dict[str, dict[str, Any]] = {}
-    with processors(options.threads), Progress(transient=True) as progress:
+    with processors(options.threads), progress_bar() as progress:
         for part in requested(options, PARTS):
             with drives(options) if part == "real" else _simulated(options) as sources:
                 named = progress.track(sources.items(), description=part)

@@ -9,9 +9,9 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, evenly, processors, requested, settings_of, truth_of
+from dpm2_core.console import progress_bar
 from dpm2_core.estimates import OdometryResult, State
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
@@ -52,7 +52,7 @@ def bench_gaps(options: Options) -> Report:
     """
     methods = requested(options, ("geometric", "adaptive", "refined", "neural"))
     results: dict[str, Any] = {}
-    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
+    with drives(options) as sources, processors(options.threads), progress_bar() as progress:
         for name, source in sources.items():
             truth, frames = truth_of(source), list(source.frames())
             cases = list(gaps([frame.stamp for frame in frames]))

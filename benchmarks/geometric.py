@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, installed, processors, quantiles_ms, settings_of, truth_of
+from dpm2_core.console import progress_bar
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.experiments.peers import at_stamps, cloud_and_times, end_of, kiss_icp_config
@@ -121,7 +121,7 @@ def bench_geometric(options: Options) -> Report:
     methods |= installed({BASELINE: partial(kiss_icp, options)})
     results: dict[str, Any] = {}
     truth: dict[str, str] = {}
-    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
+    with drives(options) as sources, processors(options.threads), progress_bar() as progress:
         task = progress.add_task("benchmark", total=len(sources) * options.repetitions * len(methods))
         for drive, source in sources.items():
             poses, frames = truth_of(source), list(source.frames())

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Group
-from rich.progress import Progress
 
 from benchmarks.figures import verdicts_png
 from benchmarks.geometric import BASELINE, Method, Trial, dpm2, kiss_icp
 from benchmarks.hardships import EVERY, Case, cases, judged
 from benchmarks.harness import Options, Report, drives, installed, processors, requested, truth_of
+from dpm2_core.console import progress_bar
 from dpm2_core.estimates import State
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.sim.settings import PresetName
@@ -45,7 +45,7 @@ def bench_hard(options: Options) -> Report:
     results: dict[str, Any] = {}
     worlds = () if options.sources else _SYNTHETIC
     synthetic = [SimulatedDrive(road, preset, seed, preset) for road, preset, seed in worlds]
-    with drives(options, synthetic) as sources, processors(options.threads), Progress(transient=True) as progress:
+    with drives(options, synthetic) as sources, processors(options.threads), progress_bar() as progress:
         for name, source in sources.items():
             frames = list(source.frames(0, _SYNTHETIC_FRAMES if source in synthetic else None))
             hard = list(cases(frames, truth_of(source)[: len(frames)]))

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Group
-from rich.progress import Progress
 
 from benchmarks.gaps import evaluated, gaps, summary
 from benchmarks.harness import Options, Report, settings_of
+from dpm2_core.console import progress_bar
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.evaluation.metrics import evaluate, path_length
 from dpm2_core.frame import Array, Frame
@@ -53,7 +53,7 @@ def bench_imu(options: Options) -> Report:
     """Each world once, the odometry alone with default settings."""
     settings, results = settings_of(options), dict[str, Any]()
     imu = ImuConfig()
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         for name, (preset, seed, speed, swings) in WORLDS.items():
             world = build_world("loop", preset, seed)
             robot = TurningRobot(world, FRAMES, Ride(speed, swings), real_sensor(LIDAR), imu)

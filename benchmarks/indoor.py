@@ -29,6 +29,7 @@ from benchmarks.indoor_places import (
     visits_to,
 )
 from benchmarks.loops import error_of
+from dpm2_core.console import progress_bar
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.evaluation.metrics import evaluate
@@ -54,7 +55,7 @@ def bench_indoor(options: Options) -> Report:
     """Each world with default settings: its drive, visits to it, and thirds of the drive in one map."""
     settings, results = settings_of(options), dict[str, Any]()
     mappers, visits, dusty = dict[str, Mapper](), dict[str, list[Visit]](), dict[str, list[Visit]]()
-    with Progress(transient=True) as progress, tempfile.TemporaryDirectory() as folder:
+    with progress_bar() as progress, tempfile.TemporaryDirectory() as folder:
         for name, (preset, seed, frames) in WORLDS.items():
             lidar = real_sensor(LidarConfig(beams=BEAMS, height=HEIGHT))
             config = DriveConfig(frames=frames, seed=seed, road="loop", preset=preset, images=False, lidar=lidar)

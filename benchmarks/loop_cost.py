@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, settings_of
 from benchmarks.resident import resident_mb
+from dpm2_core.console import tracked
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import NO_POINTS, Array
@@ -42,9 +42,8 @@ def bench_loop_cost(options: Options) -> Report:
     keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[:few])]
     make_loops(settings).close(keyframes, [cloud] * few, poses[:few], parts[:few])  # torch takes its memory
     empty = resident_mb()
-    with Progress(transient=True) as progress:
-        for node in progress.track(range(few, len(poses)), description="map"):
-            keyframes.append(_keyframe(node, poses[node], rng))
+    for node in tracked(range(few, len(poses)), "map"):
+        keyframes.append(_keyframe(node, poses[node], rng))
     for size in SIZES:
         clouds = [cloud] * len(keyframes)
         seconds = []

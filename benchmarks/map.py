@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console, Group
-from rich.progress import track
+from rich.console import Group
 
 from benchmarks.harness import Options, Report, truth_of
 from dpm2_core.config import load_settings
+from dpm2_core.console import tracked
 from dpm2_core.data.open import open_source
 from dpm2_core.database import size_with_log
 from dpm2_core.errors import Dpm2Error
@@ -103,8 +103,7 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
     duration = time.perf_counter() - started  # from the imports to the last image
     rng, kills, finals = np.random.default_rng(0), [], []
     path = folder / "killed0.dpm2map"
-    with_bar = track(range(kills_wanted), description="kills", transient=True, console=Console(stderr=True))
-    for _ in with_bar:
+    for _ in tracked(range(kills_wanted), "kills"):
         before = _keyframes(path)
         while True:
             added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0, 0.4 * duration)))
@@ -210,7 +209,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
     """Keyframes every 5 m with drifting odometry, and which of their points move (M,)."""
     lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(lap)
     at = np.arange(0.0, world.road.drive.length, 5.0)
-    for number, s in enumerate(track(at, description=f"lap {lap + 1}", transient=True, console=Console(stderr=True))):
+    for number, s in enumerate(tracked(at, f"lap {lap + 1}")):
         T_world_kf = world.pose_at(float(s))
         scan = lidar.scan(world, T_world_kf, 100.0 * lap + s / 8, rng)
         near = voxel_first(scan.points, 0.3, far=60.0)

@@ -6,10 +6,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from benchmarks.harness import Options, Report, drives, settings_of
 from benchmarks.resident import resident_mb
+from dpm2_core.console import tracked
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.build import make_slam
 from dpm2_core.tables import FigureTable, record_table
@@ -31,8 +31,7 @@ def bench_memory(options: Options) -> Report:
         for name, source in sources.items():
             slam = make_slam(settings)
             samples = [(0, resident_mb())]
-            frames = track(source.frames(), description=f"{name}: memory", total=len(source), transient=True)
-            for count, frame in enumerate(frames, 1):
+            for count, frame in enumerate(tracked(source.frames(), f"{name}: memory", len(source)), 1):
                 slam.process(frame)
                 if count % _EVERY == 0:
                     samples.append((count, resident_mb()))

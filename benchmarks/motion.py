@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, installed, settings_of
+from dpm2_core.console import progress_bar
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.experiments.peers import KissIcp
 from dpm2_core.frame import Array, Frame
@@ -40,7 +40,7 @@ def bench_motion(options: Options) -> Report:
     """Each ride once: the odometry alone with default settings, without the network, and KISS-ICP."""
     results = dict[str, Any]()
     settings = [settings_of(options), settings_of(options, "slam.registration=geometric")]
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         for place, (preset, seed, beams, rides) in WORLDS.items():
             world = build_world("loop", preset, seed)
             for name in rides:

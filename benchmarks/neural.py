@@ -12,7 +12,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.figures import success_png
 from benchmarks.geometric import BASELINE, Method, dpm2, kiss_icp, summary
@@ -34,6 +33,7 @@ from benchmarks.pairs import APART, PairMethod, all_pairs, by_registration, gicp
 from benchmarks.repeated import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
+from dpm2_core.console import progress_bar
 from dpm2_core.data.packed import open_packed, packed_digest
 from dpm2_core.data.source import digest_of
 from dpm2_core.errors import UsageError
@@ -66,7 +66,7 @@ def bench_neural(options: Options) -> Report:
     same = {"weights": weights, "options": _options(options)}
     parts = earlier(path, "parts", **same)
     chosen = [name for name in chosen if options.only or name not in parts]
-    with processors(options.threads), Progress(transient=True) as progress:
+    with processors(options.threads), progress_bar() as progress:
         task = progress.add_task("neural", total=len(chosen))
         for name in chosen:
             progress.update(task, description=name)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.geometric import mapped
 from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from benchmarks.loops import check_loops
+from dpm2_core.console import progress_bar
 from dpm2_core.data.trajectory import arc_lengths
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.frame import Array, Frame
@@ -51,7 +51,7 @@ def bench_paper(options: Options) -> Report:
     """
     results: dict[str, Any] = {}
     more = [] if options.sources else [lap()]
-    with drives(options, more) as sources, processors(options.threads), Progress(transient=True) as progress:
+    with drives(options, more) as sources, processors(options.threads), progress_bar() as progress:
         for name, source in sources.items():
             frames = list(source.frames())
             truth, results[name] = truth_of(source), {}

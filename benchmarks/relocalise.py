@@ -16,6 +16,7 @@ from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
 from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
 from benchmarks.roads import open_road, road_files
+from dpm2_core.console import progress_bar
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
@@ -53,7 +54,7 @@ def bench_relocalise(options: Options) -> Report:
         UsageError: there are no pose files.
     """
     settings = settings_of(options)
-    with Progress(transient=True) as progress, tempfile.TemporaryDirectory() as folder, processors(options.threads):
+    with progress_bar() as progress, tempfile.TemporaryDirectory() as folder, processors(options.threads):
         file = Path(folder) / "map.dpm2"
         roads = survey(options, settings, file, progress)
         with MapStore.open(file) as store:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from dpm2_core.commands.options import run_command
+from dpm2_core.console import Console
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.tables import FigureTable
 from tools.replay import ros_environment, start, stop

@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, excerpt, settings_of
 from benchmarks.loops import check_loops
+from dpm2_core.console import progress_bar
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.pipeline import OfflineRun
@@ -38,7 +39,7 @@ def bench_roads(options: Options) -> Report:
     """
     settings = settings_of(options)
     roads: dict[str, Any] = {}
-    with Progress(transient=True) as progress:
+    with progress_bar() as progress:
         for path in road_files(options):
             roads[path.stem] = drive(path, settings, progress)
             progress.console.print(f"{path.stem}: {roads[path.stem]}", soft_wrap=True)

@@ -17,13 +17,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import track
 
 from benchmarks.harness import Options
 from benchmarks.lossy_link import LOSS, inside, make_link, own_network, start_mapper, switch_link
 from benchmarks.roads import open_road, road_files
 from dpm2_core.commands.options import run_command
-from dpm2_core.console import Console
+from dpm2_core.console import Console, tracked
 from dpm2_core.errors import Dpm2Error, exit_code
 from dpm2_core.evaluation.metrics import align, ape_rmse
 from dpm2_core.evaluation.record import write_record
@@ -132,7 +131,7 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
         _wait(scans, scans.connected, "robots and mapper to start")
         count = [0, 0]
         first, end = SPANS["red"]
-        for tick in track(range((end - first) // EVERY), "driving"):
+        for tick in tracked(range((end - first) // EVERY), "driving"):
             if tick in OUTAGE:
                 count[OUTAGE.index(tick)] = sum(map(len, scans.made.values()))
                 switch_link(up=tick != OUTAGE[0])

@@ -14,11 +14,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from benchmarks.pairs import summarized
 from dpm2_core.commands.options import run_command
+from dpm2_core.console import Console, tracked
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame, Image
 from dpm2_core.geometry import se3
@@ -67,7 +66,7 @@ def errors(network: DeepPointMap2, kind: PresetName, seed: int) -> Array:
     """(ways, pairs, 2) m and deg, of one world."""
     world = build_world("straight", kind, seed, 300.0)
     poses, described = list[Array](), list[list[Descriptors]]()
-    for T, frame in track(list(_frames(world, network)), description=f"{kind} {seed}", transient=True):
+    for T, frame in tracked(_frames(world, network), f"{kind} {seed}", FRAMES):
         images = {image.camera.name: image for image in frame.images}
         poses.append(T)
         described.append([network.describe(replace(frame, images=tuple(images[n] for n in way))) for way in WAYS])

@@ -8,10 +8,10 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, drives, evenly, processors, settings_of, truth_of
 from benchmarks.pairs import summarized
+from dpm2_core.console import tracked
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame
@@ -37,8 +37,8 @@ def bench_tilt(options: Options) -> Report:
     """
     s = settings_of(options)
     network = load_network(s.neural.weights, options.threads)
-    with drives(options) as sources, processors(options.threads), Progress(transient=True) as progress:
-        named = progress.track(sources.items())
+    with drives(options) as sources, processors(options.threads):
+        named = tracked(sources.items(), "drives")
         results = {name: _of_drive(source, network, options.pairs) for name, source in named}
     return Report({"drives": results}, _table(results))
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from rich.progress import Progress
-
 from benchmarks.harness import Options, Report, configuration_of, drives, processors
+from dpm2_core.console import progress_bar
 from dpm2_core.data.source import Source
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.live_view import LiveView
@@ -72,7 +71,7 @@ def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
     with (
         OfflineRun(source, configuration_of(options), map_file=place / "drive.dpm2map") as drive,
         LiveView(source.name, viewer=False, record=place / "run.rrd") as live,
-        Progress(transient=True) as progress,
+        progress_bar() as progress,
     ):
         task = progress.add_task(source.name, total=len(drive))
 

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
 import rich.console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from dpm2_core.errors import printable
 
+_T = TypeVar("_T")
 QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 """Whether notes and progress, all that goes to stderr but errors, are left out: `--quiet` of every command."""
 
@@ -57,3 +59,9 @@ def progress_bar(console: Console | None = None) -> Progress:
         return Lines(console=console, disable=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=console)
+
+
+def tracked(items: Iterable[_T], description: str, total: int | None = None) -> Iterator[_T]:
+    """The items, with a bar that says how many are done; `total`: how many there are, where they do not say it."""
+    with progress_bar() as bar:
+        yield from bar.track(items, total=total, description=description)

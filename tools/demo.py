@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -13,10 +11,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dpm2_core.commands.options import run_command
-from dpm2_core.console import Console
+from dpm2_core.console import Console, progress_bar
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import convert
 from dpm2_core.data.open import is_rosbag2, open_source
@@ -26,7 +23,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.metrics import evaluate
 from dpm2_core.extras import MissingPackageError
-from dpm2_core.files import atomic_write
+from dpm2_core.files import write_json
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.output import corrected
@@ -58,14 +55,12 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     bag = prepare(src, out, frames, seed, console)
     source = BagSource(bag, InputSettings(images=False))
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with progress_bar(console) as progress:
         task = progress.add_task("bag_player -> slam_node -> /dpm2/odom", total=len(source))
         parameters = {"ros.queue_depth": QUEUE, "ros.map_period": 2.0}
         result = replay(source, out, rate, parameters, lambda done: progress.update(task, completed=done))
     evaluation = evaluate_replay(source, result, out)
-    with atomic_write(out / "summary.json") as file:
-        file.write(json.dumps(evaluation.summary, indent=2) + "\n")
+    write_json(out / "summary.json", evaluation.summary)
     console.print(_table(source, result, evaluation, out))
     failed = [check for check, holds in evaluation.checks.items() if not holds]
     for check in failed:
@@ -87,11 +82,8 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
         return src
     if src is None:
         src = out / f"city_{frames}_{seed}"
-        if not src.is_dir():
-            part = src.with_name(src.name + ".part")
-            shutil.rmtree(part, ignore_errors=True)
-            _simulate(part, frames, seed)
-            part.rename(src)
+        if not src.is_dir():  # it is there when it is whole
+            _simulate(src, frames, seed)
     bag = out / f"bag_{src.resolve().name}"
     made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):

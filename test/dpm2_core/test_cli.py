@@ -21,7 +21,7 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
 from dpm2_core.cli import COMMANDS, GROUPS, load_command
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.console import QUIET, Console, progress_bar, tracked
 from dpm2_core.data.trajectory import write_kitti
 from dpm2_core.errors import exit_code
 from dpm2_core.geometry import se3
@@ -132,6 +132,18 @@ def test_progress_survives_a_pipe() -> None:
     assert shown[0].startswith("drive tracking: 20/200")
     assert shown[-1].startswith("drive tracking: 200/200")
     assert "\x1b" not in out.getvalue()
+
+
+def test_what_is_tracked_comes_as_it_is_and_is_counted_unless_all_is_to_be_quiet(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The last line is there at the end, however fast it goes."""
+    for quiet in (False, True):
+        before = QUIET.set(quiet)
+        assert list(tracked(iter("abcd"), "scans", 4)) == ["a", "b", "c", "d"]
+        QUIET.reset(before)
+        out, err = capsys.readouterr()
+        assert (out, err.splitlines()[-1:]) == ("", [] if quiet else ["scans: 4/4"])
 
 
 def test_no_color_means_none(straight: Path) -> None:
