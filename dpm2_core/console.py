@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The terminal. What is printed is text, whatever it looks like: names and notes come from files."""
+"""The terminal: text, whatever it looks like, since names and notes come from files; and how far a work has come."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
@@ -15,6 +16,12 @@ from dpm2_core.errors import printable
 _T = TypeVar("_T")
 QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 """Whether notes and progress, all that goes to stderr but errors, are left out: `--quiet` of every command."""
+Advance = Callable[[int, int], None]
+"""Told how much is done, of how much."""
+
+
+def untold(done: int, total: int) -> None:
+    """An `Advance` that says nothing."""
 
 
 class Console(rich.console.Console):
@@ -59,6 +66,14 @@ def progress_bar(console: Console | None = None) -> Progress:
         return Lines(console=console, disable=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=console)
+
+
+@contextmanager
+def counted(description: str) -> Iterator[Advance]:
+    """A bar that is told how much is done, and how much there is to do."""
+    with progress_bar() as bar:
+        task = bar.add_task(description, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def tracked(items: Iterable[_T], description: str, total: int | None = None) -> Iterator[_T]:

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from dpm2_core.commands.options import ConfigFile, InputOverrides, counted, note
+from dpm2_core.commands.options import ConfigFile, InputOverrides, note
 from dpm2_core.config import load_settings
+from dpm2_core.console import counted
 
 
 def convert(

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import RenderableType
 
-from dpm2_core.console import Console, progress_bar
+from dpm2_core.console import Console
 from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.files import atomic_write, json_text
@@ -54,14 +53,6 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
 def note(text: str, style: str = "") -> None:
     """To the user, not among the results; nothing with `--quiet`."""
     Console(stderr=True).print(text, style=style, highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def counted(description: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar; what it gives takes how much is done, and how much there is to do."""
-    with progress_bar() as bar:
-        task = bar.add_task(description, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def parse_names(text: str | None) -> tuple[str, ...]:

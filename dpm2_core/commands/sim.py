@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, Workers, counted, note
+from dpm2_core.commands.options import PROCESSORS, Workers, note
 from dpm2_core.config import settings_from
+from dpm2_core.console import counted
 from dpm2_core.sim.sensors import real_sensor
 from dpm2_core.sim.settings import DriveConfig, PresetName
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, counted, note
+from dpm2_core.commands.options import PROCESSORS, InputOverrides, Workers, note
 from dpm2_core.config import load_settings
-from dpm2_core.console import Console
+from dpm2_core.console import Console, counted
 from dpm2_core.data.source import parse_range
 from dpm2_core.errors import Dpm2Error, UsageError, printable
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from dpm2_core.console import Advance, untold
 from dpm2_core.data import bag_messages, topics
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.pairing import SWEEP
@@ -41,7 +41,7 @@ def convert(
     frames: Span = (0, None),
     zstd: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Advance = untold,
 ) -> list[str]:
     """Write frames of a drive to the new folder `out`; it appears whole or not at all.
 

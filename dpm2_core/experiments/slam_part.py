@@ -11,6 +11,7 @@ from typing import TypedDict
 import numpy as np
 
 from dpm2_core.config import load_settings
+from dpm2_core.console import Advance
 from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.data.source import Source, Span, digest_of
@@ -32,7 +33,8 @@ from dpm2_core.evaluation.metrics import Metrics, evaluate
 from dpm2_core.evaluation.run_folder import FRAMES, METRICS, TIMING, TRAJECTORY, TRUTH, write_frames, write_truth
 from dpm2_core.experiments.peers import at_stamps, end_of, make_peer
 from dpm2_core.files import write_json
-from dpm2_core.fleet.part import Advance, Figures, counted
+from dpm2_core.fleet.drives import driven
+from dpm2_core.fleet.part import Figures
 from dpm2_core.frame import Array
 from dpm2_core.pipeline import OfflineRun, open_recording, span_of
 from dpm2_core.slam.settings import Config
@@ -63,9 +65,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
     if corrupt is not None:
         source = CorruptedSource(open_drive(drive["data"], drive["settings"]), parse_corruption(corrupt))
     with OfflineRun(source, config, drive["frames"]) as run:
-        result = run.run(counted(advance, len(run)))
-        if result.interrupted:
-            raise KeyboardInterrupt
+        result = driven(run, advance)
         result.lengths = tuple(drive["lengths"])
         if result.metrics is None:
             raise UsageError(f"{run.source.name}: no ground truth to compare with")

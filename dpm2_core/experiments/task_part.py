@@ -9,10 +9,11 @@ from statistics import median
 from typing import Literal, TypedDict
 
 from dpm2_core.config import load_settings
+from dpm2_core.console import Advance
 from dpm2_core.data.trajectory import write_tum
 from dpm2_core.evaluation.run_folder import TRAJECTORY, TRUTH, write_truth
 from dpm2_core.files import make_folder
-from dpm2_core.fleet.part import Advance, Figures
+from dpm2_core.fleet.part import Figures
 from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.tasks.open import open_scans

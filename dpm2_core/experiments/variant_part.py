@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.config import load_settings, merged
+from dpm2_core.console import Advance
 from dpm2_core.data.packed import PackedDrive, packed_digest
 from dpm2_core.errors import UsageError
 from dpm2_core.experiments.slam_part import open_drive
-from dpm2_core.fleet.part import Advance, Figures
+from dpm2_core.fleet.part import Figures
 from dpm2_core.learning.begun import begin_training
 from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.learning.generate import pack as write_packed_drive

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
 from dpm2_core.config import Settings, load_settings, read_yaml, settings_from
+from dpm2_core.console import Advance
 from dpm2_core.data.source import Span, parse_range
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.fleet.part import Advance, Figures, Part, counted
+from dpm2_core.evaluation.run_result import Result
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.network.pretrained import pretrained_names, weights_path
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.filters import filter_weights
@@ -115,6 +118,19 @@ def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
     return slam.model_copy(update=changes), files
 
 
+def driven(run: OfflineRun, advance: Advance) -> Result:
+    """What came of a run as a part of more, which is told of each frame.
+
+    Raises:
+        KeyboardInterrupt: it was stopped before its end.
+    """
+    done = count(1)
+    result = run.run(lambda _: advance(next(done), len(run)))
+    if result.interrupted:
+        raise KeyboardInterrupt
+    return result
+
+
 def run_drive(folder: Path, advance: Advance, path: str, frames: Span, gt: str, config: Config) -> Figures:
     """Run a drive; leaves the files of `dpm2 run` and its map in the folder.
 
@@ -122,9 +138,7 @@ def run_drive(folder: Path, advance: Advance, path: str, frames: Span, gt: str, 
         UsageError: a recording that cannot be opened. Dpm2Error: results that cannot be written.
     """
     with OfflineRun(path, config, frames, gt or None, folder / MAP) as run:
-        result = run.run(counted(advance, len(run)))
-        if result.interrupted:
-            raise KeyboardInterrupt
+        result = driven(run, advance)
         if problem := result.mapper.store_problem:
             raise Dpm2Error(f"map file incomplete: {problem}")
         notes = [*run.source.notes, *result.save(folder)]

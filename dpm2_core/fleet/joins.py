@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.console import Advance
 from dpm2_core.estimates import Edge, Keyframe, Registration
-from dpm2_core.fleet.part import Advance, Figures, Part
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.frame import Array, Points
 from dpm2_core.slam.build import make_loops
 from dpm2_core.slam.mapping.parts import parts_of

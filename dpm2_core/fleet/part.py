@@ -14,13 +14,13 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
 from dpm2_core.config import Settings
+from dpm2_core.console import Advance, untold
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write, file_digest, make_folder, not_written
@@ -29,14 +29,6 @@ DONE = "part.json"
 """In the folder of a part that ended: what it was asked for, and its figures."""
 
 Figures = dict[str, Any]
-Advance = Callable[[int, int], None]
-"""Told how many frames are done, of how many."""
-
-
-def counted(advance: Advance, total: int) -> Callable[[object], None]:
-    """To be called after each of `total` frames."""
-    done = count(1)
-    return lambda _: advance(next(done), total)
 
 
 @dataclass(frozen=True)
@@ -124,14 +116,14 @@ def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -
         pool.shutdown(cancel_futures=True)
 
 
-def _named(part: Part, out: Path, advance: Advance = lambda done, total: None) -> Figures:
+def _named(part: Part, out: Path, advance: Advance = untold) -> Figures:
     try:
         return do_part(part, out, advance)
     except Dpm2Error as error:
         raise type(error)(f"{part.name}: {error}") from error
 
 
-def do_part(part: Part, out: Path, advance: Advance = lambda done, total: None) -> Figures:
+def do_part(part: Part, out: Path, advance: Advance = untold) -> Figures:
     """Do a part in this process, whether it was done before or not; returns its figures.
 
     Raises:

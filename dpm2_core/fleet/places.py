@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.console import Advance
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.extras import needs
 from dpm2_core.files import atomic_write, write_json
-from dpm2_core.fleet.part import Advance, Figures, Part
+from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map

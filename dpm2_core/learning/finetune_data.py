@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.console import Advance
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.kitti_metric import known
@@ -126,7 +127,7 @@ def prepare(
     return notes
 
 
-def _of_many(advance: Callable[[str], None], what: str) -> Callable[[int, int], None]:
+def _of_many(advance: Callable[[str], None], what: str) -> Advance:
     return lambda done, total: advance(f"{what} {done} of {total}")
 
 

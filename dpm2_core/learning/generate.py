@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, field_validator
 
 from dpm2_core.config import Settings
+from dpm2_core.console import Advance, untold
 from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writer, write_packed
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import levelling
@@ -148,9 +149,7 @@ def training_camera(network: NetworkSettings) -> CameraConfig:
     return CameraConfig(width=2 * width, height=2 * height, focal=720.0 * 2 * width / 1241)
 
 
-def generate(
-    out: Path, settings: GenerateSettings, workers: int, progress: Callable[[int, int], None] = lambda done, total: None
-) -> None:
+def generate(out: Path, settings: GenerateSettings, workers: int, progress: Advance = untold) -> None:
     """All worlds, several at a time; those that are there already stay, so a killed run continues.
 
     Raises:
@@ -180,7 +179,7 @@ def pack(
     folder: Path,
     network: NetworkSettings,
     frames: range | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Advance = untold,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns how many.

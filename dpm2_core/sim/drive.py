@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 from scipy.signal import savgol_filter
 
+from dpm2_core.console import Advance, untold
 from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.errors import UsageError
 from dpm2_core.files import file_digest, new_folder
@@ -42,7 +42,7 @@ def simulate(
     out: Path,
     drive: DriveConfig,
     workers: int = 2,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Advance = untold,
 ) -> bool:
     """Write a drive to `out`, which appears when it is complete and not before.
 
@@ -148,7 +148,7 @@ class _Drive:
         self.T_lidar_cam0, self.T_lidar_cam2 = T_lidar_level @ T_level_cam0, T_lidar_level @ color.T_lidar_cam
         self.K, self.baseline = color.K, color.T_lidar_cam[1, 3]
 
-    def write(self, root: Path, recipe: dict[str, Any], workers: int, progress: Callable[[int, int], None]) -> None:
+    def write(self, root: Path, recipe: dict[str, Any], workers: int, progress: Advance) -> None:
         sequence = root / "sequences" / "00"
         for name in ("velodyne", "labels", "static", *(["image_2"] if self.camera else [])):
             (sequence / name).mkdir(parents=True)
