@@ -30,7 +30,7 @@ from benchmarks.harness import (
 )
 from benchmarks.neural_view import view
 from benchmarks.pairs import APART, PairMethod, all_pairs, by_registration, gicp_from_identity, kiss_from_identity
-from benchmarks.repeated import repeated
+from benchmarks.reference_points import repeated
 from benchmarks.unseen import corruption, image_matters, overlap, synthetic
 from benchmarks.unseen_sensors import other_sensors
 from dpm2_core.console import progress_bar

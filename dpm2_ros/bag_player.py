@@ -18,7 +18,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_file import Bag, open_bag
 from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS
 from dpm2_core.data.messages import rigid_parts
@@ -33,8 +33,8 @@ from dpm2_ros.stamps import stamp_to_msg
 from dpm2_ros.tf_message import MOST_TRANSFORMS, TFMessage
 
 CLOCK = "/clock"
-LATCHED = (topics.TF_STATIC, topics.VERTICAL_ANGLE_CORRECTION)
-_STATIC = topics.TF_STATIC, "tf2_msgs/msg/TFMessage"  # and its type
+LATCHED = (naming.TF_STATIC, naming.VERTICAL_ANGLE_CORRECTION)
+_STATIC = naming.TF_STATIC, "tf2_msgs/msg/TFMessage"  # and its type
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
 DELIVERY = 5.0
@@ -158,7 +158,7 @@ class BagPlayer:
         transforms = list(placed.values())
         for first in range(0, len(transforms), MOST_TRANSFORMS):
             message = TFMessage(transforms=transforms[first : first + MOST_TRANSFORMS])
-            self._publishers[topics.TF_STATIC].publish(message)
+            self._publishers[naming.TF_STATIC].publish(message)
 
     def _transforms(self, data: bytes) -> dict[str, Any]:
         """Those of a message, by the frame that each places; what cannot be used is left out, with a warning."""
@@ -166,14 +166,14 @@ class BagPlayer:
         try:
             message = deserialize_message(data, TFMessage)
         except Exception as error:  # rclpy raises RMWError or RuntimeError
-            log.warning(f"{topics.TF_STATIC}: a message is left out: {printable(str(error))}", once=True)
+            log.warning(f"{naming.TF_STATIC}: a message is left out: {printable(str(error))}", once=True)
             return out
         for stamped in message.transforms:
             child = stamped.child_frame_id
             try:
                 rigid_parts(stamped.transform)
             except UsageError as error:
-                log.warning(f"{topics.TF_STATIC}: {printable(child)} is left out: {error}", once=True)
+                log.warning(f"{naming.TF_STATIC}: {printable(child)} is left out: {error}", once=True)
             else:
                 out[child.lstrip("/")] = stamped
         return out
@@ -277,7 +277,7 @@ class BagPlayer:
             if log_time < first:
                 continue
             played = bytes(data)
-            if topic == topics.TF and self._frames:
+            if topic == naming.TF and self._frames:
                 played = without_frames(played, self._frames)
             if played:
                 yield topic, log_time, played

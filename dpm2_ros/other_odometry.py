@@ -14,7 +14,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import TF
+from dpm2_core.data.naming import TF
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Comparison

@@ -17,7 +17,7 @@ from rclpy.time_source import CLOCK_TOPIC
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, NavSatFix, PointCloud2
 from std_msgs.msg import Float64
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.frames import Calibration, CameraTopic
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside
@@ -30,7 +30,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import check_header, check_size, checked_cloud, extended, replaced
 from dpm2_ros.guard import GuardedNode, excerpt, take_waiting
-from dpm2_ros.losses import Losses
+from dpm2_ros.lost_messages import Losses
 from dpm2_ros.matched_subscription import MatchedSubscription
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
@@ -79,11 +79,11 @@ class Inputs:
         self._frame: str | None = None  # of the clouds
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
         others = self._others(given)
-        self._static_topic, self._static_messages = node.resolve_topic_name(topics.TF_STATIC), 0
+        self._static_topic, self._static_messages = node.resolve_topic_name(naming.TF_STATIC), 0
         if TFMessage is not None:  # else extrinsics come from parameters alone
-            node.create_subscription(TFMessage, topics.TF_STATIC, self._on_static, LATCHED)
-        self._correction_topic = node.resolve_topic_name(topics.VERTICAL_ANGLE_CORRECTION)
-        node.create_subscription(Float64, topics.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
+            node.create_subscription(TFMessage, naming.TF_STATIC, self._on_static, LATCHED)
+        self._correction_topic = node.resolve_topic_name(naming.VERTICAL_ANGLE_CORRECTION)
+        node.create_subscription(Float64, naming.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         # The last to be announced: who waits for it has found the others.
         self.subscriptions = [self._subscribed(PointCloud2, given.points_topic, self._on_cloud), *others]
         node.create_timer(0.1, self._refresh)
@@ -284,7 +284,7 @@ class Inputs:
 
 def _with_defaults(settings: InputSettings) -> InputSettings:
     """The settings with every topic that is wanted."""
-    usual = {"points_topic": topics.POINTS, "image_topic": topics.IMAGE, "imu_topic": topics.IMU.lstrip("/")}
+    usual = {"points_topic": naming.POINTS, "image_topic": naming.IMAGE, "imu_topic": naming.IMU.lstrip("/")}
     return settings.model_copy(update={key: getattr(settings, key) or topic for key, topic in usual.items()})
 
 

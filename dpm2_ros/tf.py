@@ -10,7 +10,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import TF
+from dpm2_core.data.naming import TF
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.checks import check_transforms

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.messages import cloud_fields, point_columns
 from dpm2_core.frame import Array, Camera, Fix, Frame
 from dpm2_core.geometry import se3
@@ -45,7 +45,7 @@ def _pose(T: Array) -> Any:
 
 
 def _pose_stamped(stamp: int, T: Array) -> Any:
-    return _TYPES["geometry_msgs/msg/PoseStamped"](header=header(stamp, topics.MAP), pose=_pose(T))
+    return _TYPES["geometry_msgs/msg/PoseStamped"](header=header(stamp, naming.MAP), pose=_pose(T))
 
 
 def odometry(stamp: int, child: str, T: Array) -> Any:
@@ -53,7 +53,7 @@ def odometry(stamp: int, child: str, T: Array) -> Any:
     zero = _TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     twist = _TYPES["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
     return _TYPES["nav_msgs/msg/Odometry"](
-        header=header(stamp, topics.MAP),
+        header=header(stamp, naming.MAP),
         child_frame_id=child,
         pose=_TYPES["geometry_msgs/msg/PoseWithCovariance"](pose=_pose(T), covariance=np.zeros(36)),
         twist=_TYPES["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
@@ -65,7 +65,7 @@ def imu(stamp: int, rates: Array, forces: Array) -> Any:
     vector, unknown = _TYPES["geometry_msgs/msg/Vector3"], np.zeros(9)  # covariances
     no_orientation = np.array([-1.0, *np.zeros(8)])  # as REP-145 has it
     return _TYPES["sensor_msgs/msg/Imu"](
-        header=header(stamp, topics.IMU_LINK), orientation=_TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        header=header(stamp, naming.IMU_LINK), orientation=_TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         orientation_covariance=no_orientation, angular_velocity=vector(*rates.tolist()),
         angular_velocity_covariance=unknown, linear_acceleration=vector(*forces.tolist()),
         linear_acceleration_covariance=unknown,
@@ -76,7 +76,7 @@ def nav_sat_fix(stamp: int, fix: Fix) -> Any:
     """Of an antenna in GNSS_LINK."""
     latitude, longitude, altitude = fix.geodetic.tolist()
     return _TYPES["sensor_msgs/msg/NavSatFix"](
-        header=header(stamp, topics.GNSS_LINK), status=_TYPES["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+        header=header(stamp, naming.GNSS_LINK), status=_TYPES["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
         latitude=latitude, longitude=longitude, altitude=altitude, position_covariance=fix.covariance.ravel(),
         position_covariance_type=2,  # of the diagonal
     )  # fmt: skip
@@ -116,7 +116,7 @@ def cloud(stamp: int, lidar: str, frame: Frame) -> Any:
 def path(stamp: int, poses: list[tuple[int, Array]]) -> Any:
     """Stamps, ns, and T_map_lidar (4, 4)."""
     stamped = [_pose_stamped(at, T) for at, T in poses]
-    return _TYPES["nav_msgs/msg/Path"](header=header(stamp, topics.MAP), poses=stamped)
+    return _TYPES["nav_msgs/msg/Path"](header=header(stamp, naming.MAP), poses=stamped)
 
 
 def number(value: float) -> Any:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_file import Bag
 from dpm2_core.data.frames import CameraTopic
 from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside, is_depth
@@ -41,11 +41,11 @@ class TopicChoice:
                 f"{self._path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
             )
         if len(found) > 1:
-            if topics.POINTS not in found:
+            if naming.POINTS not in found:
                 raise UsageError(f"{self._path}: several PointCloud2 topics, choose one with input.points_topic: "
                                  + ", ".join(found))  # fmt: skip
-            self._bag.notes.append(f"PointCloud2 topics {', '.join(found)}: {topics.POINTS} was chosen")
-            return topics.POINTS
+            self._bag.notes.append(f"PointCloud2 topics {', '.join(found)}: {naming.POINTS} was chosen")
+            return naming.POINTS
         return found[0]
 
     def second(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
@@ -66,14 +66,14 @@ class TopicChoice:
             self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
         compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same as the raw ones
         found = [topic for topic in found if topic not in depth and (topic == asked or topic not in compressed)]
-        usual = topics.IMAGE if topics.IMAGE in found else topics.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
+        usual = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
         return self._one_of(found, asked, usual, "image", "images")
 
     def imu(self) -> str:
         """An IMU's topic, empty for none."""
         if not self._settings.imu:
             return ""
-        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, topics.IMU, "Imu", "Imu messages")
+        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, naming.IMU, "Imu", "Imu messages")
 
     def gnss(self) -> str:
         """The topic of fixes, empty for none."""
@@ -110,7 +110,7 @@ class TopicChoice:
         asked, found = self._settings.ground_truth_topic, self._bag.topics(*TRUTHS)
         if asked and asked not in found:
             raise UsageError(f"{self._path}: no Odometry or Path messages on {asked}; {self._contents()}")
-        return next((topic for topic in (asked, *topics.TRUTHS) if topic in found), "")
+        return next((topic for topic in (asked, *naming.TRUTHS) if topic in found), "")
 
     def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
         """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""

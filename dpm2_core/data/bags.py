@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bag_topics import TopicChoice
 from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
@@ -76,8 +76,8 @@ class BagSource:
         self.transforms = self._calibration.transforms
         self._add_transforms()
         self.T_cam_lidar: Array | None = None
-        if topics.GRAY_CAMERA in self.transforms.frames:
-            self.T_cam_lidar = self.transforms.lookup(topics.GRAY_CAMERA, self.lidar_frame)
+        if naming.GRAY_CAMERA in self.transforms.frames:
+            self.T_cam_lidar = self.transforms.lookup(naming.GRAY_CAMERA, self.lidar_frame)
         self.imu_topic = self._calibration.imu_topic = self._topics.imu()
         self._calibration.gnss_topic = self._topics.gnss()
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
@@ -203,13 +203,13 @@ class BagSource:
     def _add_transforms(self) -> None:
         """Take those of /tf_static; the invalid ones are left out, with a note."""
         problems = list[str]()
-        for _, _, data in self._bag.messages([topics.TF_STATIC]):
+        for _, _, data in self._bag.messages([naming.TF_STATIC]):
             try:
-                problems += self.transforms.add(self._bag.decode(topics.TF_STATIC, data))
+                problems += self.transforms.add(self._bag.decode(naming.TF_STATIC, data))
             except MessageError as error:
                 problems.append(str(error))
         if problems:
-            what = f"{topics.TF_STATIC}: {len(problems)} transforms left out"
+            what = f"{naming.TF_STATIC}: {len(problems)} transforms left out"
             note_once(self.notes, what, f"the first: {printable(problems[0])}")
 
     def _mounted(self, first: Any) -> Array | None:
@@ -225,7 +225,7 @@ class BagSource:
         if up[2] > _LEVEL:
             return T_base_lidar
         angle = float(np.degrees(np.arccos(max(up[2], -1.0))))
-        tilted = f"{topics.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
+        tilted = f"{naming.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
         seen = self._ground()
         if seen is not None and seen @ up < _LIKE:
             note_once(self.notes, tilted, "which is no base: the ground is not level in it")
@@ -244,7 +244,7 @@ class BagSource:
         return None
 
     def _recorded_correction(self) -> float | None:
-        topic, wanted = topics.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
+        topic, wanted = naming.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
         message = self._bag.first(topic) if wanted else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from dpm2_core.console import Advance, untold
-from dpm2_core.data import bag_messages, topics
+from dpm2_core.data import bag_messages, naming
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.pairing import SWEEP
 from dpm2_core.data.point_times import last_point
@@ -47,7 +47,7 @@ def convert(
 
     KITTI odometry has the topics and frames of kitti2bag, which the nodes listen to without being told; its points are
     written as they are, and the vertical angle correction that they need is recorded beside them. Other drives have
-    those of `topics.OTHER`.
+    those of `naming.OTHER`.
 
     Args:
         source: with its images, as rgb8.
@@ -98,7 +98,7 @@ class _Bag:
         self._last = 0  # ns, when the last cloud would have been recorded at its stamp
         self._later = self._shift = 0  # ns, added to stamps, and besides to the times of recording
         self._recorded: dict[str, int] = {}  # ns, of the last message of each topic
-        self._names = topics.OTHER
+        self._names = naming.OTHER
         self._correction_deg: float | None = None
         self._links: dict[str, tuple[str, Array]] = {}  # frame to its parent and T_parent_frame
         camera = getattr(source, "camera", None)  # the first one, also where its images come late
@@ -109,13 +109,13 @@ class _Bag:
         if isinstance(source, KittiSource):
             self.source = copy(source)
             self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
-            self._names, self._correction_deg = topics.KITTI, source.vertical_angle_correction_deg
+            self._names, self._correction_deg = naming.KITTI, source.vertical_angle_correction_deg
             self._R_lidar_imu = source.R_lidar_imu
             T_base_lidar = _T_BASE_LIDAR
         if T_base_lidar is not None:
-            self._links[self._names.lidar] = (topics.BASE, T_base_lidar)
+            self._links[self._names.lidar] = (naming.BASE, T_base_lidar)
         if source.T_cam_lidar is not None:
-            self._links[topics.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
+            self._links[naming.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
 
     def write(self, frame: Frame, position: int) -> None:
         """IMU, fix and image first: who waits for the cloud then has them already. The cloud is recorded when its last
@@ -124,8 +124,8 @@ class _Bag:
         self._link(stamp, frame)
         if frame.imu is not None:
             self._write_imu(frame.imu)
-        if frame.fix is not None and self._is_new(topics.FIX, time := frame.fix.stamp + self._later):
-            self._put(topics.FIX, time, bag_messages.nav_sat_fix(time, frame.fix))
+        if frame.fix is not None and self._is_new(naming.FIX, time := frame.fix.stamp + self._later):
+            self._put(naming.FIX, time, bag_messages.nav_sat_fix(time, frame.fix))
         if frame.problem:
             self.source.notes.append(f"{frame.problem}: written as an empty cloud")
         for image in frame.images:
@@ -152,12 +152,12 @@ class _Bag:
             self._first = self._last = stamp
             if self._correction_deg is not None:
                 correction = bag_messages.number(self._correction_deg)
-                self._put(topics.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
+                self._put(naming.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
         if frame.stepped or stamp + self._shift < self._last:
             self._shift = self._last + _PERIOD - stamp
-            if frame.imu and topics.IMU in self._recorded:  # the sweep may take longer than that
+            if frame.imu and naming.IMU in self._recorded:  # the sweep may take longer than that
                 first = int(frame.imu.stamps[0]) + self._later
-                self._shift = max(self._shift, self._recorded[topics.IMU] + 1 - first)
+                self._shift = max(self._shift, self._recorded[naming.IMU] + 1 - first)
         self._last = stamp + self._shift
         return stamp
 
@@ -173,12 +173,12 @@ class _Bag:
                 self._cameras.append(image.camera.name)
             links[self._optical(image)] = (lidar, image.camera.T_lidar_cam)
         if frame.imu is not None:
-            links[topics.IMU_LINK] = (lidar, se3.make(self._R_lidar_imu, np.zeros(3)))
+            links[naming.IMU_LINK] = (lidar, se3.make(self._R_lidar_imu, np.zeros(3)))
         if frame.fix is not None:
-            links[topics.GNSS_LINK] = (lidar, se3.make(np.eye(3), frame.fix.antenna))
-        if links and (links.keys() != self._links.keys() or topics.TF_STATIC not in self._connections):
+            links[naming.GNSS_LINK] = (lidar, se3.make(np.eye(3), frame.fix.antenna))
+        if links and (links.keys() != self._links.keys() or naming.TF_STATIC not in self._connections):
             self._links = links
-            self._put(topics.TF_STATIC, stamp, bag_messages.transforms(stamp, links), latched=True)
+            self._put(naming.TF_STATIC, stamp, bag_messages.transforms(stamp, links), latched=True)
 
     def _number(self, image: Image) -> str:
         """Of its camera, behind its name."""
@@ -197,8 +197,8 @@ class _Bag:
     def _write_imu(self, imu: Inertial) -> None:
         R = self._R_lidar_imu  # back along its own axes
         for time, rates, forces in zip(imu.stamps.tolist(), imu.rates @ R, imu.forces @ R, strict=True):
-            if self._is_new(topics.IMU, time + self._later):
-                self._put(topics.IMU, time + self._later, bag_messages.imu(time + self._later, rates, forces))
+            if self._is_new(naming.IMU, time + self._later):
+                self._put(naming.IMU, time + self._later, bag_messages.imu(time + self._later, rates, forces))
 
     def _put(self, topic: str, stamp: int, msg: Any, latched: bool = False) -> None:
         kind = msg.__msgtype__

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.repeated import shares
+from benchmarks.reference_points import shares
 from benchmarks.scan_statistics import RANGES, rings_of, statistics
 from dpm2_core.frame import Frame
 from dpm2_core.geometry import se3

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_messages import transforms
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.image_messages import decode_image
@@ -43,12 +43,12 @@ class Listener:
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         self.harness, self._log = harness, log
-        self.clouds = harness.hear(PointCloud2, topics.POINTS)
-        self.images = harness.hear(Image, topics.IMAGE)
-        self.infos = harness.hear(CameraInfo, f"{topics.KITTI.camera}/camera_info")
+        self.clouds = harness.hear(PointCloud2, naming.POINTS)
+        self.images = harness.hear(Image, naming.IMAGE)
+        self.infos = harness.hear(CameraInfo, f"{naming.KITTI.camera}/camera_info")
         self.clock = harness.hear(Clock, "/clock", 1000)
         latched = QoSProfile(depth=LATCHED_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.static = harness.hear(TFMessage, topics.TF_STATIC, latched)
+        self.static = harness.hear(TFMessage, naming.TF_STATIC, latched)
 
     def play(self, *arguments: str) -> subprocess.Popen[bytes]:
         process: subprocess.Popen[bytes] = self.harness.start("bag_player", arguments, self._log)
@@ -119,14 +119,14 @@ def test_each_message_goes_out_when_it_is_due(
     listener.hear_here(bag, rate=2.0, log=tmp_path / "times.csv")
     with (tmp_path / "times.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert sum(row["topic"] == topics.POINTS for row in rows) == drive.frames
+    assert sum(row["topic"] == naming.POINTS for row in rows) == drive.frames
     recorded, published = (np.array([int(row[key]) for row in rows]) for key in ("log_time_ns", "published_ns"))
     late = (published - published[0]) - (recorded - recorded[0]) / 2
     assert np.abs(late).max() < 1e6  # ns: a microsecond for each look at the clock
 
 
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
-    listener.hear_here(bag, start=0.45, duration=0.4, topics=(topics.POINTS, topics.TF_STATIC))
+    listener.hear_here(bag, start=0.45, duration=0.4, topics=(naming.POINTS, naming.TF_STATIC))
     listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
     listener.harness.wait(lambda: listener.static, "the calibration")  # it comes from wherever one starts
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
@@ -147,7 +147,7 @@ def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any)
 
 def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listener, bag: Path) -> None:
     """It was played again and again, thousands of times a second, each with a line in the log."""
-    player = listener.play(str(bag), "--wait", "90", "--loop", "--topics", topics.TF_STATIC)
+    player = listener.play(str(bag), "--wait", "90", "--loop", "--topics", naming.TF_STATIC)
     listener.harness.wait(lambda: listener.static, "the transforms")
     time.sleep(0.5)
     player.send_signal(signal.SIGINT)
@@ -160,13 +160,13 @@ def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(list
     types = get_typestore(Stores.ROS2_JAZZY)
     kind = "tf2_msgs/msg/TFMessage"
     links = [("lidar", 1.5), *(("camera", 0.1 * n) for n in range(150)), ("lidar", math.nan)]
-    out = [(len(links), topics.TF_STATIC, b"\0\1\0\0\xff")]
+    out = [(len(links), naming.TF_STATIC, b"\0\1\0\0\xff")]
     for at, (child, x) in enumerate(links):
         T = np.eye(4)
         T[0, 3] = x
         message = transforms(at, {child: ("base_link", T)})
-        out.append((at, topics.TF_STATIC, types.serialize_cdr(message, kind)))
-    recording = write_bag(tmp_path / "bag", {topics.TF_STATIC: kind}, out)
+        out.append((at, naming.TF_STATIC, types.serialize_cdr(message, kind)))
+    recording = write_bag(tmp_path / "bag", {naming.TF_STATIC: kind}, out)
     player = listener.play(str(recording), "--wait", "90", "--loop")
     placed = lambda: {t.child_frame_id: t.transform.translation.x for m in listener.static for t in m.transforms}  # noqa: E731
     listener.harness.wait(lambda: len(placed()) == 2, "both frames")
@@ -197,7 +197,7 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
     harness = ros()
     player = harness.start("bag_player", [str(bag), "--wait", "90", "--rate", "4"], tmp_path / "log")
     harness.wait(lambda: "waiting 90 s" in (tmp_path / "log").read_text(), "the player")
-    clouds = harness.hear(PointCloud2, topics.POINTS)
+    clouds = harness.hear(PointCloud2, naming.POINTS)
     assert player.wait(180) == 0
     harness.wait(lambda: len(clouds) == drive.frames, "every cloud")
 
@@ -205,16 +205,16 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
 def test_it_waits_for_the_nodes_that_it_is_told(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
     """Two of a name, in namespaces of their own; what another node hears, as RViz does, starts nothing."""
     harness = ros()
-    clouds = harness.hear(PointCloud2, topics.POINTS)
+    clouds = harness.hear(PointCloud2, naming.POINTS)
     awaited = ["--for", "robot", "--subscribers", "2", "--wait", "90", "--rate", "4"]
     player = harness.start("bag_player", [str(bag), *awaited], tmp_path / "log")
-    says = f"waiting 90 s at most for 2 subscribers named robot to {topics.POINTS}"
+    says = f"waiting 90 s at most for 2 subscribers named robot to {naming.POINTS}"
     harness.wait(lambda: says in (tmp_path / "log").read_text(), "the player")
     received: list[list[Any]] = [[], []]
     for n, heard in enumerate(received):
         assert not clouds
         node = rclpy.create_node("robot", namespace=f"robot_{n}", context=harness.node.context)
-        node.create_subscription(PointCloud2, topics.POINTS, heard.append, 100)
+        node.create_subscription(PointCloud2, naming.POINTS, heard.append, 100)
         node.close = lambda: None  # type: ignore[attr-defined]
         harness.add(node)
         time.sleep(1.0)  # with one of two it does not begin
@@ -232,7 +232,7 @@ def test_without_a_subscriber_it_says_so_and_plays(
 ) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))  # where nobody listens
     assert play_here(str(bag), "--wait", "0.3", "--duration", "0.1") == 0
-    assert f"playing without a subscriber to {topics.POINTS} yet" in capfd.readouterr().err
+    assert f"playing without a subscriber to {naming.POINTS} yet" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

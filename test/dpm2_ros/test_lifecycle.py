@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
-from dpm2_core.data.topics import POINTS
+from dpm2_core.data.naming import POINTS
 from dpm2_core.estimates import Keyframe
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map

@@ -22,7 +22,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from sensor_msgs.msg import PointCloud2
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
@@ -58,7 +58,7 @@ def test_slam_node_saves_its_map_when_stopped(
 ) -> None:
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
-    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    lidar = harness.publisher(PointCloud2, naming.POINTS)
     with running(harness, lidar, tmp_path) as process:
         for n in range(8):
             lidar.publish(drive.cloud(n))
@@ -174,7 +174,7 @@ def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
 
 def test_what_cannot_listen_leaves_no_map(run: Callable[..., Any], tmp_path: Path) -> None:
     """Its map was opened before."""
-    pairs = [f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={topics.POINTS}"]
+    pairs = [f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={naming.POINTS}"]
     done = run("slam_node", "--ros-args", *GEOMETRIC, *(part for pair in pairs for part in ("-p", pair)))
     assert done.returncode == 2
     assert "is that of the first LiDAR" in done.stderr
@@ -186,7 +186,7 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
 ) -> None:
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
-    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    lidar = harness.publisher(PointCloud2, naming.POINTS)
     (tmp_path / "map").write_text("in the way")
     with running(harness, lidar, tmp_path) as process:
         lidar.publish(drive.cloud(0))
@@ -204,7 +204,7 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     harness, path = ros(), tmp_path / "town.dpm2map"
     (tmp_path / "map").write_text("in the way")
     keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
-    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    lidar = harness.publisher(PointCloud2, naming.POINTS)
     with (
         running(harness, lidar, tmp_path, f"ros.map_file:={path}") as process,
         closing(sqlite3.connect(path, isolation_level=None)) as other,

@@ -19,7 +19,7 @@ from rcl_interfaces.srv import SetParameters
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
@@ -55,7 +55,7 @@ class Robot:
     def __init__(self, harness: Any, recording: Path, log: Path, *parameters: str) -> None:
         self.harness, self.log, self._stamp = harness, log, 100_000_000_000
         self._source = open_source(recording, InputSettings(images=False))
-        self.lidar = harness.publisher(PointCloud2, topics.POINTS)
+        self.lidar = harness.publisher(PointCloud2, naming.POINTS)
         self.odom = harness.hear(Odometry, "/dpm2/odom")
         self.tf = harness.hear(TFMessage, "/tf")
         self.diagnostics = harness.diagnostics

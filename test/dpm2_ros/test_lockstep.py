@@ -21,7 +21,7 @@ from sensor_msgs.msg import PointCloud2
 
 from dpm2_core.commands.run import run
 from dpm2_core.config import load_settings
-from dpm2_core.data import bag_messages, topics
+from dpm2_core.data import bag_messages, naming
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.message_kinds import IMU
@@ -50,16 +50,16 @@ def with_shots(bag: Path, folder: Path, shots: Shots, later: int) -> Path:
     source, rng = open_bag(bag), np.random.default_rng(2)
     out: list[tuple[int, str, bytes]] = []
     for topic, log_time, data in source.messages(list(source.types)):
-        if topic != topics.IMAGE:
-            out.append((log_time + later * (topic == f"{topics.KITTI.camera}/camera_info"), topic, data))
-    image = source.first(topics.IMAGE)
+        if topic != naming.IMAGE:
+            out.append((log_time + later * (topic == f"{naming.KITTI.camera}/camera_info"), topic, data))
+    image = source.first(naming.IMAGE)
     assert image is not None
     for stamp, log_time in shots:
         image.header.stamp.sec, image.header.stamp.nanosec = stamp // 10**9, stamp % 10**9
         gray = cv2.GaussianBlur(rng.integers(0, 255, (40, 120), np.uint8), (0, 0), 2)
         pixels = np.repeat(cv2.normalize(gray, None, 0, 255, cv2.NORM_MINMAX)[..., None], 3, 2)
         message = replace(image, data=pixels.reshape(-1))
-        out.append((log_time, topics.IMAGE, bytes(types.serialize_cdr(message, source.types[topics.IMAGE]))))
+        out.append((log_time, naming.IMAGE, bytes(types.serialize_cdr(message, source.types[naming.IMAGE]))))
     return write_bag(folder, source.types, out)
 
 
@@ -133,12 +133,12 @@ def test_a_gap_is_no_clock_that_was_set(
 ) -> None:
     """In lockstep no time passes in it but by /clock. Where the stamps alone go on by so many ms, a clock was set."""
     types, source = get_typestore(Stores.ROS2_JAZZY), open_bag(bag)
-    kinds = {topic: source.types[topic] for topic in (topics.POINTS, f"{topics.KITTI.truth}/odom")} | {topics.IMU: IMU}
+    kinds = {topic: source.types[topic] for topic in (naming.POINTS, f"{naming.KITTI.truth}/odom")} | {naming.IMU: IMU}
     set_at = BagSource(bag).stamps.tolist()[8]
     messages = [(time, topic, bytes(data)) for topic, time, data in source.messages(list(kinds))]
     for time in BagSource(bag).stamps.tolist():  # none in the gap either: the last cloud before waits to its end
         sample = bag_messages.imu(time, np.full(3, 0.01), np.array([0, 0, 9.8]))
-        messages.append((time + MS, topics.IMU, bytes(types.serialize_cdr(sample, IMU))))
+        messages.append((time + MS, naming.IMU, bytes(types.serialize_cdr(sample, IMU))))
     for n, (time, topic, data) in enumerate(messages):
         later = time >= set_at
         moved = restamped(data, serialized_stamp(data, time) + later * ahead * MS)
@@ -159,18 +159,18 @@ def with_second(bag: Path, folder: Path, seed: int) -> Path:
     jitter by up to 45 ms, some are missing, and some come twice."""
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(seed)
     source = open_bag(bag)
-    kinds = {topic: kind for topic, kind in source.types.items() if topic != topics.IMAGE}
+    kinds = {topic: kind for topic, kind in source.types.items() if topic != naming.IMAGE}
     out = [(time, topic, bytes(data)) for topic, time, data in source.messages(list(kinds))]
-    placed, cloud = source.first(topics.TF_STATIC), source.first(topics.POINTS)
+    placed, cloud = source.first(naming.TF_STATIC), source.first(naming.POINTS)
     assert placed is not None
     assert cloud is not None
     transform = placed.transforms[0].transform
     left = replace(transform, translation=replace(transform.translation, x=0.0, y=1.0, z=0.0))
     place = replace(placed.transforms[0], header=cloud.header, child_frame_id="second", transform=left)
     placed = replace(placed, transforms=[*placed.transforms, place])
-    out = [m for m in out if m[1] != topics.TF_STATIC]
-    tf = bytes(types.serialize_cdr(placed, kinds[topics.TF_STATIC]))
-    out.append((min(time for time, *_ in out), topics.TF_STATIC, tf))
+    out = [m for m in out if m[1] != naming.TF_STATIC]
+    tf = bytes(types.serialize_cdr(placed, kinds[naming.TF_STATIC]))
+    out.append((min(time for time, *_ in out), naming.TF_STATIC, tf))
     for n, stamp in enumerate(BagSource(bag).stamps.tolist()):
         for _ in range(n % 3):
             at = stamp + int(rng.integers(-45, 46)) * MS
@@ -178,9 +178,9 @@ def with_second(bag: Path, folder: Path, seed: int) -> Path:
             row = cloud.data.reshape(-1, cloud.point_step)[n : n + 50 + n]
             header = replace(cloud.header, stamp=time, frame_id="second")
             message = replace(cloud, header=header, width=len(row), row_step=row.size, data=row.reshape(-1).copy())
-            data = bytes(types.serialize_cdr(message, kinds[topics.POINTS]))
+            data = bytes(types.serialize_cdr(message, kinds[naming.POINTS]))
             out.append((at + int(rng.choice([1, 60, 300])) * MS, SECOND, data))
-    return write_bag(folder, kinds | {SECOND: kinds[topics.POINTS]}, out)
+    return write_bag(folder, kinds | {SECOND: kinds[naming.POINTS]}, out)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -188,7 +188,7 @@ def test_lockstep_joins_the_clouds_of_two_lidars_as_dpm2_run_does(
     ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path, seed: int
 ) -> None:
     recording = with_second(bag, tmp_path / "two", seed)
-    settings = InputSettings(points_topic=topics.POINTS, second_points_topic=SECOND)
+    settings = InputSettings(points_topic=naming.POINTS, second_points_topic=SECOND)
     expected = list(BagSource(recording, settings).frames())
     alone = [len(frame.points) for frame in BagSource(bag).frames()]
     joined = [len(frame.points) > size for frame, size in zip(expected, alone, strict=True)]
@@ -237,7 +237,7 @@ class Responder:
         self.harness, self._responds = harness, responds
         self.stamps: list[int] = []
         self.publisher = harness.publisher(Odometry, "/dpm2/odom")
-        harness.node.create_subscription(PointCloud2, topics.POINTS, self._on_cloud, 10)
+        harness.node.create_subscription(PointCloud2, naming.POINTS, self._on_cloud, 10)
 
     def _on_cloud(self, message: PointCloud2) -> None:
         self.stamps.append(stamp_ns(message.header))
@@ -273,4 +273,4 @@ def test_a_node_that_goes_away_ends_it(ros: Callable[..., Any], bag: Path) -> No
 def test_without_a_node_it_ends(run: Callable[..., Any], bag: Path) -> None:
     ended = run("bag_player", str(bag), "--lockstep", "--wait", "0.5")
     assert ended.returncode == 1
-    assert f"error: lockstep: no node turns {topics.POINTS} into /dpm2/odom" in ended.stderr
+    assert f"error: lockstep: no node turns {naming.POINTS} into /dpm2/odom" in ended.stderr

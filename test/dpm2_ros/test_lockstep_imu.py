@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from dpm2_core.data import bag_messages, topics
+from dpm2_core.data import bag_messages, naming
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import cloud_fields, decode_points, point_columns
@@ -29,20 +29,20 @@ def recorded(bag: Path, folder: Path) -> Path:
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(0)
     source, stamps = open_bag(bag), BagSource(bag).stamps.tolist()
     first, last = stamps[0], stamps[-1]
-    link = dict.fromkeys((topics.IMU_LINK, topics.GNSS_LINK), (topics.KITTI.lidar, np.eye(4)))
-    out: list[tuple[int, str, Any]] = [(first - 1000 * MS, topics.TF_STATIC, bag_messages.transforms(first, link))]
-    for topic, time, data in source.messages([topics.TF_STATIC, topics.POINTS]):
+    link = dict.fromkeys((naming.IMU_LINK, naming.GNSS_LINK), (naming.KITTI.lidar, np.eye(4)))
+    out: list[tuple[int, str, Any]] = [(first - 1000 * MS, naming.TF_STATIC, bag_messages.transforms(first, link))]
+    for topic, time, data in source.messages([naming.TF_STATIC, naming.POINTS]):
         message = types.deserialize_cdr(bytes(data), source.types[topic])
-        if topic == topics.POINTS:
+        if topic == naming.POINTS:
             columns = point_columns(decode_points(message)[0])
             columns["time"] = np.linspace(0, 0.1, len(columns["x"]), dtype=np.float32)
             message = replace(message, **cloud_fields(columns, type(message.fields[0])))
         out.append((time, topic, message))
     for stamp in range(first - 100 * MS, last + 500 * MS, 5 * MS):
-        out.append((stamp, topics.IMU, bag_messages.imu(stamp, rng.normal(0, 0.1, 3), np.array([0, 0, 9.8]))))
+        out.append((stamp, naming.IMU, bag_messages.imu(stamp, rng.normal(0, 0.1, 3), np.array([0, 0, 9.8]))))
     for stamp in range(first, last, 70 * MS):
         fix = Fix(stamp, np.array([49.0, 8.4, 100.0]), np.eye(3), np.zeros(3))
-        out.append((stamp + int(rng.integers(1, 450)) * MS, topics.FIX, bag_messages.nav_sat_fix(stamp, fix)))
+        out.append((stamp + int(rng.integers(1, 450)) * MS, naming.FIX, bag_messages.nav_sat_fix(stamp, fix)))
     kinds = {topic: message.__msgtype__ for _, topic, message in out}
     return write_bag(folder, kinds, [(t, topic, types.serialize_cdr(m, kinds[topic])) for t, topic, m in out])
 
@@ -53,9 +53,9 @@ def test_the_samples_of_a_sweep_and_a_late_fix_are_those_of_dpm2_run(
     """The last samples of a sweep are recorded after its stamp; a fix that comes right after a cloud is the next
     one's."""
     recording = recorded(bag, tmp_path / "recorded")
-    expected = list(BagSource(recording, InputSettings(gnss_topic=topics.FIX)).frames())
+    expected = list(BagSource(recording, InputSettings(gnss_topic=naming.FIX)).frames())
     assert all(frame.imu is not None and frame.imu.stamps[-1] == frame.stamp + 100 * MS for frame in expected)
     assert sum(frame.fix is not None for frame in expected) > len(expected) / 2
-    node = ros().add(Listener(gnss=topics.FIX, busy=0.05))
+    node = ros().add(Listener(gnss=naming.FIX, busy=0.05))
     play(recording)
     assert [contents(frame) for frame in node.frames] == [contents(frame) for frame in expected]

@@ -14,7 +14,7 @@ from nav_msgs.msg import Path as Way
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 
-from dpm2_core.data.topics import POINTS
+from dpm2_core.data.naming import POINTS
 from dpm2_ros.conversions import cloud_to_msg, edge_to_msg, transform_to_msg
 from dpm2_ros.tf_message import TFMessage
 from test.helpers.lockstep import play

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import PointCloud2
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_ros.conversions import cloud_to_msg
@@ -43,7 +43,7 @@ def test_a_robot_that_is_lost_finds_itself(ros: Callable[..., Any], recording: P
     assert made.returncode == 0, made.stderr
     finding = ("ros.localization_mode:=true", "slam.loops.descriptors:=true", "input.images:=false")
     harness = ros(f"ros.map_file:={tmp_path / 'street.dpm2map'}", *finding)
-    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    lidar = harness.publisher(PointCloud2, naming.POINTS)
     harness.add(SlamNode())
     harness.wait(lidar.get_subscription_count, "the subscription to the clouds")
     process = action(harness, 150.0)

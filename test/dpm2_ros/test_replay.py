@@ -16,7 +16,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import PointCloud2
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_file import open_bag
 from test.helpers.rig import Rig
 from tools.replay import ros_environment, start, stop
@@ -50,11 +50,11 @@ def test_started_at_the_same_moment_nothing_is_lost(
     assert "import time:" in ready
     assert "import time:" not in driving
     # Too fast, whichever process is held up meanwhile: the node stands still until all of them are there.
-    lidar = harness.publisher(PointCloud2, topics.POINTS)
+    lidar = harness.publisher(PointCloud2, naming.POINTS)
     harness.wait(lidar.get_subscription_count, "the subscription to the clouds")
     harness.find("slam_node")
     node.send_signal(signal.SIGSTOP)
-    for _, _, data in open_bag(bag).messages([topics.POINTS]):
+    for _, _, data in open_bag(bag).messages([naming.POINTS]):
         lidar.publish(bytes(data))
     node.send_signal(signal.SIGCONT)
     harness.status("slam_node: odometry", all_gone(2 * drive.frames), since=len(diagnostics))

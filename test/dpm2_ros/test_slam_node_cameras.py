@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import IMAGE, KITTI
+from dpm2_core.data.naming import IMAGE, KITTI
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg
 from test.helpers.rig import Camera, Rig, publish_static, record_frames

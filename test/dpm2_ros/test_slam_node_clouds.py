@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Image, Imu, NavSatFix, PointCloud2, PointField
 
 from dpm2_core.data.messages import cloud_fields, decode_points
-from dpm2_core.data.topics import POINTS
+from dpm2_core.data.naming import POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.estimates import OdometryResult
 from dpm2_core.frame import Frame

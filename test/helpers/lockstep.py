@@ -12,7 +12,7 @@ from typing import Any
 import rclpy
 from nav_msgs.msg import Odometry
 
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.frames import FrameBuilder
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.frame import Frame
@@ -47,7 +47,7 @@ class Listener(GuardedNode):
         super().__init__("listener", **options)
         self.frames: list[Frame] = []
         self.stepped: list[bool] = []
-        settings = InputSettings(points_topic=topics.POINTS, second_points_topic=second, gnss_topic=gnss)
+        settings = InputSettings(points_topic=naming.POINTS, second_points_topic=second, gnss_topic=gnss)
         self.declare_parameter("input.second_points_topic", second)
         self._busy = busy
         self._odometry = self.create_publisher(Odometry, "dpm2/odom", 10)

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.topics import IMAGE, KITTI, POINTS
+from dpm2_core.data.naming import IMAGE, KITTI, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_ros.conversions import transform_to_msg

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import dpm2_core
-from dpm2_core.data import topics
+from dpm2_core.data import naming
 from dpm2_core.data.bag_file import open_bag
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.convert import EPOCH_NS, convert
@@ -96,12 +96,12 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
         "/kitti/ground_truth/path": "nav_msgs/msg/Path",
         "/kitti/vertical_angle_correction_deg": "std_msgs/msg/Float64",
     }
-    latched = {topics.TF_STATIC, f"{topics.KITTI.truth}/path", topics.VERTICAL_ANGLE_CORRECTION}
+    latched = {naming.TF_STATIC, f"{naming.KITTI.truth}/path", naming.VERTICAL_ANGLE_CORRECTION}
     assert bag.counts == {t: 1 if t in latched else 5 for t in bag.types}
     cloud = bag.first("/kitti/velo/pointcloud")
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
     assert (cloud.header.frame_id, cloud.point_step, cloud.width) == ("velo_link", 16, 60)
-    image = bag.first(topics.IMAGE)
+    image = bag.first(naming.IMAGE)
     assert (image.encoding, image.header.frame_id, image.width) == ("rgb8", "camera_color_left", 40)
     links = {(t.header.frame_id, t.child_frame_id) for t in bag.first("/tf_static").transforms}
     assert links == {("base_link", "velo_link"), ("velo_link", "camera_gray_left"), ("velo_link", "camera_color_left")}
@@ -115,8 +115,8 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
         durability = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
     assert {topic for topic, name in durability.items() if name == "TRANSIENT_LOCAL"} == latched
     order = [topic for topic, _, _ in bag.messages(list(bag.types))][2:6]
-    camera, truth = topics.KITTI.camera, topics.KITTI.truth
-    assert order == [f"{camera}/camera_info", topics.IMAGE, f"{truth}/odom", topics.POINTS]  # the image is there before
+    camera, truth = naming.KITTI.camera, naming.KITTI.truth
+    assert order == [f"{camera}/camera_info", naming.IMAGE, f"{truth}/odom", naming.POINTS]  # the image is there before
 
 
 def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path
     convert(drive, tmp_path / "bag", (1, 3))
     source = BagSource(tmp_path / "bag")
     assert [frame.stamp - EPOCH_NS for frame in source.frames()] == [100_000_000, 200_000_000]
-    assert topics.IMAGE not in open_bag(tmp_path / "bag").types
+    assert naming.IMAGE not in open_bag(tmp_path / "bag").types
     np.testing.assert_allclose(source.poses[:, 0, 3], [1, 2], atol=1e-12)
 
 

@@ -15,8 +15,8 @@ from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.data.gnss import FixBuffer, decode_fix
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import MessageError
+from dpm2_core.data.naming import FIX, POINTS
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.topics import FIX, POINTS
 from dpm2_core.errors import UsageError
 
 SECOND = 10**9

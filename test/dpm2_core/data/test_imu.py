@@ -15,8 +15,8 @@ from dpm2_core.data.convert import EPOCH_NS, convert
 from dpm2_core.data.imu import ImuBuffer, decode_imu
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.messages import MessageError
+from dpm2_core.data.naming import POINTS
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.topics import POINTS
 from dpm2_core.errors import UsageError
 
 SECOND = 10**9

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_ros.losses import Losses
+from dpm2_ros.lost_messages import Losses
 
 PERIOD = 103_600_000  # ns: KITTI's LiDAR
 
