@@ -20,6 +20,19 @@ from dpm2_core.errors import Dpm2Error, UsageError
 
 
 @contextmanager
+def explaining(path: Path | str, what: str = "not written") -> Iterator[None]:
+    """What the system refuses within is an error that names `path`, and says `what` became of it and why.
+
+    Raises:
+        Dpm2Error: in the place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise Dpm2Error(f"{path}: {what}: {error.strerror or error}") from error
+
+
+@contextmanager
 def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """A file that takes the name `path` when the block ends well, and vanishes when it does not.
 
@@ -31,7 +44,7 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
     path = Path(path)
     target = path.resolve()  # a symbolic link stays one
     encoding = None if "b" in mode else "utf-8"
-    try:
+    with explaining(path):
         if path.exists() and not path.is_file() and not path.is_dir():
             with path.open(mode, encoding=encoding) as file:
                 yield file
@@ -47,8 +60,6 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
         finally:
             with suppress(OSError):
                 part.unlink()
-    except OSError as error:
-        raise not_written(path, error) from error
 
 
 def part_beside(path: Path) -> Path:
@@ -90,18 +101,17 @@ def new_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     part = part_beside(path)
     replaced = part.with_name(f"{part.name}-replaced")
     try:
-        part.mkdir(parents=True)
-        with named(path, part):
-            yield part
-        if path.is_dir() and not any(path.iterdir()):
-            for entry in sorted(part.iterdir()):
-                entry.rename(path / entry.name)
-        else:
-            if replace and path.exists():
-                path.rename(replaced)
-            part.rename(path)
-    except OSError as error:
-        raise not_written(path, error) from error
+        with explaining(path):
+            part.mkdir(parents=True)
+            with named(path, part):
+                yield part
+            if path.is_dir() and not any(path.iterdir()):
+                for entry in sorted(part.iterdir()):
+                    entry.rename(path / entry.name)
+            else:
+                if replace and path.exists():
+                    path.rename(replaced)
+                part.rename(path)
     finally:
         shutil.rmtree(part, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
@@ -115,11 +125,6 @@ def _alive(pid: int) -> bool:
     except (OSError, OverflowError):
         return False
     return True
-
-
-def not_written(path: Path | str, error: OSError) -> Dpm2Error:
-    """What to raise where a file or folder could not be written: it names `path` and says why."""
-    return Dpm2Error(f"{path}: not written: {error.strerror or error}")
 
 
 def write_json(path: Path | str, content: object) -> None:

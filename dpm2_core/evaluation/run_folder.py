@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.trajectory import Trajectory, read_trajectory, write_tum
-from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Edge
 from dpm2_core.evaluation.kitti_metric import known
-from dpm2_core.files import atomic_write, make_folder, numbered
+from dpm2_core.files import atomic_write, explaining, make_folder, numbered
 from dpm2_core.frame import Array
 
 TRAJECTORY, FRAMES, LOOPS, TRUTH = "trajectory.tum", "frames.csv", "loops.csv", "ground_truth.tum"
@@ -107,10 +107,8 @@ def remove_results(folder: Path, *names: str) -> None:
         Dpm2Error: one could not be removed.
     """
     for name in names:
-        try:
+        with explaining(folder / name, "not removed"):
             (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise Dpm2Error(f"{folder / name}: not removed: {error.strerror or error}") from error
 
 
 def set_aside(folder: Path, name: str) -> Path:
@@ -125,11 +123,9 @@ def set_aside(folder: Path, name: str) -> Path:
     into = next(path for path in numbered(folder / name) if not path.exists())
     make_folder(into)
     for result in (TRAJECTORY, *MAPPING):
-        try:
+        with explaining(folder / result, f"not moved to {into}"):
             if (folder / result).exists():
                 (folder / result).replace(into / result)
-        except OSError as error:
-            raise Dpm2Error(f"{folder / result}: not moved to {into}: {error.strerror or error}") from error
     return into
 
 

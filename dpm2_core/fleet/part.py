@@ -23,7 +23,7 @@ from dpm2_core.config import Settings
 from dpm2_core.console import Advance, untold
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
-from dpm2_core.files import atomic_write, file_digest, make_folder, not_written
+from dpm2_core.files import atomic_write, explaining, file_digest, make_folder
 
 DONE = "part.json"
 """In the folder of a part that ended: what it was asked for, and its figures."""
@@ -186,11 +186,11 @@ def _folder(part: Part, out: Path) -> Iterator[Path]:
         return
     attempt, old = (folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.attempt") for _ in range(2))
     try:
-        with _explained(folder):
+        with explaining(folder):
             attempt.mkdir(parents=True)
             made = attempt.stat().st_ino
         yield attempt
-        with _explained(folder):
+        with explaining(folder):
             if attempt.stat().st_ino != made:  # removed meanwhile, and made anew by what was written later
                 raise Dpm2Error(f"{attempt}: removed while it was written to")
             if figures_of(part, out) is None:  # else another attempt was first, with the same
@@ -200,14 +200,6 @@ def _folder(part: Part, out: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(attempt, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def _explained(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise not_written(folder, error) from error
 
 
 def _sizes(folder: Path) -> dict[str, int]:

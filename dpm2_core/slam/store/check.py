@@ -11,6 +11,7 @@ from pathlib import Path
 
 from dpm2_core.database import connect
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.files import explaining
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_connection import explained
 from dpm2_core.slam.store.map_data import MapData, save_as
@@ -59,11 +60,9 @@ def _copy(path: Path, copy: Path) -> None:
             sql.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
             sql.backup(target)
             return
-    try:
+    reason = f"no copy of it could be made in {copy.parent.parent}, which TMPDIR can change"
+    with explaining(path, f"not checked: {reason}"):
         copy_with_log(source, copy)
-    except OSError as error:
-        reason = f"no copy of it could be made in {copy.parent.parent}, which TMPDIR can change"
-        raise Dpm2Error(f"{path}: not checked: {reason}: {error.strerror or error}") from error
 
 
 def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import not_written
+from dpm2_core.files import explaining
 
 
 def copy_with_log(path: Path, copy: Path) -> None:
@@ -49,11 +49,9 @@ def move_map(source: Path, target: Path) -> None:
             there stays.
     """
     _check_whole(source, target)
-    try:
+    with explaining(target):
         _remove_log(target)
         source.replace(target)
-    except OSError as error:
-        raise not_written(target, error) from error
 
 
 def name_map(source: Path, target: Path) -> None:
