@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Options, Report, drives, evenly, processors, requested, settings_of, truth_of
+from benchmarks.harness import Options, Report, drives, processors, requested, settings_of, truth_of
 from dpm2_core.console import progress_bar
+from dpm2_core.data.trajectory import frame_period
 from dpm2_core.estimates import OdometryResult, State
 from dpm2_core.frame import Array, Frame, Inertial
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable, record_table
@@ -37,10 +39,10 @@ class Gap:
 
 def gaps(stamps: Sequence[int]) -> Iterator[Gap]:
     """Those of each length that a drive with these stamps (ns) has room for, at places spread evenly over it."""
-    period = float(np.median(np.diff(np.array(stamps)))) * 1e-9
+    period = frame_period(stamps)
     for seconds in _SECONDS:
         missing = round(seconds / period)
-        for place in evenly(len(stamps) - 2 * _BEFORE - missing + 1, _PLACES):
+        for place in evenly(len(stamps) - 2 * _BEFORE - missing + 1, _PLACES).tolist():
             yield Gap(_BEFORE + place, _BEFORE + place + missing, seconds)
 
 

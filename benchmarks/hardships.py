@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.corrupt import in_fog
+from dpm2_core.data.trajectory import frame_period
 from dpm2_core.estimates import State
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
@@ -50,8 +51,7 @@ def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
     count = len(frames)
     for every in [every for every in EVERY if count > every]:  # two frames at least
         yield Case(f"every {every}", list(frames[::every]), truth[::every])
-    stamps = np.array([frame.stamp for frame in frames]) * 1e-9
-    period = float(np.median(np.diff(stamps)))
+    period = frame_period([frame.stamp for frame in frames])
     for kind, lengths in (("gap", GAPS), ("blind", BLIND)):
         for seconds in lengths:
             missing = round(seconds / period)

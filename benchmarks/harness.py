@@ -197,11 +197,6 @@ def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:
         return {}
 
 
-def evenly(count: int, most: int) -> list[int]:
-    """At most `most` of the numbers below `count`, spread evenly from the first to the last; none of none."""
-    return np.unique(np.linspace(0, count - 1, min(most, max(count, 0))).astype(int)).tolist()
-
-
 def rounded(x: float) -> float:
     """To four digits."""
     return float(f"{x:.4g}")

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import evenly
 from dpm2_core.evaluation.pair_set import SUCCESS
 from dpm2_core.experiments.peers import KissIcp, cloud_and_times
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
@@ -55,7 +55,7 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
     out = {}
     for kind, pairs in kinds.items():
         usable = [(a, b) for a, b in pairs if known[a] and known[b]]
-        out[kind] = [usable[k] for k in evenly(len(usable), most)]
+        out[kind] = [usable[k] for k in evenly(len(usable), most).tolist()]
     return out
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.figures import bars_png
-from benchmarks.harness import Options, drives, evenly, truth_of
+from benchmarks.harness import Options, drives, truth_of
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.learning.generate import training_camera
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pyramid import build_pyramid, crop
@@ -79,7 +80,7 @@ def shares(frames: Sequence[Frame], poses: Array, network: NetworkSettings, most
         chosen = [_references(*scan, settings) for scan in zip(cropped, images, strict=True)]
         out[name] = {}
         for apart in APART:
-            starts = evenly(len(frames) - apart, most)
+            starts = evenly(len(frames) - apart, most).tolist()
             pairs = [(a, a + apart) for a in starts if np.isfinite(poses[[a, a + apart]]).all()]
             distance = [
                 cKDTree(chosen[b]).query(se3.transform(se3.inverse(poses[b]) @ poses[a], chosen[a]))[0]

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import lines_png
-from benchmarks.harness import Options, Report, drives, evenly
+from benchmarks.harness import Options, Report, drives
 from benchmarks.scan_statistics import RANGES, statistics
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.settings import HDL64E, LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
@@ -30,7 +31,7 @@ def bench_sensor(options: Options) -> Report:
     real = []
     with drives(options) as sources:
         for source in sources.values():
-            chosen = evenly(len(source), _SCANS // len(sources))
+            chosen = evenly(len(source), _SCANS // len(sources)).tolist()
             real += [frame.points for i, frame in enumerate(source.frames()) if i in chosen]
     results = {
         "real": statistics(real),

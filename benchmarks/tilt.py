@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import Options, Report, drives, evenly, processors, settings_of, truth_of
+from benchmarks.harness import Options, Report, drives, processors, settings_of, truth_of
 from benchmarks.pairs import summarized
 from dpm2_core.console import tracked
 from dpm2_core.data.source import Source
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.network.pyramid import build_pyramid, collate, crop
@@ -45,7 +46,7 @@ def bench_tilt(options: Options) -> Report:
 
 def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
     poses, frames = truth_of(source), list(source.frames())
-    pairs = [(a, a + n) for n in APART for a in evenly(len(frames) - n, most)]
+    pairs = [(a, a + n) for n in APART for a in evenly(len(frames) - n, most).tolist()]
     noise = np.random.default_rng(0)
     out: dict[str, Any] = {}
     for tilt, turned in product((*map(str, TILTS), "random"), (False, True)):

@@ -10,7 +10,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMsg
@@ -22,6 +21,7 @@ from visualization_msgs.msg import MarkerArray
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Array
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.mapping.occupancy import why_of_no_use
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
@@ -293,7 +293,5 @@ class MapperThread:
 
     def _map(self) -> Any:
         points = self.active.mapper.cloud()
-        most = self._config.ros.map_max_points
-        if len(points) > most:
-            points = points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
-        return cloud_to_msg(points, self._stamp, self._config.ros.map_frame)
+        shown = points[evenly(len(points), self._config.ros.map_max_points)]
+        return cloud_to_msg(shown, self._stamp, self._config.ros.map_frame)

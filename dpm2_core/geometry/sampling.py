@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point sampling: farthest points, hybrid neighbor query."""
+"""Sampling: places in a row, farthest points, hybrid neighbor query."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ Index = NDArray[np.int64]
 
 _CHUNK = 128  # points that are updated together: 64 and 256 are slower for scans
 _HALVINGS = 5  # of the cloud, to where the sampling starts
+
+
+def evenly(count: int, most: int) -> Index:
+    """At most `most` of the numbers below `count`, spread evenly from the first to the last; none of none."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
 
 
 def farthest_points(points: Points, count: int, grid: PointGrid) -> Index:

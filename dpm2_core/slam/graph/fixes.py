@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.graph.graph_data import GraphData, Index
 
 _FEWEST = 5
@@ -151,7 +152,7 @@ def fitted(here: Array, there: Array, sigmas: Array) -> Array | None:
     """
     a, b = here[:, :2] @ [1, 1j], there[:, :2] @ [1, 1j]  # as complex numbers a rotation is a factor
     half = len(a) // 2
-    first = np.unique(np.linspace(0, half - 1, min(half, _TRIALS)).astype(int))
+    first = evenly(half, _TRIALS)
     turns = np.exp(1j * np.angle((b[first + half] - b[first]) * np.conj(a[first + half] - a[first])))
     moved = turns[:, None] * a
     offsets = np.median((b - moved).real, axis=1) + 1j * np.median((b - moved).imag, axis=1)

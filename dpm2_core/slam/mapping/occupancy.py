@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
+from dpm2_core.geometry.sampling import evenly
 from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.tilt import up_of
 from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings
@@ -48,7 +49,7 @@ def ground_tilt(clouds: CloudStore, poses: Array) -> float:
     Of keyframe clouds at (N, 4, 4) T_map_kf some are looked at, as seen from the LiDAR. Upside down is known outdoors
     only: rooms have ceilings.
     """
-    some = np.unique(np.linspace(0, len(poses) - 1, _LOOKED_AT).astype(int)).tolist()
+    some = evenly(len(poses), _LOOKED_AT).tolist()
     seen = ((node, clouds[node][:, :3] - clouds.origin(node).astype(np.float32)) for node in some)
     found = [(node, up) for node, cloud in seen if (up := _up(cloud)) is not None]
     if len(found) < _SHOW_GROUND * len(some):

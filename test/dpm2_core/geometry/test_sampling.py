@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from dpm2_core.geometry.point_grid import PointGrid
-from dpm2_core.geometry.sampling import farthest_points, neighbours
+from dpm2_core.geometry.sampling import evenly, farthest_points, neighbours
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 1), (7, 1), (7, 7), (7, 9), (8, 7), (100_001, 100_000)])
+def test_some_of_a_row_are_different_ones_from_its_first_to_its_last(count: int, most: int) -> None:
+    some = evenly(count, most)
+    assert len(some) == min(count, most)
+    assert (np.diff(some) > 0).all()
+    assert set(some[:1]) <= {0}
+    assert most == 1 or set(some[-1:]) <= {count - 1}
 
 
 @pytest.mark.parametrize("n", [5, 200, 3000])
