@@ -224,14 +224,13 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
 
 
 def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
-    own = sum(mapper.clouds.loan(node) is None for node in range(len(mapper.keyframes)))
-    size, accepted = size_with_log(path), sum(loop.ok for loop in mapper.loops)
+    own, size, accepted = int(mapper.clouds.own.sum()), size_with_log(path), sum(loop.ok for loop in mapper.loops)
     return {"lap": lap + 1, "keyframes": len(mapper.keyframes), "with_own_cloud": own, "bytes": size, "loops": accepted}
 
 
 def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[str, float]:
     """Fraction of the points of moving things in the map before and after, of them removed, of static ones removed."""
-    own = [node for node in range(len(data)) if data.clouds.loan(node) is None]
+    own = np.flatnonzero(data.clouds.own).tolist()
     masks = {}
     for node in own:
         packed = data.clouds.moving(node)

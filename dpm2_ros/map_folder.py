@@ -9,10 +9,9 @@ from pathlib import Path
 
 from dpm2_core.errors import UsageError
 from dpm2_core.files import numbered
-from dpm2_core.slam.store.map_file import left_log
+from dpm2_core.slam.store.map_file import SUFFIX, left_log
 
 _NAME = "drive"
-_SUFFIX = ".dpm2map"
 
 
 class MapFolder:
@@ -29,7 +28,7 @@ class MapFolder:
     def usual(self) -> Path:
         """The file of a drive without a name of its own, as it is asked of `free`; without a name where nothing is
         saved."""
-        return Path() if self.folder is None else self.folder / f"{_NAME}{_SUFFIX}"
+        return Path() if self.folder is None else self.folder / f"{_NAME}{SUFFIX}"
 
     def file(self, name: str) -> Path:
         """The map of that name.
@@ -39,7 +38,7 @@ class MapFolder:
         """
         if self.folder is None:
             raise UsageError("ros.map_name: ros.map_directory is empty")
-        return self.folder / f"{name.removesuffix(_SUFFIX)}{_SUFFIX}"
+        return self.folder / f"{name.removesuffix(SUFFIX)}{SUFFIX}"
 
     def of_robot(self, requested: Path) -> Path:
         """The path of that name and the robot's."""
@@ -61,7 +60,7 @@ class MapFolder:
         """
         assert self.folder is not None
         own = file.stem if file is not None else self._of_robot(_NAME)
-        for folder in numbered(self.folder / (name.removesuffix(_SUFFIX) or own)):
+        for folder in numbered(self.folder / (name.removesuffix(SUFFIX) or own)):
             if name and file_beside(folder).exists():
                 continue  # another drive's map
             with suppress(FileExistsError):
@@ -71,7 +70,7 @@ class MapFolder:
 
     def hint(self) -> str:
         """Which map is the youngest, in words; empty where there is none."""
-        found = sorted(self.folder.glob(f"*{_SUFFIX}"), key=_age) if self.folder is not None else []
+        found = sorted(self.folder.glob(f"*{SUFFIX}"), key=_age) if self.folder is not None else []
         return f"; the youngest in {self.folder} is {found[-1]}" if found else ""
 
     def _of_robot(self, stem: str) -> str:
@@ -80,7 +79,7 @@ class MapFolder:
 
 def file_beside(folder: Path) -> Path:
     """The map file that belongs to a folder of clouds."""
-    return folder.with_name(f"{folder.name}{_SUFFIX}")
+    return folder.with_name(f"{folder.name}{SUFFIX}")
 
 
 def _age(path: Path) -> float:

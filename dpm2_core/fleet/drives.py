@@ -21,8 +21,9 @@ from dpm2_core.network.pretrained import pretrained_names, weights_path
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.filters import filter_weights
 from dpm2_core.slam.settings import Config, SlamSettings
+from dpm2_core.slam.store.map_file import SUFFIX
 
-MAP = "drive.dpm2map"
+MAP = f"drive{SUFFIX}"
 """In the folder of a drive: its map file."""
 _WORK = "dpm2_core.fleet.drives:run_drive"
 _MANIFEST = (".yaml", ".yml")

@@ -25,6 +25,7 @@ from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocali
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as, subset
+from dpm2_core.slam.store.map_file import SUFFIX
 from dpm2_core.slam.store.map_store import MapStore
 
 INDEX, VECTORS = "tiles.json", "places.npy"
@@ -72,7 +73,7 @@ def _vector(data: MapData, node: int) -> Vector:
 
 
 def _name(tile: Tile) -> str:
-    return f"{tile[0]}_{tile[1]}.dpm2map"
+    return f"{tile[0]}_{tile[1]}{SUFFIX}"
 
 
 class TiledMap:

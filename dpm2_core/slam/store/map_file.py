@@ -11,6 +11,9 @@ from pathlib import Path
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import explaining
 
+SUFFIX = ".dpm2map"
+"""Of the names of map files, where nobody asks for another."""
+
 
 def copy_with_log(path: Path, copy: Path) -> None:
     """Copy what of a map file and its FILE-wal is there, as it lies there.
