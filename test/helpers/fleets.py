@@ -11,13 +11,9 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.fleet.regions import Join
 from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_data import MapData
-from dpm2_core.slam.store.rows import Session
 
-NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
-"""(6, 6) covariance of odometry and joins."""
+from .maps import FIRM, SESSION, stored
 
 
 def drive_map(poses: Array, seed: int) -> MapData:
@@ -26,14 +22,11 @@ def drive_map(poses: Array, seed: int) -> MapData:
     keyframes = [Keyframe(i, i, i, np.eye(4), NO_POINTS, session=1) for i in range(len(poses))]
     edges, own = [], [se3.exp(rng.normal(size=6) * [0, 0, 1, 50, 50, 0])]
     for i in range(1, len(poses)):
-        T = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(NOISE)))
-        edges.append(Edge("odometry", i - 1, i, Registration(T, NOISE)))
+        T = se3.inverse(poses[i - 1]) @ poses[i] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(FIRM)))
+        edges.append(Edge("odometry", i - 1, i, Registration(T, FIRM)))
         own.append(own[-1] @ T)
-    clouds, point = CloudStore(), pack_cloud(np.ones((1, 4), np.float32))
-    for _ in poses:
-        clouds.append(point)
-    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
-    return MapData(keyframes, np.array(own), edges, [], sessions, clouds)
+    clouds = stored(np.ones((1, 4), np.float32) for _ in poses)
+    return MapData(keyframes, np.array(own), edges, [], [SESSION], clouds)
 
 
 def fleet_maps(count: int, turn: float = 0.01) -> tuple[dict[str, Array], dict[str, MapData], list[Join]]:
@@ -50,7 +43,7 @@ def fleet_maps(count: int, turn: float = 0.01) -> tuple[dict[str, Array], dict[s
     for one, other in pairwise(names):
         for k in range(0, 20, 2):
             T = se3.inverse(truth[one][40 + k]) @ truth[other][k]
-            joins.append(Join(one, other, Edge("loop", 40 + k, k, Registration(T, NOISE))))
+            joins.append(Join(one, other, Edge("loop", 40 + k, k, Registration(T, FIRM))))
         wrong = T @ se3.exp(np.array([0, 0, 0.3, 8.0, 0, 0]))
-        joins.append(Join(one, other, Edge("loop", 5, 5, Registration(wrong, NOISE))))
+        joins.append(Join(one, other, Edge("loop", 5, 5, Registration(wrong, FIRM))))
     return truth, maps, joins

@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of a ring road, made without a drive: for what shows or writes maps; what is written into map files."""
+"""Maps of a ring road and of laps, made without a drive: for what shows, writes or searches maps; what is written into
+map files."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import NO_POINTS, Array, Fix, Georeference, Points
 from dpm2_core.geometry import se3
+from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData
 from dpm2_core.slam.store.map_store import Change
 from dpm2_core.slam.store.rows import Session
 
 SPACING = 5.0
 """m between keyframes."""
+FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+"""(6, 6) covariance of a good odometry."""
+SESSION = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
 GEOREFERENCE = Georeference(np.array([49.0, 8.4, 110.0]), se3.exp(np.array([0, 0, 1.0, 2, 3, 4])))
 FIX = Fix(5, np.array([49.0, 8.4, 110.5]), np.diag([4.0, 4, 16]), np.array([0.1, 0, 1.5]))
 
@@ -40,9 +48,23 @@ def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -
     keyframes = [Keyframe(i, 10**9 * i, 10 * i, T, NO_POINTS, session=1) for i, T in enumerate(poses)]
     steps = [_edge("odometry", i, i + 1, poses) for i in range(count - 1)]
     loops = [_edge("loop", 0, count - 1, poses), _edge("loop", 0, count // 2, poses).rejected("<b>points</b> disagree")]
-    session = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
     pictures = [None if image is None else _noise(rng, image) for _ in range(3)]
-    return MapData(keyframes, poses, [*steps, *loops], [], [session], clouds, lambda node: pictures[node % 3])
+    return MapData(keyframes, poses, [*steps, *loops], [], [SESSION], clouds, lambda node: pictures[node % 3])
+
+
+def in_laps(clouds: Sequence[Points], poses: Array, laps: int, seen: Sequence[Descriptors]) -> MapData:
+    """A map of so many laps past the first places, of which the later ones borrow, and past the other places once.
+
+    `poses`: (N, 4, 4) of all keyframes, of which there are fewer clouds (M, 4), and descriptors `seen`, at the first.
+    """
+    count = len(clouds)
+    keyframes = [Keyframe(i, i, i, T, NO_POINTS, None, "", seen[i % count], session=1) for i, T in enumerate(poses)]
+    store = stored(clouds[node % count] for node in range(len(poses)))
+    for node in range(count, laps * count):
+        store.borrow(node, Loan(node % count, np.eye(4)))
+    ways = [Registration(se3.inverse(one) @ other, FIRM) for one, other in pairwise(poses)]
+    steps = [Edge("odometry", node, node + 1, way) for node, way in enumerate(ways)]
+    return MapData(keyframes, poses, steps, [], [replace(SESSION, weights=SlamSettings().weights_id())], store)
 
 
 def stored(clouds: Iterable[Points], origin: Array | None = None) -> CloudStore:

@@ -27,7 +27,8 @@ from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from test.helpers.fleets import NOISE, fleet_maps
+from test.helpers.fleets import fleet_maps
+from test.helpers.maps import FIRM
 
 SETTINGS = RobustSettings()
 
@@ -143,7 +144,7 @@ def test_a_ring_that_closes_moves_what_it_must(tmp_path: Path) -> None:
     truth, maps, joins = fleet_maps(6, turn=2 * np.pi / 240)
     names, path = list(maps), tmp_path / "map"
     T = se3.inverse(truth["d0"][:20]) @ truth["d5"][40:]
-    around = [Join("d0", "d5", Edge("loop", k, 40 + k, Registration(T[k], NOISE))) for k in range(0, 20, 2)]
+    around = [Join("d0", "d5", Edge("loop", k, 40 + k, Registration(T[k], FIRM))) for k in range(0, 20, 2)]
     inside = _made(path, {name: maps[name] for name in names[:-1]}, _of(joins, names[:-1]))
     with MapStore.open(path, read_only=False) as store:
         growth = grown(_standing(store, inside), {"d5": maps["d5"]}, [*joins[-11:], *around])
@@ -161,7 +162,7 @@ def test_a_drive_that_the_map_contradicts_stays_out(tmp_path: Path) -> None:
     inside = _made(path, {name: maps[name] for name in ("d0", "d1")}, _of(joins, ["d0", "d1"]))
     few = [join for join in joins[11:] if join.loop.ok][:2]
     wrong = [
-        Join("d0", "d2", Edge("loop", 7 * k, 59 - k, Registration(se3.exp(np.eye(6)[3] * k), NOISE))) for k in range(4)
+        Join("d0", "d2", Edge("loop", 7 * k, 59 - k, Registration(se3.exp(np.eye(6)[3] * k), FIRM))) for k in range(4)
     ]
     with MapStore.open(path, read_only=False) as store:
         growth = grown(_standing(store, inside), {"d2": maps["d2"]}, [*few, *wrong])

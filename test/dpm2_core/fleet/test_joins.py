@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,10 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.fleet import joins
 from dpm2_core.fleet.places import describe, places_part, vectors_of
-from dpm2_core.frame import NO_POINTS, Array, Points
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
 from dpm2_core.sim.lidar import Lidar
@@ -24,32 +23,13 @@ from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.mapping.merge import loops_by
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.cloud_store import Loan
-from dpm2_core.slam.store.map_data import MapData, load_map, save_as
+from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_core.slam.store.rows import Session
 
 from ...helpers.drives import street
-from ...helpers.maps import stored
+from ...helpers.maps import in_laps
 
-FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LIDAR = Lidar(LidarConfig(columns=1024))
-
-
-def in_laps(clouds: Sequence[Points], poses: Array, laps: int, seen: Sequence[Descriptors]) -> MapData:
-    """A map of so many laps past the first places, of which the later ones borrow, and past the other places once.
-
-    `poses`: (N, 4, 4) of all keyframes, of which there are fewer clouds (M, 4), and descriptors `seen`, at the first.
-    """
-    count = len(clouds)
-    keyframes = [Keyframe(i, i, i, T, NO_POINTS, None, "", seen[i % count], session=1) for i, T in enumerate(poses)]
-    store = stored(clouds[node % count] for node in range(len(poses)))
-    for node in range(count, laps * count):
-        store.borrow(node, Loan(node % count, np.eye(4)))
-    ways = [Registration(se3.inverse(one) @ other, FIRM) for one, other in pairwise(poses)]
-    steps = [Edge("odometry", node, node + 1, way) for node, way in enumerate(ways)]
-    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", SlamSettings().weights_id())]
-    return MapData(keyframes, poses, steps, [], sessions, store)
 
 
 class Asked(LoopCloser):

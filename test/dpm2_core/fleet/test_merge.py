@@ -36,8 +36,6 @@ from test.helpers.fleets import fleet_maps
 from test.helpers.full_disk import CHECKPOINT, largest_file
 from test.helpers.maps import ring
 
-NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
-
 
 @pytest.mark.long
 def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: Path) -> None:

@@ -36,10 +36,11 @@ from dpm2_core.slam.registration.icp import GeometricSettings
 from dpm2_core.slam.settings import SlamSettings
 
 from ....helpers.drives import street
+from ....helpers.maps import FIRM
 from ....helpers.rooms import BOTH_ENDS, CABINET, HALL, ROUND, standing
 from ....helpers.rooms import scan as room_scan
 
-FIRM, OFF = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.diag([0.01] * 3 + [0.7] * 3) ** 2
+OFF = np.diag([0.01] * 3 + [0.7] * 3) ** 2
 STREET = np.arange(40.0, 105.0, 5.0)
 ONE_PART = np.zeros(100, np.intp)  # all keyframes are tied together
 

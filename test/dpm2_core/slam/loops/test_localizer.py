@@ -17,7 +17,7 @@ from dpm2_core.slam.loops.localizer import Localizer
 from dpm2_core.slam.loops.relocalization import nowhere
 from dpm2_core.slam.settings import SlamSettings
 
-FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+from ....helpers.maps import FIRM
 
 
 class Places:

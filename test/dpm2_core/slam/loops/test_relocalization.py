@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.estimates import Edge, Keyframe, Registration, State
-from dpm2_core.frame import NO_POINTS, Array, Points
+from dpm2_core.estimates import Keyframe, Registration, State
+from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
 from dpm2_core.network.pretrained import load_network
@@ -27,17 +27,15 @@ from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.relocalization import Relocalizer
 from dpm2_core.slam.session import open_for_localization
 from dpm2_core.slam.settings import SlamSettings
-from dpm2_core.slam.store.cloud_codec import pack_cloud
-from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import MapData, save_as
-from dpm2_core.slam.store.rows import Session
+from dpm2_core.slam.store.map_data import save_as
 
 from ....helpers.drives import street
+from ....helpers.maps import FIRM, in_laps
 from ....helpers.rooms import BOTH_ENDS, CABINET, HALL, ROUND, scan, standing
 
 pytestmark = pytest.mark.weights
 
-FIRM, LOST = np.diag([1e-3] * 3 + [0.02] * 3) ** 2, np.eye(6)
+LOST = np.eye(6)
 LIDAR = Lidar(LidarConfig(columns=1024))
 
 
@@ -169,20 +167,9 @@ def test_a_place_that_was_passed_often_is_compared_with_one_that_was_passed_once
     """The street stands twice in the map, driven eight times and once: all six candidates, and the nine keyframes by
     each, were of the first, where it was found, 500 m from where it was. Laps after the first one borrow."""
     at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 500.0, 0]))
-    streets, clouds = np.array([world().pose_at(s) for s in at]), CloudStore()
-    poses, describe = np.concatenate([*[streets] * 8, far @ streets]), PlaceRecognition(load_network("small", 1))
-    descriptors = [describe.descriptors(lone(seen(s))) for s in at]
-    for node in range(len(poses)):
-        clouds.append(pack_cloud(seen(at[node % len(at)])))
-        if len(at) <= node < len(poses) - len(at):
-            clouds.borrow(node, Loan(node % len(at), np.eye(4)))
-    keyframes = [Keyframe(i, i, i, T, NO_POINTS, None, "", descriptors[i % len(at)]) for i, T in enumerate(poses)]
-    steps = [
-        Edge("odometry", i, i + 1, Registration(se3.inverse(poses[i]) @ poses[i + 1], FIRM))
-        for i in range(len(poses) - 1)
-    ]
-    sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", SlamSettings().weights_id())]
-    save_as(MapData(keyframes, poses, steps, [], sessions, clouds), path := tmp_path / "laps.dpm2map")
+    streets, describe = np.array([world().pose_at(s) for s in at]), PlaceRecognition(load_network("small", 1))
+    poses, looks = np.concatenate([*[streets] * 8, far @ streets]), [describe.descriptors(lone(seen(s))) for s in at]
+    save_as(in_laps([seen(s) for s in at], poses, 8, looks), path := tmp_path / "laps.dpm2map")
     with open_for_localization(path, SlamSettings()) as store:
         localizer = make_slam(SlamSettings(), store=store).localizer
         assert localizer is not None

@@ -22,8 +22,8 @@ from dpm2_core.slam.store.map_data import load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.full_disk import largest_file
 from test.helpers.loops import KnownLoops
+from test.helpers.maps import FIRM
 
-SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LAP = 20
 WRONG = LAP + 4  # a node with a wrong loop
 
@@ -33,7 +33,7 @@ def of_the_lap_before(node: int) -> list[Edge]:
     if node < LAP:
         return []
     T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
-    loop = Edge("loop", node - LAP, node, Registration(T, SIGMA, 0.9, 0.05, "known"))
+    loop = Edge("loop", node - LAP, node, Registration(T, FIRM, 0.9, 0.05, "known"))
     return [loop if node % 7 else loop.rejected("no")]
 
 
@@ -56,7 +56,7 @@ def laps(count: int, seed: int = 0) -> list[Keyframe]:
     out: list[Keyframe] = []
     for i in range(count * LAP):
         T = se3.exp(np.array([0, 0, 1.0, 20, 0, 0]) * (2 * np.pi * i / LAP))
-        edge = Registration(se3.inverse(out[-1].T_odom_kf) @ T, SIGMA, 0.9, 0.05, "test") if i else None
+        edge = Registration(se3.inverse(out[-1].T_odom_kf) @ T, FIRM, 0.9, 0.05, "test") if i else None
         points = np.column_stack([rng.uniform(-30, 30, (500, 3)), rng.random(500)]).astype(np.float32)
         out.append(Keyframe(i, i * 10**8, i, T, points, edge))
     return out
@@ -195,7 +195,7 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
     for part in parts:
         with begun(path) as mapper:
             if mapper.keyframes:
-                mapper.start_session(None, SIGMA)
+                mapper.start_session(None, FIRM)
             for number, keyframe in enumerate(part):
                 edge = keyframe.edge if number else None
                 mapper.add(Keyframe(number, keyframe.stamp, keyframe.index, keyframe.T_odom_kf, keyframe.cloud, edge))
@@ -214,7 +214,7 @@ def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(
         for keyframe in drive[:8]:
             mapper.add(keyframe)
     with begun(path) as mapper:
-        mapper.start_session(None, SIGMA)
+        mapper.start_session(None, FIRM)
         assert mapper.T_map_odom is None
         T_odom_first = se3.exp([0, 0.1, 0, 0, 0, 0])
         mapper.add(replace(drive[7], id=0, T_odom_kf=T_odom_first, edge=None))

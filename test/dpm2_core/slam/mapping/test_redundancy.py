@@ -16,8 +16,8 @@ from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.loops import KnownLoops
+from test.helpers.maps import FIRM
 
-SIGMA = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
 LENGTH = 6
 """Keyframes of a session."""
 
@@ -26,7 +26,7 @@ def first_waits(node: int) -> list[Edge]:
     """The keyframe of the session before. The first loop waits for the second, and is accepted with it."""
     if node < LENGTH:
         return []
-    found = Edge("loop", node - LENGTH, node, Registration(np.eye(4), SIGMA, 0.9, 0.05, "known"))
+    found = Edge("loop", node - LENGTH, node, Registration(np.eye(4), FIRM, 0.9, 0.05, "known"))
     if node % LENGTH == 0:
         return [found.rejected("waits for a second loop that agrees")]
     return [found, found.between(node - 1 - LENGTH, node - 1)] if node % LENGTH == 1 else [found]
@@ -37,7 +37,7 @@ def add_session(path: Path, noise: np.random.Generator) -> Mapper:
     with MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path) as store:
         store.begin_session()
         mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), KnownLoops(first_waits), store)
-        way = Registration(se3.make(np.eye(3), np.array([5.0, 0, 0])), SIGMA, 0.9, 0.05, "test")
+        way = Registration(se3.make(np.eye(3), np.array([5.0, 0, 0])), FIRM, 0.9, 0.05, "test")
         for i in range(LENGTH):
             T, points = se3.make(np.eye(3), np.array([5.0 * i, 0, 0])), noise.uniform(-30, 30, (100, 4))
             mapper.add(Keyframe(i, 10**8 * i, i, T, points.astype(np.float32), way if i else None))
