@@ -22,6 +22,7 @@ from dpm2_core.data import naming
 from dpm2_core.data.bag_file import Bag, open_bag
 from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS
 from dpm2_core.data.messages import rigid_parts
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.prefetch import prefetch
 from dpm2_core.errors import UsageError, printable
 from dpm2_core.files import atomic_write
@@ -175,7 +176,7 @@ class BagPlayer:
             except UsageError as error:
                 log.warning(f"{naming.TF_STATIC}: {printable(child)} is left out: {error}", once=True)
             else:
-                out[child.lstrip("/")] = stamped
+                out[frame_name(child)] = stamped
         return out
 
     def _await_subscribers(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
@@ -29,7 +30,7 @@ class BaseFrame:
 
     def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
         """`wanted`: the frame that was asked for, or empty; `own`: frames that this node is a parent with."""
-        self._wanted, self._own = wanted.lstrip("/"), own
+        self._wanted, self._own = frame_name(wanted), own
         self._tree: TransformTree | None = None  # that of the last look
         self.name = self.problem = ""
         self.above = self._wanted
@@ -68,7 +69,7 @@ class BaseFrame:
         self._tree = tree
         if self._wanted:
             self.above = tree.root(self._wanted, self._own)
-        lidar_frame = lidar_frame.lstrip("/")
+        lidar_frame = frame_name(lidar_frame)
         name = self._wanted or tree.root(lidar_frame, self._own)
         try:
             self._T_base_lidar = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)

@@ -14,7 +14,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.naming import TF
+from dpm2_core.data.naming import TF, frame_name
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Comparison
@@ -169,7 +169,7 @@ class OtherOdometry:
         check_transforms(message)
         with self._changed:
             for stamped in message.transforms:
-                parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+                parent, child = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
                 check_frame(parent)
                 check_frame(child)
                 self._history.add(parent, child, stamp_ns(stamped.header), stamped.transform)
@@ -177,7 +177,7 @@ class OtherOdometry:
 
     def _on_odometry(self, message: Odometry) -> None:
         check_header(message.header)
-        frame, child = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+        frame, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
         if frame != self._frame:
             raise RejectedError("frame", f"odometry in frame {frame[:80]!r}; ros.odom_frame is {self._frame!r}")
         if not child:

@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dpm2_core.data.bag_file import Bag
+from dpm2_core.data.naming import frame_name
 from dpm2_ros.lockstep import ODOMETRY
 from dpm2_ros.tf_message import TFMessage
 
@@ -32,7 +33,7 @@ def published_here(node: Node, topics: Iterable[str]) -> list[str]:
 def odometry_frames(bag: Bag, topics: Iterable[str]) -> set[str]:
     """The frames of the odometry of these topics: what the recording has on /tf from or to one of them is dpm2's."""
     first = [next(bag.decoded(topic), None) for topic in topics if topic.endswith(f"/{ODOMETRY}")]
-    return {message.header.frame_id.lstrip("/") for message in first if message is not None}
+    return {frame_name(message.header.frame_id) for message in first if message is not None}
 
 
 def without_frames(data: bytes, frames: Collection[str]) -> bytes:
@@ -41,5 +42,5 @@ def without_frames(data: bytes, frames: Collection[str]) -> bytes:
         transforms = deserialize_message(data, TFMessage).transforms
     except Exception:  # rclpy raises RMWError or RuntimeError; who listens says what is wrong with it
         return data
-    kept = [t for t in transforms if not {t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")} & {*frames}]
+    kept = [t for t in transforms if not {frame_name(t.header.frame_id), frame_name(t.child_frame_id)} & {*frames}]
     return bytes(serialize_message(TFMessage(transforms=kept))) if kept else b""

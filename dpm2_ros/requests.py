@@ -11,6 +11,7 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_srvs.srv import SetBool, Trigger
 
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
 from dpm2_core.slam.mapping.admission import check_pose
@@ -64,7 +65,7 @@ class Requests:
         return response
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        frame, requested = message.header.frame_id.lstrip("/"), self._map_frame
+        frame, requested = frame_name(message.header.frame_id), self._map_frame
         if frame != requested:
             raise UsageError(f"initialpose not used: want it in frame {requested}, not in {frame[:80]!r}")
         T_map_base = transform_matrix(message.pose.pose)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from dpm2_core.config import Settings
+from dpm2_core.data.naming import frame_name
 from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 from dpm2_core.slam.settings import Config
 
@@ -112,7 +113,7 @@ class RosSettings(Settings):
 
     @model_validator(mode="after")
     def _different(self) -> RosSettings:
-        frames = [self.map_frame, self.own_frame, self.base_frame.lstrip("/")]
+        frames = [self.map_frame, self.own_frame, frame_name(self.base_frame)]
         if self.own_frame != self.odom_frame:
             frames.append(self.odom_frame)
         if len(set(frames)) < len(frames):

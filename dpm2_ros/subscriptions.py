@@ -24,6 +24,7 @@ from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_bes
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.message_kinds import CLOUDS
 from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
@@ -131,7 +132,7 @@ class Inputs:
         """Whether all latched messages about the LiDAR that have a publisher have arrived."""
         known, count = self.calibration, self._node.count_publishers
         publishers, frames = count(self._static_topic), known.transforms.frames
-        if publishers and (self._static_messages < publishers or lidar_frame.lstrip("/") not in frames):
+        if publishers and (self._static_messages < publishers or frame_name(lidar_frame) not in frames):
             return False
         return known.angle_correction_deg is not None or not count(self._correction_topic)
 
@@ -259,7 +260,7 @@ class Inputs:
         if _usable(camera.info):
             decode_camera(info, np.eye(4), "camera")  # raises where what is known is to stay
             frame, known, images = info.header.frame_id, camera.info.header.frame_id, self.calibration.frame_of(camera)
-            if images and frame.lstrip("/") not in (images, known.lstrip("/")):
+            if images and frame_name(frame) not in (images, frame_name(known)):
                 raise RejectedError("another frame", f"a CameraInfo in frame {frame[:80]!r}, the images' is {images!r}")
         camera.info = info
 

@@ -10,7 +10,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.naming import TF
+from dpm2_core.data.naming import TF, frame_name
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_ros.checks import check_transforms
@@ -73,7 +73,7 @@ class TransformBroadcaster:
     def _on_tf(self, message: Any) -> None:
         check_transforms(message)
         for stamped in message.transforms:
-            sent = self._sent.get(child := stamped.child_frame_id.lstrip("/"))
+            sent = self._sent.get(child := frame_name(stamped.child_frame_id))
             if sent is not None and (link := _link(stamped)) not in sent:
                 text = f"another node has {excerpt(link[0])} -> {child} on /tf, too: what is in that frame jumps"
                 self._other = time.monotonic(), f"{text}; {_REMEDY}"
@@ -81,7 +81,7 @@ class TransformBroadcaster:
 
 def _link(stamped: Any) -> _Link:
     at = stamped.transform.translation
-    return stamped.header.frame_id.lstrip("/"), stamp_ns(stamped.header), at.x, at.y, at.z
+    return frame_name(stamped.header.frame_id), stamp_ns(stamped.header), at.x, at.y, at.z
 
 
 class _Unspun(CallbackGroup):

@@ -14,6 +14,7 @@ from dpm2_core.data.frames import CameraTopic
 from dpm2_core.data.image_messages import decode_camera, info_of, info_topic_beside, is_depth
 from dpm2_core.data.message_kinds import CAMERA_INFO, CLOUDS, FIX, IMAGES, IMU, TRUTHS
 from dpm2_core.data.messages import MessageError
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
@@ -85,7 +86,7 @@ class TopicChoice:
         are some of several cameras; None without, which is an error where it is asked for."""
         info_topic = info_topic or info_topic_beside(topic)
         problem, usable, image = f"no CameraInfo on {info_topic}", list[CameraTopic](), self._bag.first(topic)
-        frame = image.header.frame_id.lstrip("/") if image else ""
+        frame = frame_name(image.header.frame_id) if image else ""
         for message in self._bag.decoded(info_topic) if self._bag.types.get(info_topic) == CAMERA_INFO else ():
             info = info_of(topic, message)
             try:
@@ -94,7 +95,7 @@ class TopicChoice:
                 problem = str(error)
                 continue
             usable.append(CameraTopic(topic, info))
-            if info.header.frame_id.lstrip("/") == frame:
+            if frame_name(info.header.frame_id) == frame:
                 return usable[-1]
             if len(usable) == _LOOKED_AT:
                 break

@@ -23,6 +23,7 @@ from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.message_kinds import CLOUDS, IMAGES, PATH
 from dpm2_core.data.messages import MessageError, decode_points, serialized_frame, serialized_stamp, stamp_ns
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.pairing import AHEAD, JUMP, SWEEP, Beside, RawMessage, clouds_after_others, is_due
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import note_once
@@ -218,7 +219,7 @@ class BagSource:
         None without one, and where the first clouds show that the root is none, as the frame of a camera.
         """
         base = self.transforms.root(self.lidar_frame, _NO_BASE)
-        if first is None or base == self.lidar_frame.lstrip("/"):
+        if first is None or base == frame_name(self.lidar_frame):
             return None
         T_base_lidar = self.transforms.lookup(base, self.lidar_frame)
         up = T_base_lidar[2, :3]

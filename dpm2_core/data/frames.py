@@ -14,6 +14,7 @@ from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, returned, why_untimed
+from dpm2_core.data.naming import frame_name
 from dpm2_core.data.point_times import last_point
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
@@ -68,7 +69,7 @@ class Calibration:
                 one that turns, two cameras for one that jumps. One that names no frame may be of any.
         """
         known, last = self.heard.get(topic, ("", stamp))
-        frame = frame.lstrip("/") or known
+        frame = frame_name(frame) or known
         if known and frame != known and abs(stamp - last) < _SILENT:
             found = f"a message in frame {frame[:80]!r}, those before are in {known!r}"
             raise MessageError(f"{found}: a topic has one sensor")
@@ -146,7 +147,7 @@ class FrameBuilder:
     def _check_frame(self, frame: str) -> None:
         """Raises MessageError for that of another LiDAR: poses of two would be taken for the motion of one."""
         of_drive = self._calibration.lidar_frame
-        if of_drive and frame.lstrip("/") != of_drive.lstrip("/"):
+        if of_drive and frame_name(frame) != frame_name(of_drive):
             found = f"a cloud in frame {frame[:80]!r}, the drive's are in {of_drive!r}"
             raise MessageError(f"{found}: one drive has one LiDAR")
 
@@ -231,7 +232,7 @@ class FrameBuilder:
         if (fix := buffer.take(stamp)) is None:
             return None
         with self._or_else(self._calibration.gnss_topic, "the antenna is taken for the LiDAR"):
-            if buffer.frame.lstrip("/") != lidar_frame.lstrip("/"):
+            if frame_name(buffer.frame) != frame_name(lidar_frame):
                 fix = replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
         return fix
 

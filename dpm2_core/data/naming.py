@@ -40,3 +40,8 @@ OTHER = Names("/points", "/camera", "/ground_truth", "lidar", "camera")
 POINTS, IMAGE = KITTI.points, f"{KITTI.camera}/image_raw"
 TRUTHS = tuple(f"{names.truth}/{kind}" for names in (KITTI, OTHER) for kind in ("odom", "path"))
 """Where ground truth is looked for."""
+
+
+def frame_name(frame: str) -> str:
+    """The name of a frame as it is compared: those of ROS 1 had a leading slash."""
+    return frame.lstrip("/")

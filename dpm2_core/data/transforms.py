@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.messages import rigid_parts
+from dpm2_core.data.naming import frame_name
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -56,11 +57,11 @@ class TransformTree:
 
     def parent(self, frame: str) -> tuple[str, Array] | None:
         """What the frame is placed in, and T_parent_frame (4, 4); None where it is not."""
-        return self._parents.get(_name(frame))
+        return self._parents.get(frame_name(frame))
 
     def set(self, parent: str, child: str, T_parent_child: Array) -> None:
         """Place `child` in `parent`; a later call replaces an earlier one."""
-        self._parents[_name(child)] = (_name(parent), np.asarray(T_parent_child, np.float64))
+        self._parents[frame_name(child)] = (frame_name(parent), np.asarray(T_parent_child, np.float64))
 
     def lookup(self, target_frame: str, source_frame: str) -> Array:
         """T_target_source (4, 4).
@@ -68,7 +69,7 @@ class TransformTree:
         Raises:
             UsageError: the two are not connected; the message names both and every frame known.
         """
-        target, source = _name(target_frame), _name(source_frame)
+        target, source = frame_name(target_frame), frame_name(source_frame)
         up_target, up_source = self._ancestors(target), self._ancestors(source)
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None or (target == source and target not in self.frames):
@@ -86,13 +87,13 @@ class TransformTree:
         Raises:
             UsageError: the two are not connected.
         """
-        if _name(target_frame) and _name(target_frame) == _name(source_frame):
+        if frame_name(target_frame) and frame_name(target_frame) == frame_name(source_frame):
             return np.eye(4)
         return self.lookup(target_frame, source_frame)
 
     def root(self, frame: str, below: Collection[str] = ()) -> str:
         """The topmost frame above `frame`, `below` none of those named; itself where nothing is."""
-        first, *above = self._ancestors(_name(frame))
+        first, *above = self._ancestors(frame_name(frame))
         return [first, *takewhile(lambda name: name not in below, above)][-1]
 
     @property
@@ -110,7 +111,3 @@ class TransformTree:
             T = T_parent_frame @ T
             out[frame] = T
         return out
-
-
-def _name(frame: str) -> str:
-    return frame.lstrip("/")  # tf1 names had a leading slash
