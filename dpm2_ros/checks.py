@@ -11,6 +11,7 @@ from dpm2_core.data.livox import cloud_of_custom
 from dpm2_core.data.messages import MessageError, check_cloud
 from dpm2_core.data.transforms import TransformTree, transform_matrix
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_pose
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
@@ -54,6 +55,17 @@ def checked_cloud(message: Any) -> tuple[Any, str]:
     return message, ""
 
 
+def checked_pose(pose: Any) -> Array:
+    """A geometry_msgs Pose or Transform as (4, 4).
+
+    Raises:
+        UsageError: it is no rigid transform. RejectedError: it leads farther than a map can be.
+    """
+    T = transform_matrix(pose)
+    check_pose(T)
+    return T
+
+
 def check_transforms(message: Any) -> None:
     """Raises RejectedError for a TFMessage of more transforms than any robot sends at once."""
     if len(message.transforms) > MOST_TRANSFORMS:
@@ -73,8 +85,7 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
         try:
             check_frame(parent)
             check_frame(child)
-            T_parent_child = transform_matrix(stamped.transform)
-            check_pose(T_parent_child)
+            T_parent_child = checked_pose(stamped.transform)
             if len(tree) >= _MOST_FRAMES and tree.parent(child) is None:
                 raise RejectedError("frame", f"there are {_MOST_FRAMES} frames already")
         except UsageError as error:

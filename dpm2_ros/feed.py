@@ -14,14 +14,14 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import UInt8MultiArray, UInt32MultiArray
 
 from dpm2_core.data.messages import stamp_ns
-from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import NO_POINTS
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors, check_pose
+from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_descriptors
 from dpm2_core.slam.store.cloud_codec import CodecError, origin_of, unpack_cloud
+from dpm2_ros.checks import checked_pose
 from dpm2_ros.conversions import EARLIER, check_frame, covariance_from_ros, parse_keyframe_name
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.keyframe_messages import BUDGET, WIRE, Payload, descriptors_from_msg, payload_from_msg, received_to_msg
@@ -283,10 +283,9 @@ def keyframe_from(
         RejectedError: the pose is not a rigid transform, or the covariance not one.
     """
     try:
-        T_odom_kf = transform_matrix(pose.pose.pose)
+        T_odom_kf = checked_pose(pose.pose.pose)
     except UsageError as error:
         raise RejectedError("pose", f"keyframe {id}: {error}") from None
-    check_pose(T_odom_kf)
     covariance, edge = covariance_from_ros(pose.pose.covariance, T_odom_kf[:3, :3]), None
     if covariance.any():
         check_covariance(covariance)

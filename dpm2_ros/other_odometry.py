@@ -15,13 +15,13 @@ from rclpy.qos import QoSProfile
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.naming import TF, frame_name
-from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Comparison
 from dpm2_core.frame import Array, Guess
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.admission import RejectedError, check_covariance, check_pose
-from dpm2_ros.checks import check_header, check_transforms
+from dpm2_core.slam.mapping.admission import RejectedError, check_covariance
+from dpm2_ros.checks import check_header, check_transforms, checked_pose
 from dpm2_ros.conversions import check_frame, covariance_from_ros
 from dpm2_ros.guard import GuardedNode
 from dpm2_ros.matched_subscription import MatchedSubscription
@@ -183,8 +183,7 @@ class OtherOdometry:
         if not child:
             raise RejectedError("frame", "odometry without a child_frame_id")
         check_frame(child)
-        T = transform_matrix(message.pose.pose)
-        check_pose(T)
+        T = checked_pose(message.pose.pose)
         numbers, covariance = np.asarray(message.pose.covariance, np.float64), None
         with suppress(RejectedError):  # all zero, or -1 for "unknown"
             stated = covariance_from_ros(np.nan_to_num(numbers, posinf=-1.0), T[:3, :3])

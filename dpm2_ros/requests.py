@@ -12,10 +12,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_srvs.srv import SetBool, Trigger
 
 from dpm2_core.data.naming import frame_name
-from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.errors import UsageError
-from dpm2_core.slam.mapping.admission import check_pose
 from dpm2_ros.base_frame import BaseFrame
+from dpm2_ros.checks import checked_pose
 from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.mapping import MapperThread
 
@@ -68,8 +67,6 @@ class Requests:
         frame, requested = frame_name(message.header.frame_id), self._map_frame
         if frame != requested:
             raise UsageError(f"initialpose not used: want it in frame {requested}, not in {frame[:80]!r}")
-        T_map_base = transform_matrix(message.pose.pose)
-        check_pose(T_map_base)
-        T_map_start = T_map_base @ self._base.T_base_start
+        T_map_start = checked_pose(message.pose.pose) @ self._base.T_base_start
         if problem := "no map here" if self._mapper is None else self._mapper.hint(T_map_start):
             raise UsageError(f"initialpose not used: {problem}")

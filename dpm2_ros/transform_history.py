@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.pairing import JUMP, SetBack
-from dpm2_core.data.transforms import TransformTree, transform_matrix
+from dpm2_core.data.transforms import TransformTree
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
-from dpm2_core.slam.mapping.admission import RejectedError, check_pose
+from dpm2_core.slam.mapping.admission import RejectedError
+from dpm2_ros.checks import checked_pose
 
 GAP = 500_000_000
 """ns: samples farther apart say nothing of the time between."""
@@ -123,9 +124,7 @@ class TransformHistory:
 
 
 def _matrix(pose: Any, child: str) -> Array:
-    T = transform_matrix(pose)
     try:
-        check_pose(T)
+        return checked_pose(pose)
     except RejectedError as error:
         raise UsageError(f"{child}: {error}") from None
-    return T
