@@ -14,7 +14,7 @@ from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
-from dpm2_core.slam.store.rows import FARTHEST, MAX_ID
+from dpm2_core.slam.store.rows import MAX_ID, why_no_pose
 
 MAX_DESCRIPTORS = 4096
 _REACH = 32_000.0  # m: as far as a packed cloud reaches
@@ -52,11 +52,9 @@ def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
 
 
 def check_pose(T: Array) -> None:
-    """Raises RejectedError unless (4, 4) is a rigid transform to a place nearer than `FARTHEST`."""
-    if not se3.is_rigid(T):
-        raise RejectedError("pose", "its pose is not a finite rigid transform")
-    if np.abs(T[:3, 3]).max() > FARTHEST:
-        raise RejectedError("pose", f"its pose is farther than {FARTHEST / 1000:.0f} km from the origin")
+    """Raises RejectedError unless (4, 4) is a rigid transform to a place nearer than `rows.FARTHEST`."""
+    if why := why_no_pose(T):
+        raise RejectedError("pose", f"its pose is {why}")
 
 
 def check_covariance(covariance: Array) -> None:

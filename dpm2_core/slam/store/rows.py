@@ -77,9 +77,16 @@ def pose_of(data: Any) -> Array:
         ValueError: not a finite rigid transform to a place on Earth.
     """
     T = bytes_array(data, 4)
-    if not se3.is_rigid(T) or np.abs(T[:3, 3]).max() > FARTHEST:
-        raise ValueError("not a finite rigid transform")
+    if why := why_no_pose(T):
+        raise ValueError(why)
     return T
+
+
+def why_no_pose(T: Array) -> str:
+    """Why no keyframe of a map can be at (4, 4), in words; empty where one can."""
+    if not se3.is_rigid(T):
+        return "not a finite rigid transform"
+    return f"farther than {FARTHEST / 1000:.0f} km from the origin" if np.abs(T[:3, 3]).max() > FARTHEST else ""
 
 
 def pack_descriptors(d: Descriptors) -> bytes:
