@@ -111,9 +111,9 @@ class KeyframeFile:
         """`keep`: leave the file for the next start; else it is deleted."""
         self.pause()
         if self.path is not None and not keep:
-            for path in (self.path, Path(f"{self.path}-wal")):
-                path.unlink(missing_ok=True)
-            with suppress(OSError):  # it is not empty
+            with suppress(OSError):  # the file system can only be read by now, or the folder is not empty
+                for path in (self.path, Path(f"{self.path}-wal")):
+                    path.unlink(missing_ok=True)
                 self.path.parent.rmdir()
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sqlite3
@@ -73,6 +74,22 @@ def test_a_full_disk_costs_no_keyframe_and_leaves_no_gap(tmp_path: Path) -> None
     assert 5 < len(file) < 50
     assert [file.read(id)[0][0] for id in range(len(file))] == list(range(len(file)))
     file.close(keep=False)
+
+
+def test_a_disk_that_can_only_be_read_by_now_does_not_keep_a_node_from_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Linux makes one that has errors. What stays is sent again, and the mapper knows it."""
+    file = KeyframeFile(path := path_of(tmp_path, "", "5f3a9c01"))
+    file.append([b"pose", b"descriptors", b"cloud"])
+
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", refuse)
+        file.close(keep=False)
+    assert left_behind(tmp_path, "") == [("5f3a9c01", path)]
 
 
 def test_a_file_belongs_to_one_process_and_one_robot(tmp_path: Path) -> None:

@@ -107,9 +107,11 @@ def _check_whole(source: Path, target: Path) -> None:
 
 
 def remove_map(path: Path) -> None:
-    """Remove a map file, if it is there, with what SQLite keeps beside it."""
-    path.unlink(missing_ok=True)
-    _remove_log(path)
+    """Remove a map file, if it is there, with what SQLite keeps beside it. What cannot be removed stays: whoever asks
+    has the reason already, as that the file system can only be read."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+        _remove_log(path)
 
 
 def _remove_log(path: Path) -> None:

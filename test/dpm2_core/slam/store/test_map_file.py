@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dpm2_core.cli import main
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Keyframe
 from dpm2_core.slam.session import open_session
 from dpm2_core.slam.settings import SlamSettings
@@ -52,6 +54,20 @@ def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
     make(map_file, path)
     assert check_map(path).problems == []
     assert check_map(path).keyframes == (0 if make is begun else check_map(map_file).keyframes)
+
+
+def test_where_nothing_can_be_written_that_is_said(
+    tmp_path: Path, map_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There removing what was not made is an error, too, and was the one that came out, as a traceback."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    monkeypatch.setattr(os, "unlink", refuse)
+    with pytest.raises(Dpm2Error, match=r"new\.dpm2map: Read-only file system"):
+        saved(map_file, tmp_path / "new.dpm2map")
 
 
 def test_prune_says_so_before_it_has_worked(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
