@@ -39,6 +39,7 @@ class ScaledOdometry(Odometry):
         self._undecided, self._others, self._scans = True, 0, 0
         self._begun = False  # a scan has been registered while it was undecided
         self._most = 0  # points of a scan in the open
+        self._last = 0  # points that the scan looked at before has shown
 
     def process(self, frame: Frame) -> OdometryResult:
         """As of `Odometry`."""
@@ -61,8 +62,12 @@ class ScaledOdometry(Odometry):
         return result
 
     def _found(self, frame: Frame) -> bool | None:
-        """Whether a scan shows a room, see `is_room`."""
+        """Whether a scan shows a room, see `is_room`.
+
+        A second LiDAR of half the rate is in every second scan: what it sees counts in the next one, too.
+        """
         found, points = look(frame.points)
         if found is False:
             self._most = max(self._most, points)
+        points, self._last = max(points, self._last), points
         return None if found and points < _CLEAR * self._most else found

@@ -18,7 +18,10 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.odometry.scaled import ScaledOdometry
 from dpm2_core.slam.settings import SlamSettings
 
-from ....helpers.rooms import boxes, frames, scan, walk
+from ....helpers.rooms import HOUSES, STREET, boxes, frames, scan, standing, walk
+
+_HALL = np.array([[-7, -5, 0], [7, 5, 3.0]])
+_SHELVES = boxes((-6.5, -4.5), (6, 4), 8, np.array([0.8, 0.5, 1.8]))
 
 
 def geometric(preset: str) -> SlamSettings:
@@ -156,6 +159,18 @@ def test_short_sight_on_a_street_is_no_room() -> None:
         assert is_room(frame.points[near])
         odometry.process(replace(frame, points=frame.points[near]))
     assert odometry.scale == "outdoor"
+
+
+def test_a_second_lidar_of_half_the_rate_does_not_hide_a_room() -> None:
+    """Every second scan has 60 % of the points, fewer than rooms show: no four scans in a row were of a room."""
+    poses = np.tile(standing(0, 0, 0), (56, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(56) - 4.0
+    odometry = make_odometry(geometric("auto"))
+    for i, T in enumerate(poses):
+        points = scan(T, *((STREET, HOUSES) if i < 11 else (_HALL, _SHELVES)), i)
+        both = i % 2 == 0
+        odometry.process(Frame(i * 10**8, points if both else points[np.arange(len(points)) % 5 < 3], index=i))
+    assert odometry.scale == "indoor"
 
 
 def test_frames_that_say_nothing_decide_nothing() -> None:
