@@ -28,6 +28,7 @@ from dpm2_core.tables import FigureTable, record_table
 _STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the made drive's odometry
 _LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
 _RIGHT = (5.0, np.radians(5.0))  # m, rad: a loop that is farther from the truth is wrong
+_FRAMES = 150  # of the loop that a solver disturbs
 _INJECTED = (60, 120, 200, 300)
 _Mask = NDArray[np.bool_]
 
@@ -65,12 +66,12 @@ def are_right(truth: Array, graph: GraphData) -> _Mask:
     return np.asarray((np.linalg.norm(off[:, :3, 3], axis=1) < _RIGHT[0]) & (se3.angle(off) < _RIGHT[1]))
 
 
-def made_drive(wrong: int, count: int = 5000, right: int = 200, seed: int = 0) -> tuple[Array, GraphData]:
+def made_drive(wrong: int, count: int = 5000, right: int = 200) -> tuple[Array, GraphData]:
     """True poses of a drive that revisits itself, and its graph with noise as its covariances say.
 
     Wrong loops say that two places more than 20 m apart are one, as look-alike places do.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     u = 2 * np.pi * np.arange(count) / 1250
     at = np.stack([250 * np.sin(u) + 60 * np.sin(2 * u), 200 * np.sin(2 * u + 0.3) + 30 * np.cos(u), 5 * np.sin(u)], 1)
     ahead = np.gradient(at, axis=0)
@@ -98,13 +99,13 @@ def made_drive(wrong: int, count: int = 5000, right: int = 200, seed: int = 0) -
     return truth, replace(graph, poses=integrate(graph))
 
 
-def disturbance(graph: GraphData, frames: int = 150) -> dict[str, Any]:
+def disturbance(graph: GraphData) -> dict[str, Any]:
     """p95 of a 10 Hz loop of 30 ms of work alone, and while a process solves the graph over and over."""
     work = np.random.default_rng(0).normal(size=(40_000, 3))
 
     def loop(worker: GraphWorker | None) -> tuple[list[float], int]:
         taken, solved = [], 0
-        for _ in range(frames):
+        for _ in range(_FRAMES):
             if worker is not None:
                 solved += worker.take() is not None
                 if not worker.busy:

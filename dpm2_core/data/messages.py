@@ -209,7 +209,7 @@ def _points(view: NDArray[np.void], intensity: str | None, intensity_max: float 
     return scale_intensity(points, intensity_max, integer=view.dtype[intensity].base.kind != "f")
 
 
-def scale_intensity(points: Points, intensity_max: float | None = None, integer: bool = False) -> Points:
+def scale_intensity(points: Points, intensity_max: float | None, integer: bool = False) -> Points:
     """(N, 4) points with intensity in 0..1: the same array if it is already, else a copy. Unknown (NaN) becomes 0.
 
     Args:

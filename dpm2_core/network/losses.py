@@ -100,7 +100,7 @@ def student_offset(residual: Tensor, L: Tensor, weight: Tensor) -> Tensor:
     return (loss * weight).sum() / weight.sum().clamp(min=1)
 
 
-def overlap_loss(logits: Tensor, distance: Tensor, limit: float = 20.0) -> Tensor:
+def overlap_loss(logits: Tensor, distance: Tensor, limit: float) -> Tensor:
     """Binary cross entropy of overlap logits (B,) against `distance` (B,) <= limit, m."""
     return nn.functional.binary_cross_entropy_with_logits(logits, (distance <= limit).float())
 

@@ -74,7 +74,7 @@ class World:
         T_body_lidar = se3.make(Rotation.from_rotvec(sway * turn * (0.003, 0.004, 0)).as_matrix(), (0, 0, bounce))
         return self.pose_at(float(self.road.distance(time)), 0.0, self.road.slip_at(time), height) @ T_body_lidar
 
-    def drive_twist(self, time: float, height: float = 1.73, sway: float = 1.0) -> Array:
+    def drive_twist(self, time: float, height: float, sway: float) -> Array:
         """(6,) [rad/s, m/s] of the sensor in its own frame at a time of the drive, s."""
         before, after = (self.drive_pose(time + half, height, sway) for half in (-0.02, 0.02))
         return se3.way(before, after) / 0.04

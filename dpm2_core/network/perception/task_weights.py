@@ -19,7 +19,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def write_weights(
-    path: Path, name: str, network: Settings, state: Mapping[str, Tensor], about: dict[str, str], half: bool = False
+    path: Path, name: str, network: Settings, state: Mapping[str, Tensor], about: dict[str, str], half: bool
 ) -> None:
     """Write the tensors of the task `name` and the settings of its network; `half` stores fp16."""
     write_tensors(state, path, {**about, "task": name, "network": network.model_dump_json()}, half)

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from dpm2_core.learning.train_overlap import OVERLAP
 from dpm2_core.network.losses import (
     info_nce,
     label_distances,
@@ -95,5 +96,5 @@ def test_loss_gradients() -> None:
 def test_overlap_label_is_twenty_meters() -> None:
     """A certain and right prediction costs nothing, a certain and wrong one its logit."""
     distance = torch.tensor([20.0, 20.1])
-    assert overlap_loss(torch.tensor([9.0, -9.0]), distance).item() < 1e-3
-    assert overlap_loss(torch.tensor([-9.0, 9.0]), distance).item() == pytest.approx(9, abs=1e-3)
+    assert overlap_loss(torch.tensor([9.0, -9.0]), distance, OVERLAP).item() < 1e-3
+    assert overlap_loss(torch.tensor([-9.0, 9.0]), distance, OVERLAP).item() == pytest.approx(9, abs=1e-3)
