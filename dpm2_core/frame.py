@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 Up = tuple[float, float, float]
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
+R_AHEAD: Array = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""(3, 3) R_lidar_cam of a camera that looks along x of the LiDAR; its own axes: x right, y down, z ahead."""
 
 
 def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:

@@ -18,13 +18,13 @@ from dpm2_core.data.source import IndexedSource
 from dpm2_core.data.text import read_numbers
 from dpm2_core.data.vertical_angle import correct_vertical_angle
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Array, Camera, Frame
+from dpm2_core.frame import R_AHEAD, Array, Camera, Frame
 from dpm2_core.geometry import se3
 
 _FIELD_OF_VIEW = 72.0  # deg, across the width, of its cameras
 _PERIOD = 0.1  # s between sweeps
 # The simulated camera's axes are x forward, y left, z up; those of a `Camera` x right, y down, z forward.
-_T_BODY_OPTICAL = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+_T_BODY_OPTICAL = se3.make(R_AHEAD, np.zeros(3))
 
 
 class KittiCarlaSource(IndexedSource):

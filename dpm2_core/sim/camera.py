@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Array, Camera
+from dpm2_core.frame import R_AHEAD, Array, Camera
 from dpm2_core.geometry import se3
 from dpm2_core.sim.lens import through_lens
 from dpm2_core.sim.light import Light
@@ -32,8 +32,7 @@ REACH = 600.0
 def calibration(config: CameraConfig) -> Camera:
     """The camera on the car: looking ahead, 0.27 m ahead of and 0.08 m below the LiDAR, 0.06 m left of its middle."""
     K = np.array([[config.focal, 0, config.width / 2 - 0.5], [0, config.focal, config.height / 2 - 0.5], [0, 0, 1]])
-    axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x right, y down, z ahead
-    return Camera(K, se3.make(axes, (0.27, 0.06, -0.08)), (config.width, config.height), name="image_2")
+    return Camera(K, se3.make(R_AHEAD, (0.27, 0.06, -0.08)), (config.width, config.height), name="image_2")
 
 
 @lru_cache(maxsize=8)

@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image, PointCloud2
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.naming import IMAGE, KITTI
+from dpm2_core.frame import R_AHEAD
 from dpm2_core.geometry import se3
 from dpm2_ros.conversions import cloud_to_msg
 from test.helpers.rig import Camera, Rig, publish_static, record_frames
@@ -28,7 +29,7 @@ def with_camera(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Camera]
 
 
 PLACE = "input.T_lidar_cam:=[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]"
-AHEAD = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+AHEAD = se3.make(R_AHEAD, np.zeros(3))
 """As a matrix."""
 
 

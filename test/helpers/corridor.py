@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from dpm2_core.frame import Array, Camera, Frame, Image
+from dpm2_core.frame import R_AHEAD, Array, Camera, Frame, Image
+from dpm2_core.geometry import se3
 
 HALF, HEIGHT = 4.0, 1.8  # m: from the sensor to the walls, and to floor and ceiling
 AHEAD = 14.0  # m, the truck
-T_LIDAR_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+T_LIDAR_CAM = se3.make(R_AHEAD, np.zeros(3))
 CAMERA = Camera(np.array([[300, 0, 319.5], [0, 300, 119.5], [0, 0, 1.0]]), T_LIDAR_CAM, (640, 240))
 Paint = Callable[[Array], Array]
 

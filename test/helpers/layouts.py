@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.data.kitti import KittiSource, read_calib
+from dpm2_core.frame import R_AHEAD
 from dpm2_core.geometry import se3
 
 from .drives import first_scans
@@ -43,7 +44,7 @@ def kitti_360(recording: Path, root: Path, names: tuple[str, ...], count: int) -
     """KITTI-360 without images: drives of these numbers; the first frame has no pose, as in the original."""
     source = KittiSource(recording)
     assert source.poses is not None
-    T_lidar_cam = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.8, 0.3, -0.2])
+    T_lidar_cam = se3.make(R_AHEAD, [0.8, 0.3, -0.2])
     calibration = root / "calibration"
     calibration.mkdir(parents=True)
     (calibration / "calib_cam_to_velo.txt").write_text(_text(T_lidar_cam[:3]))

@@ -6,12 +6,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from dpm2_core.frame import Camera, Image, Points
+from dpm2_core.frame import R_AHEAD, Camera, Image, Points
 from dpm2_core.geometry import se3
 
 SIZE = (128, 416)
 K = np.array([[240.0, 0, 207.5], [0, 240.0, 63.5], [0, 0, 1]])
-T_LIDAR_CAM = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, -0.1], [0, 0, 0, 1]])
+T_LIDAR_CAM = se3.make(R_AHEAD, [0.3, 0, -0.1])
 WALL = 6.0  # m to the left
 _PER_M = 20  # pixels of the wall's paint
 _LENGTH, _LOW, _HIGH = 40.0, -2.0, 6.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpm2_core.frame import Camera, Image
+from dpm2_core.frame import R_AHEAD, Camera, Image
 from dpm2_core.geometry import se3
 
 
@@ -27,6 +27,6 @@ def boxes(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
 def make_image(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
     """A forward-looking camera with a random image, (width, height)."""
     K = np.array([[60.0, 0, size[0] / 2 - 0.5], [0, 60.0, size[1] / 2 - 0.5], [0, 0, 1]])
-    T_lidar_cam = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.3, 0.05, -0.1])
+    T_lidar_cam = se3.make(R_AHEAD, [0.3, 0.05, -0.1])
     pixels = noise.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
     return Image(pixels, Camera(K, T_lidar_cam, size))

@@ -24,7 +24,7 @@ from dpm2_core.data.ply import write_ply
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource, Span
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.frame import Camera, Fix, Frame, Image, Inertial
+from dpm2_core.frame import R_AHEAD, Camera, Fix, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
 from ...helpers.command import dpm2, succeeded
@@ -33,7 +33,6 @@ from ...helpers.full_disk import largest_file
 MakeFolder = Callable[..., Path]
 ROOT = Path(dpm2_core.__file__).resolve().parents[1]
 STAMP = 1_700_000_000_000_000_000  # ns
-_ROTATION = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def assert_same_drive(bag: BagSource, folder: KittiSource, count: int | None = None) -> None:
@@ -263,7 +262,7 @@ class OtherDrive(IndexedSource):
         self.poses = np.tile(np.eye(4), (3, 1, 1))
         self.poses[:, 0, 3] = [0, 1, np.nan]
         self.cameras = [
-            Camera(np.array([[50, 0, 20.5], [0, 51, 10], [0, 0, 1]]), se3.make(_ROTATION, [0.1, y, 0]), (40, 20),
+            Camera(np.array([[50, 0, 20.5], [0, 51, 10], [0, 0, 1]]), se3.make(R_AHEAD, [0.1, y, 0]), (40, 20),
                    distortion, name)
             for y, distortion, name in ((0.3, (-0.2, 0.1, 1e-3, 0, 0), "left"), (-0.3, tuple(range(8)), "right"))
         ]  # fmt: skip

@@ -15,11 +15,12 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.trajectory import read_trajectory
 from dpm2_core.data.velodyne import azimuth_time
 from dpm2_core.errors import UsageError
+from dpm2_core.frame import R_AHEAD
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 
 DRIVE = "2013_05_28_drive_0009_sync"
-T_LIDAR_CAM = se3.make([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.8, 0.3, -0.2])
+T_LIDAR_CAM = se3.make(R_AHEAD, [0.8, 0.3, -0.2])
 T_IMU_CAM = se3.exp([0.02, -0.01, 0.03, 1.5, 0.1, 0.4]) @ T_LIDAR_CAM
 T_RECT_CAM = se3.exp([0.01, -0.02, 0.005, 0, 0, 0])
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.projection import painted
-from dpm2_core.frame import Camera, Image, Points
+from dpm2_core.frame import R_AHEAD, Camera, Image, Points
 from dpm2_core.geometry import se3
 
 K = np.array([[100.0, 0, 80], [0, 100.0, 60], [0, 0, 1]])
 # the camera looks along the LiDAR's x
-T_LIDAR_CAM = se3.make(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), [0.0, 0.0, 0.0])
+T_LIDAR_CAM = se3.make(R_AHEAD, np.zeros(3))
 BLACK = np.zeros((120, 160, 3), np.uint8)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from dpm2_core.frame import R_AHEAD
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.geometry.se3_torch import transform
@@ -15,7 +16,7 @@ from dpm2_core.network.spatial import point_bias
 
 def _camera() -> tuple[torch.Tensor, torch.Tensor]:
     K = torch.tensor([[[70.0, 0, 62], [0, 71, 33], [0, 0, 1]]], dtype=torch.float64)
-    R = Rotation.from_euler("xyz", [0.2, -0.1, 0.3]).as_matrix() @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    R = Rotation.from_euler("xyz", [0.2, -0.1, 0.3]).as_matrix() @ R_AHEAD
     return K, torch.from_numpy(se3.make(R, [0.3, -0.2, 0.1]))[None]
 
 

@@ -12,7 +12,8 @@ from safetensors.torch import load_file
 
 from dpm2_core.data.packed import Sample, write_packed
 from dpm2_core.errors import UsageError
-from dpm2_core.frame import Camera
+from dpm2_core.frame import R_AHEAD, Camera
+from dpm2_core.geometry import se3
 from dpm2_core.learning.checkpoint import read_log
 from dpm2_core.learning.train_image import ImageDataset, ImageDataSettings, ImageTrainingSettings, shown, train_image
 from dpm2_core.learning.trainer import OptimizerSettings
@@ -77,7 +78,7 @@ def test_points_of_a_pair_are_the_same_in_the_world(settings: ImageTrainingSetti
 
 def test_shown_is_what_projects_into_the_image() -> None:
     """Ahead and inside, not behind, not beside. The camera looks along x of the LiDAR."""
-    T_lidar_cam = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+    T_lidar_cam = se3.make(R_AHEAD, np.zeros(3))
     camera = Camera(np.array([[50, 0, 50], [0, 50, 25], [0, 0, 1.0]]), T_lidar_cam, (100, 50))
     points = np.array([[10, 0, 0], [-10, 0, 0], [10, 9, 0], [10, 11, 0], [10, 0, 6]], np.float32)
     assert shown(points, camera).tolist() == [True, False, True, False, False]

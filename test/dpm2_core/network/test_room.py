@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpm2_core.frame import Camera, Frame, Image
+from dpm2_core.frame import R_AHEAD, Camera, Frame, Image
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ROOM_SCALE, is_room
 from dpm2_core.network.images import in_encoded_axes
@@ -81,8 +81,7 @@ def test_a_room_and_a_street_are_not_registered(network: DeepPointMap2) -> None:
 
 def test_a_camera_in_an_enlarged_scene_stands_farther_from_the_lidar_and_sees_the_same() -> None:
     K = np.array([[300.0, 0, 160], [0, 300, 60], [0, 0, 1]])
-    R = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    image = Image(np.zeros((120, 320, 3), np.uint8), Camera(K, se3.make(R, [0.1, -0.2, 0.3]), (320, 120)))
+    image = Image(np.zeros((120, 320, 3), np.uint8), Camera(K, se3.make(R_AHEAD, [0.1, -0.2, 0.3]), (320, 120)))
     point = np.array([3.0, 0.4, -0.2])
 
     def pixel(camera: Camera, at: np.ndarray) -> np.ndarray:
