@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpm2_core.data.trajectory import arc_lengths, read_trajectory, write_kitti
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration, isotropic
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.part import DONE
 from dpm2_core.frame import Array
@@ -28,7 +28,7 @@ from dpm2_core.slam.store.map_store import MapStore
 STEP = 5.0
 """m between two keyframes."""
 _DRIFT = np.array([0, 0, 3e-4, 0.01, 0.006, 0.0])  # of the odometry, a keyframe, rad and m
-_COVARIANCE = np.diag([1e-3] * 3 + [0.03] * 3) ** 2
+_COVARIANCE = isotropic(1e-3, 0.03)
 _TRAFFIC = 100.0  # s between two drives: by then other cars are there
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.resident import peak_mb
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown
 from dpm2_core.fleet.places import FleetIndex
 from dpm2_core.fleet.regions import LARGEST, Join, solve
@@ -34,7 +34,7 @@ DRIVES, KEYFRAMES, SHARED = 52, 100, 20
 """Drives; keyframes of each, 5 m apart; those that it has in common with the next."""
 AT_ONCE = 200
 """Drives of the map that is made at once: 20,000 keyframes."""
-_NOISE = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+_NOISE = isotropic(1e-3, 0.02)
 _POINTS = 5000  # of a cloud
 _WINDOW = 5  # additions whose median is taken
 

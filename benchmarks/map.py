@@ -23,7 +23,7 @@ from dpm2_core.console import tracked
 from dpm2_core.data.open import open_source
 from dpm2_core.database import size_with_log
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration, isotropic
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -217,7 +217,7 @@ def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Ke
         edge, T_odom_kf = None, T_world_kf
         if previous is not None:
             T = se3.inverse(world.pose_at(float(at[number - 1]))) @ T_world_kf @ se3.exp(_DRIFT)
-            edge = Registration(T, np.diag([1e-3] * 3 + [0.03] * 3) ** 2, 0.9, 0.05, "simulated")
+            edge = Registration(T, isotropic(1e-3, 0.03), 0.9, 0.05, "simulated")
             T_odom_kf = previous.T_odom_kf @ T
         previous = Keyframe(node, node * 10**8, node, T_odom_kf, scan.points[near], edge)
         yield previous, scan.moving[near]

@@ -17,7 +17,7 @@ from benchmarks.relocalise_open import open_roads
 from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.console import progress_bar
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration, isotropic
 from dpm2_core.frame import Array, Frame, Points
 from dpm2_core.geometry import se3
 from dpm2_core.network.pretrained import load_network
@@ -34,7 +34,7 @@ LATERAL = (-1.2, 3.0)
 APART = 5000.0
 """Between the roads in the map, m: the one map of all of them."""
 _NO_LOOPS = 1e9  # m between two keyframes of a loop
-_EDGE = np.diag(np.repeat([np.radians(0.15), 0.05], 3) ** 2)
+_EDGE = isotropic(np.radians(0.15), 0.05)
 
 
 @dataclass(frozen=True)

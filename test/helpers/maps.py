@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.frame import NO_POINTS, Array, Fix, Georeference, Points
 from dpm2_core.geometry import se3
 from dpm2_core.slam.settings import SlamSettings
@@ -27,7 +27,7 @@ from dpm2_core.slam.store.rows import Session
 
 SPACING = 5.0
 """m between keyframes."""
-FIRM = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+FIRM = isotropic(1e-3, 0.02)
 """(6, 6) covariance of a good odometry."""
 SESSION = Session(1, "0", "2026-01-01T00:00:00Z", "", "")
 GEOREFERENCE = Georeference(np.array([49.0, 8.4, 110.0]), se3.exp(np.array([0, 0, 1.0, 2, 3, 4])))

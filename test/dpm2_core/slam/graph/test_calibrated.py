@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpm2_core.estimates import isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph.calibrated import optimize_calibrated, scaled
@@ -31,7 +32,7 @@ def with_wrong(count: int, right: list[tuple[int, int]] = RIGHT) -> tuple[Array,
 def sphere(radians: float, laps: int = 20, lap: int = 20) -> tuple[Array, GraphData]:
     """True poses of a spiral on a sphere of 10 m radius, and its graph: each place is tied to two of the next lap."""
     rng, number = np.random.default_rng(0), np.arange(laps * lap)
-    cov = np.diag(np.repeat([radians, 0.1], 3) ** 2)
+    cov = isotropic(radians, 0.1)
     azimuth, tilt = 2 * np.pi * number / lap, np.pi * (0.8 * number / len(number) - 0.4)
     turns = se3.exp(azimuth[:, None] * np.eye(6)[2]) @ se3.exp(-tilt[:, None] * np.eye(6)[1])
     poses = turns @ se3.make(np.eye(3), [10.0, 0, 0])

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import Edge, Registration
+from dpm2_core.estimates import Edge, Registration, isotropic
 from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.slam.graph.g2o import read_g2o
@@ -21,7 +21,7 @@ from dpm2_core.slam.graph.robust import RobustSettings
 START = np.array([49.0, 8.4, 110.0])
 ANTENNA = np.array([0.5, 0.2, 1.0])
 SIGMA = 2.0
-STEP = np.diag([np.radians(0.15)] * 3 + [0.05] * 3) ** 2  # of an odometry with that sigma a step of 5 m
+STEP = isotropic(np.radians(0.15), 0.05)  # of an odometry with that sigma a step of 5 m
 Wrong = Callable[[int], Array]
 
 

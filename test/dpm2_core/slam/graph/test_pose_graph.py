@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.estimates import Edge, Registration
+from dpm2_core.estimates import Edge, Registration, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.graph import pose_graph
@@ -193,7 +193,7 @@ def test_no_process_outlives_a_killed_program() -> None:
         "from dpm2_core.slam.graph import pose_graph as p\n"
         "p.SHORT = 0\n"
         "g = p.PoseGraph(p.RobustSettings(), background=True)\n"
-        "from dpm2_core.estimates import Edge, Registration\n"
+        "from dpm2_core.estimates import Edge, Registration, isotropic\n"
         "r = Registration(np.eye(4), np.eye(6) * 1e-2)\n"
         "g.add_node(np.eye(4))\n"
         "for n in range(9): g.add_node(np.eye(4), Edge('odometry', n, n + 1, r))\n"
@@ -260,7 +260,7 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
     turn = np.linspace(0, np.pi, 12)
     truth = se3.exp(np.array([0, 0, 1.0, 20.0, 0, 0]) * turn[:, None])
     own = se3.exp(np.array([0.0, 0.0, 2.5, 300.0, -40.0, 0.0]))  # of the second robot's frame
-    sigma = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+    sigma = isotropic(1e-3, 0.02)
     graph, last = PoseGraph(RobustSettings()), {}
     for k in range(len(truth)):
         for robot, frame in enumerate((np.eye(4), own)):

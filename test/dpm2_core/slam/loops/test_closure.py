@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
@@ -40,7 +40,7 @@ from ....helpers.maps import FIRM
 from ....helpers.rooms import BOTH_ENDS, CABINET, HALL, ROUND, standing
 from ....helpers.rooms import scan as room_scan
 
-OFF = np.diag([0.01] * 3 + [0.7] * 3) ** 2
+OFF = isotropic(0.01, 0.7)
 STREET = np.arange(40.0, 105.0, 5.0)
 ONE_PART = np.zeros(100, np.intp)  # all keyframes are tied together
 

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import Edge, Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
 
-FIRM, LOST = np.diag([np.radians(0.15)] * 3 + [0.05] * 3) ** 2, np.eye(6)  # of 5 m, as keyframes have it
+FIRM, LOST = isotropic(np.radians(0.15), 0.05), np.eye(6)  # of 5 m, as keyframes have it
 
 
 def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> Array:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Keyframe, Registration, isotropic
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_core.fleet.regions import side_by_side
 from dpm2_core.frame import Array
@@ -241,7 +241,7 @@ def test_a_session_whose_odometry_breaks_before_its_first_keyframe_is_tied_loose
     """As loosely as the break says. It was tied as firmly as the robot had been found before it."""
     _, maps, _ = fleet_maps(1)
     save_as(maps["d0"], tmp_path / "map")
-    broken = Registration(np.eye(4), np.diag([1.0] * 3 + [30.0] * 3) ** 2, 0.9, 0.05, "test")
+    broken = Registration(np.eye(4), isotropic(1.0, 30.0), 0.9, 0.05, "test")
     with MapStore.open(tmp_path / "map") as store:
         mapper = make_mapper(SlamSettings.model_validate({"loops": {"enabled": False}}), store)
         mapper.start_session(np.eye(4), SIGMA)
