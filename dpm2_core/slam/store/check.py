@@ -15,7 +15,7 @@ from dpm2_core.files import explaining
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_connection import explained
 from dpm2_core.slam.store.map_data import MapData, save_as
-from dpm2_core.slam.store.map_file import copy_with_log, missing_log
+from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, missing_log
 from dpm2_core.slam.store.salvage import Findings, Salvage
 
 
@@ -35,8 +35,7 @@ def check_map(
         raise UsageError(f"{path}: no such map file")
     findings = Findings()
     with explained(path):
-        if missing := missing_log(path):
-            findings.problems.append(missing)
+        findings.problems += filter(None, (missing_log(path), foreign_log(path)))
     with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
         copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
         _copy(path, copy)
@@ -53,7 +52,7 @@ def check_map(
 def _copy(path: Path, copy: Path) -> None:
     """Copy a map with its FILE-wal; while a program writes to it, what is in it at one instant."""
     source = path.resolve()
-    if Path(f"{source}-shm").exists():
+    if Path(f"{source}-shm").exists() and not foreign_log(source):
         # A damaged file, which SQLite cannot read, is copied as it lies there.
         with suppress(sqlite3.Error), closing(connect(source, "ro")) as sql, closing(sqlite3.connect(copy)) as target:
             sql.execute("BEGIN")

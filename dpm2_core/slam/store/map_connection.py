@@ -15,7 +15,7 @@ from dpm2_core.database import Connection, connect
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import named, part_beside
 from dpm2_core.slam.store import schema
-from dpm2_core.slam.store.map_file import copy_with_log, name_map, remove_map
+from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, name_map, remove_map
 
 BUSY = 5.0
 """s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
@@ -68,13 +68,16 @@ def open_map(path: Path, read_only: bool) -> MapConnection:
     """Open a map file. Read-only, no byte of it changes.
 
     Raises:
-        UsageError: no map, or one of another version. Dpm2Error: it cannot be read, or written, or is damaged.
+        UsageError: no map, one of another version, or one with the log of another. Dpm2Error: it cannot be read, or
+            written, or is damaged.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
     with explained(path):
         if _head(path)[:15] != _HEAD:
             raise UsageError(f"{path}: not a dpm2 map")
+        if foreign := foreign_log(path):
+            raise UsageError(f"{path}: {foreign}")
         opened = _open_to_read(path) if read_only else MapConnection(_connect(path, "rw"))
         try:
             schema.check(opened.sql, path)

@@ -14,6 +14,9 @@ from dpm2_core.files import explaining
 SUFFIX = ".dpm2map"
 """Of the names of map files, where nobody asks for another."""
 
+_CLOSED, _LOGGED = 1, 2  # see `_write_version`
+_WHAT_TO_DO = "move it to where that map is, or remove it"
+
 
 def copy_with_log(path: Path, copy: Path) -> None:
     """Copy what of a map file and its FILE-wal is there, as it lies there.
@@ -22,7 +25,7 @@ def copy_with_log(path: Path, copy: Path) -> None:
         OSError: it could not be read or written.
     """
     source = path.resolve()  # SQLite names FILE-wal after the file, not after a link to it
-    for suffix in ("", "-wal"):
+    for suffix in ("",) if foreign_log(path) else ("", "-wal"):
         with suppress(FileNotFoundError):
             shutil.copyfile(f"{source}{suffix}", f"{copy}{suffix}")
 
@@ -37,11 +40,38 @@ def missing_log(path: Path) -> str:
         OSError: it could not be read.
     """
     wal = Path(f"{path.resolve()}-wal")
-    with path.open("rb") as file:
-        logged = file.read(20)[18:19] == b"\x02"  # see the SQLite file format: the write version
-    if not logged or wal.exists():
+    if _write_version(path) != _LOGGED or wal.exists():
         return ""
     return f"who wrote it was killed, and {wal.name}, where the last 4 MB or all of it may be, is not beside it"
+
+
+def foreign_log(path: Path) -> str:
+    """Why FILE-wal is not that of the map file beside it, in words; empty where nothing says so.
+
+    A map that was closed has none. So it lies there where one replaced, as a copy from before, another whose writer was
+    killed; SQLite would read the one with the pages of the other.
+
+    Raises:
+        OSError: it could not be read.
+    """
+    wal = Path(f"{path.resolve()}-wal")
+    there = _holds(wal)
+    if there and _write_version(path) == _CLOSED and _holds(wal):  # asked again: a map may be closed meanwhile
+        return f"{wal} is not of this map, which was closed, but of one that was here before; {_WHAT_TO_DO}"
+    return ""
+
+
+def _write_version(path: Path) -> int:
+    """Of the header of a database, whether it has a log: see the SQLite file format. 0 of a file that is too short."""
+    with path.open("rb") as file:
+        return int.from_bytes(file.read(19)[18:])
+
+
+def _holds(log: Path) -> bool:
+    try:
+        return log.stat().st_size > 0
+    except FileNotFoundError:
+        return False
 
 
 def move_map(source: Path, target: Path) -> None:
@@ -83,16 +113,13 @@ def check_new(path: Path) -> None:
     if path.exists():
         raise already_there(path)
     if left is not None:
-        raise UsageError(
-            f"{left}: the last keyframes of a map that was killed, moved or removed without them; move it to where "
-            "that map is, or remove it"
-        )
+        raise UsageError(f"{left}: the last keyframes of a map that was moved or removed without them; {_WHAT_TO_DO}")
 
 
 def left_log(path: Path) -> Path | None:
     """What SQLite kept beside a map file, if there is any of it."""
     logs = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-journal"))
-    return next((log for log in logs if log.exists() and log.stat().st_size), None)
+    return next(filter(_holds, logs), None)
 
 
 def already_there(path: Path) -> UsageError:

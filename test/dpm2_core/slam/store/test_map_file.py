@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -54,6 +55,35 @@ def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
     make(map_file, path)
     assert check_map(path).problems == []
     assert check_map(path).keyframes == (0 if make is begun else check_map(map_file).keyframes)
+
+
+@pytest.mark.parametrize("more", [1, 100])
+def test_a_map_that_was_copied_over_a_killed_one_is_not_read_with_its_log(
+    tmp_path: Path, map_file: Path, keyframes: list[Keyframe], more: int
+) -> None:
+    """As a backup that is put back: it had the drive that it is without, or was malformed, as with 4 MB of a log."""
+    path = tmp_path / "town.dpm2map"
+    shutil.copyfile(map_file, path)
+    with MapStore.open(path, read_only=False) as store:
+        for node in range(12, 12 + more):
+            store.write(change(node, keyframes[0]))
+        for suffix in ("-wal", "-shm"):
+            shutil.copyfile(f"{path}{suffix}", tmp_path / f"left{suffix}")
+    for suffix in ("-wal", "-shm"):
+        shutil.copyfile(tmp_path / f"left{suffix}", f"{path}{suffix}")
+    shutil.copyfile(map_file, path)
+    words = rf"{path}-wal is not of this map, .*, or remove it"
+    for read_only in (True, False):
+        with pytest.raises(UsageError, match=words):
+            MapStore.open(path, read_only)
+    found = check_map(path, recover=tmp_path / "recovered")
+    assert re.fullmatch(words, *found.problems)
+    assert (found.keyframes, check_map(tmp_path / "recovered").problems) == (12, [])
+    assert path.read_bytes() == map_file.read_bytes()
+    Path(f"{path}-wal").unlink()
+    with MapStore.open(path, read_only=False) as store:
+        assert store.size == 12
+    assert check_map(path).problems == []
 
 
 def test_where_nothing_can_be_written_that_is_said(
