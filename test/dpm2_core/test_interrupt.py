@@ -65,9 +65,11 @@ def test_sigterm_is_as_ctrl_c() -> None:
 
 
 HUNG_UP = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from dpm2_core.interrupt import interrupt_deferred, terminate_as_interrupt
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
+signal.alarm(60)
 terminate_as_interrupt()
 with interrupt_deferred() as interrupted:
     print("begun", flush=True)
