@@ -70,7 +70,7 @@ def _write_version(path: Path) -> int:
 def _holds(log: Path) -> bool:
     try:
         return log.stat().st_size > 0
-    except FileNotFoundError:
+    except OSError:  # there is none, or its map cannot be reached either, which is said of that
         return False
 
 
