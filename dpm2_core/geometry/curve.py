@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import factorial
 from typing import TypeVar
 
 import numpy as np
@@ -31,6 +32,16 @@ def poses(times: ArrayLike, motion: Array) -> Array:
         part = part * t / k
         way = way + part * derivative
     return se3.exp(way)
+
+
+def beyond(time: float, half: float, motion: Array) -> Array:
+    """As `poses` at one time (4, 4), of a motion that is known from -half to half s: before and after that steady.
+
+    Away from where it was found a polynomial is of no use: half a sweep farther one of third degree is degrees off.
+    """
+    end = float(np.clip(time, -half, half))
+    twist = np.sum([end**k / factorial(k) * derivative for k, derivative in enumerate(np.atleast_2d(motion))], 0)
+    return np.asarray(poses(end, motion) @ se3.exp((time - end) * twist))
 
 
 def fitted(turn: Callable[[Array], Array | None], half: float) -> Array | None:

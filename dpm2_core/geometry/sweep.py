@@ -76,7 +76,7 @@ class Sweep:
             return np.eye(4)
         turn = measured_turn(frame)
         R = None if turn is None or motion.ndim == 2 else turn(np.array([-self.middle]))
-        T = curve.poses(-self.middle, motion)
+        T = curve.beyond(-self.middle, self.span / 2, motion)
         return T if R is None else se3.make(R[0], T[:3, 3])
 
     def covariance(self, change: Array) -> Array:

@@ -46,6 +46,17 @@ def test_points_seen_along_a_curve_come_to_rest(motion: np.ndarray) -> None:
     np.testing.assert_allclose(cloud[:, :3], at_rest, atol=1e-3)
 
 
+@given(MOTION, st.floats(-0.05, 0.05), st.sampled_from([-1.0, 1.0]))
+def test_beyond_its_ends_a_motion_goes_on_as_it_was_there(motion: np.ndarray, time: float, side: float) -> None:
+    motion, half, h = motion * SCALE, 0.05, 1e-5
+    np.testing.assert_array_equal(curve.beyond(time, half, motion), curve.poses(time, motion))
+    at, after, far = (curve.beyond(side * t, half, motion) for t in (half, half + h, half + 0.25))
+    np.testing.assert_allclose(se3.way(at, far) * h / 0.25, se3.way(at, after), atol=1e-12)  # one twist
+    before = se3.way(curve.poses(side * (half - h), motion), at)
+    # Of the body, not of the tangent space: 0.2 rad on they are apart by a tenth.
+    np.testing.assert_allclose(se3.way(at, after), before, atol=0.15 * np.abs(before).max() + 1e-8)
+
+
 def test_points_of_one_moment_and_none() -> None:
     motion = np.array([0.1, 0, 0, 1, 0, 0])
     points, along = np.array([[1.0, 2, 3], [4, 5, 6]]), partial(curve.poses, motion=motion)
