@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C where work must not stop in the middle; SIGTERM, where that is as Ctrl-C; and a terminal that is closed."""
+"""Ctrl-C where work must not stop in the middle; SIGTERM, where that is as Ctrl-C; and a terminal that is closed, which
+is the same or, where nobody tells, no reason to stop."""
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _Handler = Callable[[int, FrameType | None], None]
 
@@ -22,20 +27,48 @@ def terminate_as_interrupt() -> None:
 
 def hang_up_as_terminated() -> None:
     """From here on a terminal that is closed, or whose connection breaks, is as one SIGTERM; what would then be written
-    there is lost. A process that ignores it, as by nohup, goes on doing so."""
+    there is lost. A process that ignores it, or is not told, as a shell's `command &` at `exit`, goes on."""
+    terminals = [stream for stream in range(3) if os.isatty(stream)]  # afterwards they no longer are
+    _outlive_terminal()
     if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
         return
-    terminals = [stream for stream in range(3) if os.isatty(stream)]  # afterwards they no longer are
 
     def hung_up(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the system sends it, and then the shell: two would not wait
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in terminals:
-            os.dup2(nowhere, stream)
-        os.close(nowhere)
+        _lead_nowhere(*terminals)
         signal.raise_signal(signal.SIGTERM)
 
     signal.signal(signal.SIGHUP, hung_up)
+
+
+class _Terminal(io.FileIO):
+    """A terminal to write to; when it is gone, what is written is lost, and no error that would end the work."""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+        _lead_nowhere(self.fileno())
+        return super().write(data)
+
+
+def _outlive_terminal() -> None:
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None or stream is not getattr(sys, f"__{name}__") or not stream.isatty():
+            continue
+        stream.flush()
+        binary = io.BufferedWriter(_Terminal(stream.fileno(), "w", closefd=False))
+        setattr(sys, name, io.TextIOWrapper(binary, stream.encoding, stream.errors, line_buffering=True))
+
+
+def _lead_nowhere(*streams: int) -> None:
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in streams:
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
 
 
 _taken: list[int] = []  # Ctrl-C since each `interrupt_deferred` began that is under way, the innermost last

@@ -18,8 +18,8 @@ from dpm2_core.slam.settings import SlamSettings
 BEAMS, COLUMNS = 64, 1024
 _HEIGHT, _REACH = 1.7, 60.0  # of the LiDAR above the ground, m
 _STEP = 1.0  # m a scan: 36 km/h at 10 Hz
-_WARM = 3
 _MOST = 60  # scans
+_WARM = 3
 """The first scans compile the loops, load the network, and find no motion yet: they do not count."""
 
 SLOW_ODOMETRY = 70.0

@@ -101,6 +101,39 @@ def test_a_terminal_that_is_closed_is_as_one_ctrl_c(tmp_path: Path) -> None:
     assert (tmp_path / "results").exists()
 
 
+OUTLIVES = """
+import sys, time
+from pathlib import Path
+from dpm2_core.console import Console, tracked
+from dpm2_core.interrupt import terminate_as_interrupt
+terminate_as_interrupt()
+Console(stderr=True).print("begun")
+while not Path("closed").exists():
+    time.sleep(0.01)
+for stream in (sys.stdout, sys.stderr):
+    print("nobody reads this", file=stream, flush=True)
+Console().print("nor this")
+list(tracked(range(3), "scans"))
+Path("results").touch()
+"""
+
+
+def test_a_program_that_is_not_told_goes_on_without_its_terminal(tmp_path: Path) -> None:
+    """As one in the background whose shell was left by `exit`: each write there is an error, by which a drive ended
+    with code 1 and without results."""
+    screen, terminal = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", OUTLIVES], cwd=tmp_path, stdin=terminal, stdout=terminal, stderr=terminal,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, start_new_session=True,
+    ) as process:  # fmt: skip
+        os.close(terminal)
+        assert os.read(screen, 100).strip() == b"begun"
+        os.close(screen)
+        (tmp_path / "closed").touch()
+        assert process.wait(60) == 0
+    assert (tmp_path / "results").exists()
+
+
 def test_under_nohup_a_terminal_that_is_closed_ends_nothing() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     terminate_as_interrupt()
