@@ -109,8 +109,8 @@ def name_map(source: Path, target: Path) -> None:
 def check_new(path: Path) -> None:
     """Raises UsageError if a map that is made there would not be new: there is a file already, or what SQLite kept
     beside one, which it would take for the new one's."""
-    left = left_log(path)  # first: of a map that another program makes now the file is there before its log
-    if path.exists():
+    there, left = path.exists(), left_log(path)  # a path that may not be entered is an error of that name
+    if there or path.exists():  # asked again: of a map that another program makes now the file is there before its log
         raise already_there(path)
     if left is not None:
         raise UsageError(f"{left}: the last keyframes of a map that was moved or removed without them; {_WHAT_TO_DO}")
