@@ -48,8 +48,7 @@ class MapFolder:
         """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds, nor what
         is left of a map that did."""
         for path in numbered(self.of_robot(requested), requested.suffix):
-            taken = path.exists() or left_log(path) is not None
-            if not taken and (self.folder is None or not (self.folder / path.stem).exists()):
+            if not _taken(path) and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
     def claimed(self, name: str, file: Path | None) -> Path:
@@ -61,7 +60,7 @@ class MapFolder:
         assert self.folder is not None
         own = file.stem if file is not None else self._of_robot(_NAME)
         for folder in numbered(self.folder / (name.removesuffix(SUFFIX) or own)):
-            if name and file_beside(folder).exists():
+            if name and _taken(file_beside(folder)):
                 continue  # another drive's map
             with suppress(FileExistsError):
                 folder.mkdir(parents=True)
@@ -80,6 +79,11 @@ class MapFolder:
 def file_beside(folder: Path) -> Path:
     """The map file that belongs to a folder of clouds."""
     return folder.with_name(f"{folder.name}{SUFFIX}")
+
+
+def _taken(file: Path) -> bool:
+    """Whether there is a map, or what SQLite kept beside one that was moved and needs it."""
+    return file.exists() or left_log(file) is not None
 
 
 def _age(path: Path) -> float:

@@ -111,6 +111,16 @@ def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
     assert log.read_bytes() == b"log"
 
 
+def test_a_copy_of_the_map_leaves_the_log_of_one_that_was_moved(tmp_path: Path) -> None:
+    """Where it was moved to it lacks its last keyframes until the log is beside it."""
+    log = tmp_path / "town.dpm2map-wal"
+    log.write_bytes(b"log")
+    active = driven(1, map_directory=str(tmp_path))
+    assert str(tmp_path / "town-2.dpm2map") in active.save("town")
+    active.close()
+    assert log.read_bytes() == b"log"
+
+
 def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
     """As `ros.map_file:=''` leaves one, or dpm2 0.1."""
     drive(tmp_path, map_file="")
