@@ -55,6 +55,9 @@ class Metrics(BaseModel):
     """What the true poses were read from: a file or a topic; None where that is not known."""
     frames: int
     """Frames of the drive."""
+    compared: int | None = None
+    """Poses that have a true one beside them: the errors are of these. Fewer than `frames` where the ground truth is
+    sampled more rarely, or is of a part of the drive; None where that is not known."""
     failed_frames: int
     """Frames without an estimate of their own: missing, or only predicted."""
     breaks: int = 0
@@ -121,6 +124,7 @@ def evaluate(
     position = _position_errors(gt[both], est[both])
     return Metrics(
         frames=len(est),
+        compared=int(both.sum()),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
         path_length_m=path_length(gt[has_gt]),
         **_kitti(segments),

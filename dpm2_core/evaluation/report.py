@@ -24,7 +24,10 @@ def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None =
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
         how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
     states = f"{metrics.failed_frames} {failed or f'failed, {metrics.breaks} breaks'}"
-    table.add_row("frames", str(metrics.frames), f"{states}; true path {_value(metrics.path_length_m, 'm')}")
+    true = f"true path {_value(metrics.path_length_m, 'm')}"
+    if metrics.compared is not None and metrics.compared < metrics.frames:
+        true += f", {metrics.compared} poses compared"
+    table.add_row("frames", str(metrics.frames), f"{states}; {true}")
     table.add_row("KITTI t_err", _value(t_err, "%"), how)
     table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")
     for part in metrics.per_length if metrics.segments else ():

@@ -16,6 +16,7 @@ from dpm2_core.data.open import open_source
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import Trajectory, interpolate, read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import Dpm2Error, UsageError
+from dpm2_core.evaluation.report import metrics_table
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Frame
 from dpm2_core.pipeline import OfflineRun
@@ -227,6 +228,16 @@ def test_the_frames_of_a_drive_are_counted_whatever_its_truth_is_sampled_at(resu
     stamps = np.array(result.recorder.stamps)
     slower = replace(result, ground_truth=Trajectory(result.poses[::5], stamps[::5], "tum"))
     assert (slower.metrics.frames, slower.metrics.failed_frames) == (len(result), result.methods["failed"])
+
+
+def test_of_how_many_poses_the_errors_are_is_said_where_not_of_all(result: Result) -> None:
+    """A truth of the first five frames, as of cameras that see a part of a hall, says nothing of the rest."""
+    stamps = np.array(result.recorder.stamps)
+    part = replace(result, ground_truth=Trajectory(result.poses[:5], stamps[:5], "tum")).metrics
+    whole = replace(result, ground_truth=Trajectory(result.poses, stamps, "tum")).metrics
+    assert (part.compared, whole.compared) == (5, len(result))
+    shown = [" ".join(metrics_table(of, "", "LiDAR").rows[0]) for of in (part, whole)]
+    assert [text.endswith("5 poses compared") for text in shown] == [True, False]
 
 
 def test_a_run_goes_on_in_its_map_file(recording: Path, tmp_path: Path) -> None:
