@@ -81,7 +81,7 @@ def quaternion(T: Array) -> Array:
     """The rotation of (..., 4, 4) as (..., 4) x, y, z, w with w >= 0."""
     w = log(T)[..., :3]
     half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
-    return np.concatenate([w * np.sinc(half / np.pi) / 2, np.cos(half)], -1)
+    return np.concatenate([w * np.sinc(half / np.pi) / 2, np.abs(np.cos(half))], -1)  # of half a turn not -1e-16
 
 
 @compiled("void(f8[:, ::1], f8[:, :, ::1])")
