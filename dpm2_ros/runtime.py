@@ -30,7 +30,6 @@ from dpm2_ros.shared_memory import free_shared_memory
 _SWITCH = 5e-4
 """s until a thread must hand Python's lock on. The odometry asks for it tens of times per frame; with the usual 5 ms a
 network in the thread of the map keeps it waiting each time."""
-_END = 20.0  # s for which ROS may take to end: it takes 0.02 s, and 2 s on a busy machine
 _SLICE = 0.05  # s after `Stop.set` within which who waits goes on
 _PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 _NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
@@ -164,13 +163,17 @@ def _spin(node: Any) -> None:
             executor.shutdown()
 
 
-def end_ros(*nodes: Any) -> None:
-    """Destroy nodes and shut ROS down. Where that does not end, the process does: it says where it was, with code 1.
+def end_ros(*nodes: Any, within: float = 20.0) -> None:
+    """Destroy nodes and shut ROS down.
 
     Before Fast DDS deletes a participant it waits until none of its listeners runs. Built for a glibc before 2.30, as
     in the wheels, that wait (`DomainParticipantImpl::set_listener`) computes a time that has overflowed, spins, and
     keeps the lock without which a listener cannot end: of 80 times that five nodes were stopped together one left a
     process that never ended. Here the listeners come first, so that there is none to wait for.
+
+    Args:
+        within: s, after which the process ends with exit code 1 and says where it was. It takes 0.02 s, and 2 s on a
+            busy machine.
     """
     import rclpy
 
@@ -179,7 +182,7 @@ def end_ros(*nodes: Any) -> None:
             node.destroy_node()
         rclpy.try_shutdown()
 
-    faulthandler.dump_traceback_later(_END, exit=True, file=2)  # standard error, whatever sys.stderr is
+    faulthandler.dump_traceback_later(within, exit=True, file=2)  # standard error, whatever sys.stderr is
     try:
         with _on_one_processor(), ThreadPoolExecutor(1, initializer=lower_priority) as thread:
             thread.submit(end).result()

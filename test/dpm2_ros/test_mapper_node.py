@@ -108,6 +108,7 @@ def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(mapper: Any) -> None:
     """Once, by the one that publishes it, as by the export: a robot on the next floor went by the walls of both."""
     log, grids = mapper.hear(Log, "/rosout"), mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE)
+    mapper.wait(lambda: mapper.found_by(mapper.mapper, "/rosout"), "the subscription to the log")
 
     def said() -> list[str]:
         return [message.msg for message in log if message.msg.startswith("dpm2/grid: ")]

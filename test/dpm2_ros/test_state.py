@@ -24,6 +24,7 @@ def result(state: State, reason: str, breaks: int = 0) -> OdometryResult:
 def test_lost_and_broken_are_logged_once_with_the_reason(ros: Callable[..., Any]) -> None:
     harness = ros()
     log, states = harness.hear(Log, "/rosout"), harness.hear(String, "/dpm2/state", LAST_ONE)
+    harness.wait(lambda: harness.found_by(harness.node, "/rosout"), "the subscription to the log")
     publisher = StatePublisher(harness.node)
     drive = [
         (State.TRACKING, "", 0),
