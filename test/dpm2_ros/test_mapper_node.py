@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -14,7 +15,6 @@ import numpy as np
 import pytest
 import rclpy
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rcl_interfaces.msg import Log
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 from std_srvs.srv import Trigger
@@ -105,13 +105,15 @@ def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[
         harness.remove(harness.mapper)
 
 
-def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(mapper: Any) -> None:
+def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
+    mapper: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Once, by the one that publishes it, as by the export: a robot on the next floor went by the walls of both."""
-    log, grids = mapper.hear(Log, "/rosout"), mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE)
-    mapper.wait(lambda: mapper.found_by(mapper.mapper, "/rosout"), "the subscription to the log")
+    grids, log = mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE), list[str]()
 
     def said() -> list[str]:
-        return [message.msg for message in log if message.msg.startswith("dpm2/grid: ")]
+        log.append(capfd.readouterr().err)
+        return re.findall(r"\[WARN\] .*: (dpm2/grid: .*)", "".join(log))
 
     for n, height in enumerate((0.0, 0.0, 2.8, 2.8)):
         before = len(grids)
