@@ -49,6 +49,11 @@ class SegmentErrors:
         return (float(self.t_err.mean()), float(self.r_err.mean())) if len(self) else None
 
 
+def in_words(lengths: Sequence[float]) -> str:
+    """Segment lengths, m, for people."""
+    return f"{', '.join(f'{length:g}' for length in lengths)} m"
+
+
 def segment_errors(
     gt: Array, est: Array, lengths: Sequence[float] = OFFICIAL_LENGTHS, stamps: Keys | None = None
 ) -> SegmentErrors:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, in_words
 from dpm2_core.evaluation.metrics import Metrics
 from dpm2_core.tables import FigureTable
 
@@ -19,10 +19,9 @@ def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None =
     t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
     how = f"the path is shorter than {min(metrics.lengths_m):g} m; `dpm2 eval --lengths` takes shorter ones"
     if t_err is not None and r_err is not None:
-        lengths = ", ".join(f"{length:g}" for length in metrics.lengths_m)
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
-        how = f"{metrics.segments} segments of {lengths} m from {start}, unaligned; {devkit}"
+        how = f"{metrics.segments} segments of {in_words(metrics.lengths_m)} from {start}, unaligned; {devkit}"
     states = f"{metrics.failed_frames} {failed or f'failed, {metrics.breaks} breaks'}"
     true = f"true path {_value(metrics.path_length_m, 'm')}"
     if metrics.compared is not None and metrics.compared < metrics.frames:

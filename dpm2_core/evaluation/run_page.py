@@ -13,7 +13,7 @@ import numpy as np
 
 from dpm2_core.data.trajectory import matched
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, in_words, known
 from dpm2_core.evaluation.metrics import align
 from dpm2_core.evaluation.page import asset, escape, page
 from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
@@ -164,7 +164,7 @@ def _lengths(run: RunFolder) -> tuple[float, ...]:
 
 
 def _of(lengths: Sequence[float]) -> str:
-    return "" if lengths == OFFICIAL_LENGTHS else f" of {', '.join(f'{length:g}' for length in lengths)} m"
+    return "" if lengths == OFFICIAL_LENGTHS else f" of {in_words(lengths)}"
 
 
 def _table(table: FigureTable) -> str:

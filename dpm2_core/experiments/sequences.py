@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dpm2_core.errors import UsageError
-from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, in_words
 from dpm2_core.experiments.request import Request
 from dpm2_core.experiments.slam_part import GIVEN, OWN, PEER, drive_content, has_sequence
 from dpm2_core.experiments.table import ResultTable
@@ -57,9 +57,7 @@ def paper_notes(request: Request, found: Sequence[str], paper: Sequence[str]) ->
 
 def segments(request: Request) -> str:
     """What the KITTI metric of a table is the mean over, for its caption."""
-    if request.lengths is None:
-        return "all segments"
-    return f"all segments of {', '.join(f'{length:g}' for length in request.lengths)} m"
+    return "all segments" if request.lengths is None else f"all segments of {in_words(request.lengths)}"
 
 
 def learned_note(learned: Sequence[str], tested: Sequence[str]) -> list[str]:

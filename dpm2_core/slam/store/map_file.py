@@ -12,7 +12,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import explaining
 
 SUFFIX = ".dpm2map"
-"""Of the names of map files, where nobody asks for another."""
+"""Of the name of a map file, unless another one is given."""
 
 _CLOSED, _LOGGED = 1, 2  # see `_write_version`
 _WHAT_TO_DO = "move it to where that map is, or remove it"
