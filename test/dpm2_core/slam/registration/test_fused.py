@@ -196,11 +196,13 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
 @pytest.mark.parametrize(("off", "method"), [([0.05, 0.02], "refined"), ([0.6, 0.2], "geometric")])
 @pytest.mark.parametrize("known", [0.01, 4.0])
 def test_where_two_disagree_the_likelier_is_taken(case: Case, off: list[float], method: str, known: float) -> None:
-    """Points that start 12 m off fit somewhere, but not as well as from the network's pose; also where it is 0.6 m off
+    """Points that start 9 m off fit somewhere, but not as well as from the network's pose; also where it is 0.6 m off
     and sure of it, and whether the motion so far is thought to be known to 10 m or to 0.5 m."""
-    start = case.truth @ se3.exp([0, 0, 0, 12, 0, 0])
+    start = case.truth @ se3.exp([0, 0, 0, 9, 0, 0])
     case.prediction = Prediction([start], widen=2.0, information=known * np.eye(6))
-    assert case.register([0, 0, 0, 0, 0, 0], size=0)[1] > 5
+    somewhere, error = case.register([0, 0, 0, 0, 0, 0], size=0)
+    assert somewhere.ok
+    assert error > 5
     result, error = case.register([0, 0, 0, *off, 0], size=1)
     assert (result.ok, result.method) == (True, method)
     assert error < 0.02
