@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import subprocess
 import sys
@@ -131,6 +132,13 @@ def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bags") / "drive"
     convert(KittiSource(sequence), out)
     return out
+
+
+@pytest.fixture
+def no_earlier_nodes() -> None:
+    """For those that hear /rosout: ROS ends it for all nodes of a name as soon as one of them goes, and what an earlier
+    test has left goes when Python finds it."""
+    gc.collect()
 
 
 @pytest.fixture

@@ -34,6 +34,7 @@ def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
     assert r.node.count_publishers("/tf") == 0
 
 
+@pytest.mark.usefixtures("no_earlier_nodes")
 def test_two_publishers_that_place_the_lidar_otherwise_are_told(rig: Callable[..., Rig]) -> None:
     """As a robot's description and a calibration: before the first cloud the place was that of whichever came last, and
     with it the pose of the base, without a word."""

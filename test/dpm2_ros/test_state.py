@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from rcl_interfaces.msg import Log
 from rclpy.logging import LoggingSeverity
 from std_msgs.msg import String
@@ -21,6 +22,7 @@ def result(state: State, reason: str, breaks: int = 0) -> OdometryResult:
     return OdometryResult(0, 0, np.eye(4), np.eye(6), np.zeros(6), state, registration, breaks=breaks)
 
 
+@pytest.mark.usefixtures("no_earlier_nodes")
 def test_lost_and_broken_are_logged_once_with_the_reason(ros: Callable[..., Any]) -> None:
     harness = ros()
     log, states = harness.hear(Log, "/rosout"), harness.hear(String, "/dpm2/state", LAST_ONE)
