@@ -18,7 +18,7 @@ JOBS ?= -n 3 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup ros demo test test-long test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup ros demo test test-long test-oldest test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -44,6 +44,14 @@ test: setup  ## all tests but the long ones, and which of them took longest
 
 test-long: setup  ## those that train, measure or drive at length: before a release, and after a change of what they are about
 	$(BIN)/python -m pytest $(JOBS) --durations=15 -m long $(ARGS)
+
+OLDEST := out/oldest
+test-oldest: setup  ## `make test` in an environment of its own, with the oldest packages that setup.py allows
+	$(call with,release,uv)
+	$(BIN)/uv venv -q --clear --python $(BIN)/python $(OLDEST)
+	$(BIN)/uv pip install -q --python $(OLDEST)/bin/python --resolution lowest-direct -e '.[plot,sim,test,fleet]'
+	@$(OLDEST)/bin/python -m dpm2_ros.build_tf2_msgs
+	NUMBA_CACHE_DIR=$(abspath $(OLDEST))/numba $(OLDEST)/bin/python -m pytest $(JOBS) -m "not long" $(ARGS)
 
 # As many processes as processors: nothing in these tests waits.
 test-fast: setup  ## all but the tests marked slow or ros

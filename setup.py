@@ -14,7 +14,7 @@ EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 
 REQUIREMENTS = [
     "numpy>=1.26,<3",  # every array
-    "scipy>=1.11,<2",  # rotations, nearest neighbors
+    "scipy>=1.11.4,<2",  # rotations, nearest neighbors; parts of a graph, which 1.11.2 gets wrong without an error
     "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "numba>=0.61,<1",  # loops over points as machine code: scan registration, sampling
@@ -43,7 +43,7 @@ EXTRAS = {
         "contourpy>=1.2,<2",  # lines along the kerbs
     ],
     "test": [
-        "import-linter>=2.1,<3",
+        "import-linter>=2.6,<3",
         "pytest>=9,<10",
         "pytest-timeout>=2.3,<3",
         "pytest-xdist>=3.6,<4",
@@ -55,7 +55,7 @@ EXTRAS = {
         "py_trees>=2.2,<3",  # examples/relocalise_action.py
     ],
     "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.27,<2"],  # make docs
-    "lint": ["ruff>=0.9,<0.18", "mypy>=2,<3", "types-PyYAML", "import-linter>=2.1,<3", "grimp>=3.2,<4"],
+    "lint": ["ruff>=0.9,<0.18", "mypy>=2,<3", "types-PyYAML", "import-linter>=2.6,<3", "grimp>=3.2,<4"],
     "release": [
         "build>=1.2,<2",
         "twine>=5,<8",
