@@ -188,8 +188,8 @@ class Result:
             cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
-            Dpm2Error: a file could not be written; the old one survives. UsageError: no folder can be made there, or,
-                when all other files are written, see `metrics`.
+            Dpm2Error: a file could not be written; the old one survives, and what is smaller is written before. UsageError:
+                no folder can be made there, or, when all other files are written, see `metrics`.
         """
         out = Path(out)
         make_folder(out)
@@ -197,22 +197,24 @@ class Result:
         save_config(self.config, out)
         write_kitti(out / POSES, self.sensor_poses)
         write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
-        points = self.mapper.cloud() if cloud else None
-        if points is None:
-            remove_results(out, CLOUD)
-        else:
-            write_ply(out / CLOUD, points)
         self.mapper.graph.write_g2o(out / GRAPH)
         keys = zip(self.recorder.index, self.recorder.stamps, self.frame_states, self.frame_methods, strict=True)
         write_frames(out / FRAMES, list(keys), self.seconds)
         write_loops(out / LOOPS, self.mapper.loops, self.mapper.poses)
         write_json(out / TIMING, self.timing)
-        missing = self._draw(out / PICTURE, points)
-        if self.metrics is not None:
-            write_json(out / METRICS, self.metrics.model_dump())
-            assert self.ground_truth is not None
-            write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
-                                                     self.source.T_cam_lidar))  # fmt: skip
+        try:
+            if self.metrics is not None:
+                write_json(out / METRICS, self.metrics.model_dump())
+                assert self.ground_truth is not None
+                write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
+                                                         self.source.T_cam_lidar))  # fmt: skip
+        finally:  # the largest last: where it does not fit on the disk, the figures of the run are there
+            points = self.mapper.cloud() if cloud else None
+            if points is None:
+                remove_results(out, CLOUD)
+            else:
+                write_ply(out / CLOUD, points)
+            missing = self._draw(out / PICTURE, points)
         return missing
 
     def _draw(self, path: Path, points: Points | None) -> list[str]:

@@ -211,6 +211,11 @@ def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     assert "map.ply" in done.stderr
     assert (out / "map.ply").read_bytes() == before
     assert not [path for path in out.iterdir() if path.suffix == ".part"]
+    # Beside the new trajectory, too, not those of the run before.
+    frames = len(read_trajectory(out / "trajectory_kitti.txt"))
+    assert frames == json.loads((out / "timing.json").read_text())["frames"] == FRAMES
+    assert json.loads((out / "metrics.json").read_text())["frames"] == FRAMES
+    assert len((out / "frames.csv").read_text().splitlines()) == 1 + FRAMES
 
 
 def test_a_run_that_is_killed_leaves_results_and_settings_of_the_one_before(sequence: Path, tmp_path: Path) -> None:
