@@ -188,8 +188,8 @@ class Result:
             cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
-            Dpm2Error: a file could not be written; the old one survives, and what is smaller is written before. UsageError:
-                no folder can be made there, or, when all other files are written, see `metrics`.
+            Dpm2Error: a file could not be written; the old one survives, and map.ply comes after the figures.
+            UsageError: no folder can be made there, or, when all other files are written, see `metrics`.
         """
         out = Path(out)
         make_folder(out)

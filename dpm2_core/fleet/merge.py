@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.files import part_beside, write_json
+from dpm2_core.files import named, part_beside, write_json
 from dpm2_core.fleet.cluster import Cluster
 from dpm2_core.fleet.drives import MAP
 from dpm2_core.fleet.growth import Growth, Standing, add_drives, grown, joins_of
@@ -29,7 +29,7 @@ from dpm2_core.fleet.run import View
 from dpm2_core.fleet.search import Search, affirmed, component
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import MapData, load_map
-from dpm2_core.slam.store.map_file import move_map, remove_map
+from dpm2_core.slam.store.map_file import check_new, move_map, remove_map
 from dpm2_core.slam.store.map_store import MapStore
 
 
@@ -64,7 +64,8 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         cluster: not entered yet. largest: keyframes of a region of the pose graph.
 
     Raises:
-        UsageError: a file is there that is no merge of drives or holds more than these, or there is no drive.
+        UsageError: a file is there that is no merge of drives or holds more than these, or the log of a map that was
+            moved; or there is no drive.
         Dpm2Error: nothing can be joined, or the map that is there is damaged.
         KeyboardInterrupt: it was stopped before all drives were looked at; the map stays as it is.
     """
@@ -103,6 +104,7 @@ def _record(out: Path, folder: Path) -> Merged | None:
     except (OSError, ValueError):
         merged = None
     if not out.exists():
+        check_new(out)  # what is left of another map, moved without its log, is not ours to remove
         return merged
     if merged is None:
         raise UsageError(f"{out}: there is a file already, which is no merge of drives")
@@ -186,7 +188,7 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
         moved = {name: replace(maps[name], poses=region.poses[name]) for name in together}
         fresh = part_beside(out)
         try:
-            with MapStore.create(fresh) as store:
+            with named(out, fresh), MapStore.create(fresh) as store:
                 add_drives(store, {}, Growth(moved, enough), refused)
             if not _beside(out).exists():  # a map without any would be taken for another program's, if this ends here
                 write_json(_beside(out), asdict(Merged({}, {})))

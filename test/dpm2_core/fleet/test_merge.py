@@ -131,6 +131,8 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
     monkeypatch.setattr(Found, "version", 2)  # all drives are others by now
     with largest_file(size - 300_000), pytest.raises(Dpm2Error, match=r"town: not written: .*is the disk full"):
         merge(tmp_path, out, SlamSettings(), nullcontext())
+    with largest_file(size // 4), pytest.raises(Dpm2Error, match="/town: "):  # not the hidden file in which it is made
+        merge(tmp_path, out, SlamSettings(), nullcontext())
     assert check_map(out) == before
     assert (before.keyframes, before.problems) == (180, [])
     assert sorted(os.listdir(out.parent)) == ["town", "town.json"]
@@ -192,6 +194,17 @@ def test_a_drive_that_was_added_to_a_merge_is_not_lost(
     with pytest.raises(UsageError, match=f"town: 5 of its keyframes are of no drive of {tmp_path}; give another --out"):
         merge(tmp_path, out, SlamSettings(), nullcontext())
     assert out.read_bytes() == before
+
+
+def test_a_log_that_a_map_was_moved_without_is_not_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a drive that was killed: the last keyframes of the moved map were gone with it."""
+    out = _fleet(tmp_path, monkeypatch)
+    log = out.with_name(f"{out.name}-wal")
+    log.write_bytes(bytes(5000))
+    with pytest.raises(UsageError, match="town-wal: the last keyframes of a map that was moved"):
+        merge(tmp_path, out, SlamSettings(), nullcontext())
+    assert log.read_bytes() == bytes(5000)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("drives", ['["a"]', '{"a": "x"}', "{"])
