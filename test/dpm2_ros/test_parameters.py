@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -220,3 +221,14 @@ def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(load: Lo
         7,
     )
     assert node.get_parameter("slam.neural.solver").value == "confident"
+
+
+def test_the_parameter_file_of_the_page_sets_what_it_names(load: Load, tmp_path: Path) -> None:
+    """As a reader copies it from docs/ros2.md."""
+    (block,) = re.findall(r"^```yaml\n(/\*\*:.*?)^```$", (DOCS.parent / "ros2.md").read_text(), re.M | re.S)
+    file = tmp_path / "red.yaml"
+    file.write_text(block)
+    config = load(params_file=file)[0]
+    assert (config.input.points_topic, config.input.imu_topic) == ("ouster/points", "ouster/imu")
+    assert config.slam.keyframes.distance == 2.0
+    assert (config.ros.base_frame, config.ros.map_directory) == ("base_link", "/home/robot/maps")

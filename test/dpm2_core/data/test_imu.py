@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,37 @@ def test_without_its_place_it_is_left_out_and_said(bags: Any, tmp_path: Path) ->
     assert all(frame.imu is not None for frame in own.frames())  # in the LiDAR's own frame
     with pytest.raises(ValueError, match="no unit quaternion"):
         InputSettings(q_lidar_imu=(0, 0, 0, 2))
+
+
+PAGES = Path(__file__).resolve().parents[3] / "docs"
+OUSTER = {
+    "how_to.md": r"/ouster/imu --set input\.q_lidar_imu=\[(.*?)\]",
+    "ros2.md": r"\| `/ouster/imu` \| .*? without that, as in many a bag, `\[(.*?)\]`",
+}
+
+
+@pytest.mark.parametrize("page", OUSTER)
+def test_the_rotation_that_a_page_gives_for_an_ouster_is_its_own(bags: Any, tmp_path: Path, page: str) -> None:
+    """Of the design values in its metadata: clouds are in os_lidar, turned by 180 degrees against the housing, to which
+    its IMU is parallel. A page had none instead: turns were right, forces reversed."""
+    lidar_to_sensor, imu_to_sensor = np.diag([-1.0, -1, 1]), np.eye(3)
+    messages = drive(bags, frame="os_imu", forces=(1.0, 0.5, 9.8))
+    for _, topic, message in messages:
+        if topic == POINTS:
+            message.header.frame_id = "os_lidar"
+    places = [
+        (0.5, "/tf_static", bags.transform("os_sensor", "os_lidar", (0, 0, 0.036), lidar_to_sensor)),
+        (0.5, "/tf_static", bags.transform("os_sensor", "os_imu", (0.006, -0.012, 0.008), imu_to_sensor)),
+    ]
+    (said,) = re.findall(OUSTER[page], (PAGES / page).read_text())
+    x, y, z, w = (float(number) for number in said.split(","))
+    given = InputSettings(q_lidar_imu=(x, y, z, w))
+    driver = next(BagSource(bags.write(tmp_path / "driver", [*places, *messages])).frames()).imu
+    bare = next(BagSource(bags.write(tmp_path / "bare", messages), given).frames()).imu
+    assert driver is not None
+    assert bare is not None
+    np.testing.assert_allclose(bare.forces, driver.forces, atol=1e-9)
+    np.testing.assert_allclose(bare.rates, driver.rates, atol=1e-9)
 
 
 def test_two_frames_without_a_name_are_not_one(bags: Any, tmp_path: Path) -> None:
