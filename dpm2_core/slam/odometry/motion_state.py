@@ -24,6 +24,7 @@ that of sound ones, the map took over a bias, a scale or a delay turn by turn: 7
 ANY_VELOCITY = 15.0**2 * np.eye(3)
 """Covariance (3, 3) of the velocity, m/s, until two scans are registered."""
 
+_ACCELERATION = 40.0  # m/s2 off the predicted motion, beside 0.5 m: more is no vehicle's
 _RIDE = 3.0  # s: no lift comes to another storey sooner, and a crowd or a narrow place is passed
 _UP, _ASIDE = 30.0, 2.0  # m, standard deviations of the way that what encloses the LiDAR may have moved along
 
@@ -172,7 +173,7 @@ class MotionState:
         time = self.seconds + dt
         meters, degrees = se3.apart(T_predicted, result.T_target_source)
         unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
-        if result.ok and meters > 0.5 + unknown + self.settings.max_acceleration * time * time:
+        if result.ok and meters > 0.5 + unknown + _ACCELERATION * time * time:
             return result.rejected(f"{meters:.1f} m from the prediction")
         if result.ok and degrees > 3 + self.settings.max_turn * time:
             return result.rejected(f"{degrees:.0f} deg from the prediction")

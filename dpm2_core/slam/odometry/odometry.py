@@ -30,6 +30,8 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, f
 _ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
 _CARRIED = "broken by what enclosed the LiDAR: it may have moved along, as a lift does"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
+_LOST = 5  # frames without a registration, after which the state is `lost`, `degraded` before
+_TRIES = 10  # frames after a pause that are registered to the map before it, before the odometry counts as broken
 _BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
 
 
@@ -244,7 +246,7 @@ class Odometry:
             self._registration.update(scan, motion.T)
             return result
         motion.covariance = bridge.covariance(motion.T) + own.covariance
-        if bridge.tries >= self._settings.restart_after and motion.twist is not None:
+        if bridge.tries >= _TRIES and motion.twist is not None:
             self._bridge, self._failures = None, 0
             self._break(loops=True)
             return replace(own, reason=f"broken by a pause: {result.reason}")
@@ -327,7 +329,7 @@ class Odometry:
         self._registration.update(match.scan, motion.T)
 
     def _state(self, registration: Registration, enclosed: bool) -> State:
-        if self._failures >= self._settings.lost_after:
+        if self._failures >= _LOST:
             return State.LOST
         if self._motion.twist is None and self._bridge is None:
             return State.INITIALIZING

@@ -11,10 +11,8 @@ from dpm2_core.config import Settings
 class OdometrySettings(Settings):
     """When to accept a registration, and what to do when there is none."""
 
-    max_acceleration: float = Field(40.0, ge=0)
-    """A registration that differs from the prediction by more than this allows is rejected, m/s2 (0.5 m are free)."""
     max_turn: float = Field(200.0, ge=0)
-    """The same for rotation, deg/s of difference from the predicted rate (3 deg are free)."""
+    """A registration that turns by more than this off the predicted rate is rejected, deg/s (3 deg are free)."""
     turns: float = Field(0.0, ge=0, le=180)
     """A scan that does not fit is looked for at other headings as well, up to so many degrees to both sides: robots
     that turn on the spot; 0: not."""
@@ -24,11 +22,6 @@ class OdometrySettings(Settings):
     degraded_sigma: float = Field(0.08, gt=0)
     """Standard deviation of the position in its worst direction above which that direction counts as open, m: images
     and intensities are asked (`visual`), and where they do not know either, the state is `degraded`."""
-    lost_after: int = Field(5, ge=1)
-    """Frames without a registration until the state is `lost`; `degraded` before."""
-    restart_after: int = Field(10, ge=1)
-    """Frames after a pause that are registered to the map before it, until the odometry counts as broken: a new stretch
-    then goes on from the predicted pose, with the uncertainty that the pause deserves."""
     pause: float = Field(0.65, ge=0)
     """Seconds without a registration after which one scan alone is no longer accepted; in a stream of fewer frames
     per second 1.5 of its periods, and 2 s where a node has left clouds out for want of time."""
