@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
 _SEEN = 40.0  # m, between two keyframes that see the same at most; rooms are enlarged
+_DRIFT = 0.01  # m per m of path, by which the odometry may err: a place near by the pose is farther by so much
 _MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
 
 
@@ -55,9 +56,7 @@ class LoopSettings(Settings):
     """What accepts a candidate of the network: the points and a second loop; or, as in the paper, its overlap head
     alone, which then also chooses the best of the candidates."""
     radius: float = Field(8.0, ge=0)
-    """The keyframe nearest by the pose is a candidate, too, if nearer than this, m; `drift` widens it."""
-    drift: float = Field(0.01, ge=0)
-    """Widens the radius by so many meters per meter of path since that keyframe."""
+    """The keyframe nearest by the pose is a candidate, too, if nearer than this, m, and 1 % of the path since."""
     surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate along the path make up the map to register to, m."""
     consistency: ConsistencySettings = ConsistencySettings()
@@ -188,7 +187,7 @@ class LoopCloser:
     def _nearest(self, since: Array, distance: Array) -> int | None:
         """The keyframe nearest by the pose, if it is near enough for the drift since then."""
         s = self._settings
-        near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + s.drift * since))
+        near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + _DRIFT * since))
         return int(near[np.argmin(distance[near])]) if len(near) else None
 
     def _verified(self, proposal: Edge, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Edge:

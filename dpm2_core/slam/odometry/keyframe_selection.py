@@ -19,11 +19,12 @@ from dpm2_core.slam.registration.spacing import Spacing
 
 _SAME = np.eye(4)
 _TRACE = 30  # frames that a fix may be older than the one that it comes with
+_DRIFT, _DRIFT_RAD = 0.01, np.radians(0.03)  # m and rad per m of motion, standard deviations beside the registration's
 _FAR = 1e5  # m: farther off than so no way is
 
 
 class KeyframeSettings(Settings):
-    """Spacing of keyframes and the drift that is assumed between them."""
+    """Spacing of keyframes, and what they keep of their scans."""
 
     distance: float = Field(5.0, ge=0)
     """Motion after which a scan becomes a keyframe, m."""
@@ -36,10 +37,6 @@ class KeyframeSettings(Settings):
     """Spacing of the points of a keyframe, m."""
     range: float = Field(60.0, gt=0)
     """Points farther than this do not enter the map, m."""
-    drift_translation: float = Field(0.01, gt=0)
-    """Standard deviation of the odometry per meter of motion, m: the stiffness of odometry edges in the pose graph."""
-    drift_rotation: float = Field(0.03, gt=0)
-    """The same for rotation, degrees per meter."""
 
 
 class KeyframeSelector:
@@ -114,7 +111,7 @@ class KeyframeSelector:
                 return None
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
             way = max(se3.magnitude(T_last_this)[0], 1.0)
-            drift = isotropic(np.radians(s.drift_rotation) * way, s.drift_translation * way)
+            drift = isotropic(_DRIFT_RAD * way, _DRIFT * way)
             covariance = self._weakest.covariance + drift + self._uncertainty
             covariance[3:, 3:] += self._left_open @ self._left_open
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
