@@ -135,7 +135,7 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
         lambda i: mapper.thumbnail(nodes[i]),
     )
     relocalizer = Relocalizer(s.relocalise, s.visual, _verifiers(s), _network(s), known)
-    return Localizer(relocalizer, s.relocalise.max_failures)
+    return Localizer(relocalizer)
 
 
 def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
@@ -151,7 +151,7 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
         return Relocalizer(s.relocalise, s.visual, verifiers, network, known)
 
     relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).descriptors)
-    return Localizer(relocalizer, s.relocalise.max_failures)
+    return Localizer(relocalizer)
 
 
 def _verifiers(s: SlamSettings) -> ByScale[Verifier]:

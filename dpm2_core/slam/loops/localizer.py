@@ -18,6 +18,7 @@ from dpm2_core.slam.loops.verification import looks_elsewhere
 LOST = isotropic(1.0, 100.0)
 """Covariance of an uninformative prior."""
 _PATIENCE = 1_000_000_000  # ns
+_FAILURES = 3  # keyframes in a row that do not fit the map where they are thought to be: then one is lost
 _MOVED = 1.0  # m: nearer to each other, scans show the same
 
 
@@ -51,9 +52,8 @@ class Localizer:
         found: id of the last keyframe that was found in the map; None before the first.
     """
 
-    def __init__(self, relocalizer: FindsPlaces, max_failures: int = 3) -> None:
+    def __init__(self, relocalizer: FindsPlaces) -> None:
         self._relocalizer = relocalizer
-        self._max_failures = max_failures
         self._hint: Array | None = None
         self.restart()
 
@@ -151,7 +151,7 @@ class Localizer:
         moved = float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - T_odom_other[:3, 3])) >= _MOVED
         if not again or moved:
             self._far = result.T_target_source @ se3.inverse(keyframe.T_odom_kf), keyframe.T_odom_kf
-        return again and (self._failures >= self._max_failures if self._state.located else moved)
+        return again and (self._failures >= _FAILURES if self._state.located else moved)
 
     def _says_same(self, T_map_lidar: Array, result: Registration) -> bool:
         """Whether a result is no farther from a pose (4, 4) than the odometry may drift since the map confirmed it."""
@@ -161,7 +161,7 @@ class Localizer:
     def _doubt(self) -> None:
         """Its place, where it has one, is that of the odometry alone."""
         if self._state.located:
-            self._state = State.LOST if self._failures >= self._max_failures else State.DEGRADED
+            self._state = State.LOST if self._failures >= _FAILURES else State.DEGRADED
 
     def _located(self, keyframe: Keyframe, result: Registration, state: State) -> LocalizationResult:
         self.T_map_odom = se3.orthonormalized(result.T_target_source @ se3.inverse(keyframe.T_odom_kf))

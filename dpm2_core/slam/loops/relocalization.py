@@ -34,6 +34,9 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 HEIGHT = 4.0
 """m that a meter of height counts for between two places: 3 m up, on the next storey, one sees other things."""
+CANDIDATES = 6
+"""Keyframes that look like the scan, which the network registers and the points verify."""
+_PICTURED = 150  # keyframes, no two next to each other, whose pictures are compared where the points leave the way open
 _KEYFRAMES = 9  # make up the map around a place, at most
 _REACH = 1.0  # m, along the road around a place that a picture has found
 
@@ -41,19 +44,11 @@ _REACH = 1.0  # m, along the road around a place that a picture has found
 class RelocalizationSettings(Settings):
     """Finding oneself in a map."""
 
-    candidates: int = Field(6, ge=1)
-    """So many keyframes that look like the scan are registered by the network, and all resulting places verified by the
-    points: the best must be clearly better than the others."""
-    pictured: int = Field(150, ge=0)
-    """Where they do not say how far along a road one is: so many keyframes, no two of them next to each other, are
-    compared by their pictures."""
     surroundings: float = Field(22.0, gt=0)
     """Keyframes so near to a candidate make up the map to register to, m; a meter of height counts for four;
     of more than nine the nearest."""
     hint_radius: float = Field(20.0, gt=0)
     """With a hint, keyframes farther from it than this are no candidates, m."""
-    max_failures: int = Field(3, ge=1)
-    """Keyframes in a row that do not fit the map where they are thought to be, after which one is lost."""
 
 
 class FindsPlaces(Protocol):
@@ -108,7 +103,7 @@ class Relocalizer:
         texture = self._pictures.texture(keyframe)
         if found.ok or texture is None:
             return found
-        nodes = self._places.similar(descriptors, allowed, self._settings.pictured)
+        nodes = self._places.similar(descriptors, allowed, _PICTURED)
         verifier, T_across = self._verifiers.suited_to(cloud), self._across(places)
         place = self._pictures.find(cloud, texture, nodes, verifier, T_across)
         if place is None:
@@ -141,7 +136,7 @@ class Relocalizer:
 
     def _by_points(self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]) -> list[Registration]:
         """The places that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
-        nodes = self._places.similar(descriptors, allowed, self._settings.candidates)
+        nodes = self._places.similar(descriptors, allowed, CANDIDATES)
         return [self._verified(cloud, proposal.T_target_source) for proposal in self._proposals(descriptors, nodes)]
 
     def _across(self, places: Sequence[Registration]) -> Array:

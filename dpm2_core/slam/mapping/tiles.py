@@ -21,7 +21,7 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.files import new_folder, write_json
 from dpm2_core.frame import Array
-from dpm2_core.slam.loops.relocalization import RelocalizationSettings, Relocalizer, nowhere
+from dpm2_core.slam.loops.relocalization import CANDIDATES, RelocalizationSettings, Relocalizer, nowhere
 from dpm2_core.slam.loops.retrieval import WIDTH, Vector, centered, pooled
 from dpm2_core.slam.mapping.merge import merge_maps
 from dpm2_core.slam.store.map_data import MapData, load_map, save_as, subset
@@ -209,7 +209,7 @@ class TiledRelocalizer:
         except Dpm2Error as error:
             return nowhere(str(error))
         if hint is None:
-            tiles = self._tiles.like(pooled(descriptors), self._settings.candidates)
+            tiles = self._tiles.like(pooled(descriptors), CANDIDATES)
         else:
             tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
         self._go_to(tiles)

@@ -120,7 +120,9 @@ def test_what_is_wrong_is_named(tmp_path: Path, folder: Path, data: MapData) -> 
     assert not list(tmp_path.glob(".*"))
 
 
-def test_what_can_be_read_is_searched_without_what_cannot(folder: Path, data: MapData) -> None:
+def test_what_can_be_read_is_searched_without_what_cannot(
+    folder: Path, data: MapData, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One tile that was missing among the candidates hid all places in the others."""
 
     class Here:
@@ -138,8 +140,8 @@ def test_what_can_be_read_is_searched_without_what_cannot(folder: Path, data: Ma
     keyframe, counts = data.keyframes[0], list[int]()
     (folder / "0_0.dpm2map").unlink()
     with TiledMap(folder) as tiles:
-        settings = RelocalizationSettings(candidates=60)
-        places = TiledRelocalizer(settings, tiles, Here, lambda _: keyframe.descriptors)  # type: ignore[arg-type,return-value]
+        monkeypatch.setattr("dpm2_core.slam.mapping.tiles.CANDIDATES", 60)  # from all tiles
+        places = TiledRelocalizer(RelocalizationSettings(), tiles, Here, lambda _: keyframe.descriptors)  # type: ignore[arg-type,return-value]
         for found in (True, False):
             for ask in (places.find, lambda keyframe: places.verify(keyframe, np.eye(4))):
                 if found:
