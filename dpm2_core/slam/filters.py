@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from dpm2_core.config import Settings
 from dpm2_core.descriptors import levelling
@@ -28,6 +27,7 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
     from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet
     from dpm2_core.network.perception.gndnet import GroundNet
 
+_MOST = 0.7  # of a scan, that is left out as moving: the most likely points
 FilterKind = Literal["none", "movers", "ground", "static"]
 
 
@@ -39,23 +39,19 @@ class FilterSettings(Settings):
     in front of DSLR's translation of the scan into one without traffic."""
     weights: Path | None = None
     """Path of a .safetensors file; unset: those that come with dpm2."""
-    threshold: float = Field(DYNAMIC, gt=0, lt=1)
-    """movers: probability from which a point is left out."""
-    most: float = Field(0.7, ge=0, le=1)
-    """movers: at most this fraction of a scan is left out, the most likely ones."""
 
 
 PointFilter = Callable[[Points], NDArray[np.bool_]]
 """Which (N,) of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR stay; may be none."""
 
 
-def without_dynamic_objects(net: DynamicObjectNet, threshold: float, most: float, points: Points) -> NDArray[np.bool_]:
-    """Without what moves or could; see `network.perception.dynamic_objects`."""
+def without_dynamic_objects(net: DynamicObjectNet, points: Points) -> NDArray[np.bool_]:
+    """Without what moves or could, but for a part of the scan; see `network.perception.dynamic_objects`."""
     if not len(points):
         return np.zeros(0, bool)
     probability = net.probability(points)
     # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
-    bound = max(threshold, float(np.quantile(probability, 1 - most)))
+    bound = max(DYNAMIC, float(np.quantile(probability, 1 - _MOST)))
     return np.asarray(probability <= bound)
 
 
@@ -121,7 +117,7 @@ def _named(settings: FilterSettings, path: Path, threads: int) -> PointFilter:
         from dpm2_core.network.perception import dynamic_objects
 
         movers = load_once(path, threads, dynamic_objects.load)
-        return partial(without_dynamic_objects, movers, settings.threshold, settings.most)
+        return partial(without_dynamic_objects, movers)
     if settings.kind == "ground":
         from dpm2_core.network.perception import gndnet
 
