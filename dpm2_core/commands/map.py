@@ -87,16 +87,15 @@ def prune(
     """
     from dpm2_core.slam.mapping.prune import prune as pruned
     from dpm2_core.slam.mapping.prune import redundant_nodes
-    from dpm2_core.slam.mapping.redundancy import RedundancySettings
+    from dpm2_core.slam.mapping.redundancy import SAME, TURNED
     from dpm2_core.slam.store.map_data import load_map, save_as
     from dpm2_core.slam.store.map_file import check_new
     from dpm2_core.slam.store.map_store import MapStore
 
     check_new(out)
-    near = RedundancySettings()
     with MapStore.open(path) as store:
         data = load_map(store)
-        less = pruned(data, redundant_nodes(data, near.distance, near.angle))
+        less = pruned(data, redundant_nodes(data, SAME, TURNED))
         save_as(less, out)
     note(f"{out}: {len(less)} keyframes of {len(data)}")
 

@@ -21,7 +21,7 @@ from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.admission import check_keyframe
 from dpm2_core.slam.mapping.moving import MovingWindow
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
-from dpm2_core.slam.mapping.redundancy import RedundancySettings, lender, to_lender
+from dpm2_core.slam.mapping.redundancy import SAME, lender, to_lender
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
@@ -44,7 +44,9 @@ class MapSettings(Settings):
     moving_window: int = Field(5, ge=0)
     """So many keyframes before and after one tell which of its points are of moving things, and no part of the map; 0
     keeps all."""
-    redundancy: RedundancySettings = RedundancySettings()
+    redundancy: float = Field(SAME, ge=0)
+    """A keyframe gives up its cloud and descriptors for those of an older one that an accepted loop ties it to, within
+    this, m, and a turn of 30 degrees; 0 keeps all."""
 
 
 @dataclass(eq=False)

@@ -9,34 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from pydantic import Field
-
-from dpm2_core.config import Settings
 from dpm2_core.estimates import Edge
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 
 LAP = 10
 """Keyframes: those nearer along the drive are its neighbors, and no revisit."""
+SAME = 3.0
+"""m, at most, from a keyframe to the older one that it repeats."""
+TURNED = 30.0
+"""The same, degrees: from another direction a place may look different."""
 
 
-class RedundancySettings(Settings):
-    """Which keyframes of a revisit are given up: their pose stays in the graph, cloud and descriptors go."""
-
-    distance: float = Field(3.0, ge=0)
-    """Of a keyframe to the one that an accepted loop ties it to, m; 0 keeps all."""
-    angle: float = Field(30.0, ge=0, le=180)
-    """Turn between them, degrees: from another direction a place may look different."""
-
-
-def lender(
-    node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | None], settings: RedundancySettings
-) -> Loan | None:
+def lender(node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | None], distance: float) -> Loan | None:
     """The node whose payload a new node can share; None: it keeps its own.
 
     Args:
         node: with `loops` those that were tried for it, to it.
         loan_of: of older nodes: one that borrows itself hands on.
+        distance: m, at most, to the lender.
     """
     for edge in loops:
         if not edge.ok or edge.to_node != node:
@@ -45,7 +36,7 @@ def lender(
         if (loan := loan_of(other)) is not None:
             T_kf_lender, other = T_kf_lender @ loan.T_kf_lender, loan.lender
         meters, degrees = se3.magnitude(T_kf_lender)
-        if meters <= settings.distance and degrees <= settings.angle:
+        if meters <= distance and degrees <= TURNED:
             return Loan(other, T_kf_lender)
     return None
 

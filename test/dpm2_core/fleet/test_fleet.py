@@ -186,7 +186,7 @@ def test_values_of_a_sweep_may_be_lists() -> None:
 
 
 @pytest.mark.parametrize(("one", "other"), [
-    ("slam.keyframes.distance=4", "slam.map.redundancy.distance=4"),
+    ("slam.keyframes.distance=4", "slam.map.redundancy=4"),
     ("slam.neural.weights=w/a_b.npz", "slam.neural.weights=w_a/b.npz"),
     ("slam.neural.weights=a/b", "slam.neural.weights=a%2Fb"),
 ])  # fmt: skip

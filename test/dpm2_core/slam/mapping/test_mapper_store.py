@@ -154,7 +154,7 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
     assert own_1 == LAP
     rejected = sum(node % 7 == 0 for node in range(LAP, 4 * LAP))
     assert own_4 <= LAP + rejected
-    off = make(redundancy={"distance": 0})
+    off = make(redundancy=0.0)
     for keyframe in laps(2):
         off.add(keyframe)
     assert all(off.clouds.loan(node) is None for node in range(40))
@@ -183,7 +183,7 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
     T_old_new = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
     expected = se3.transform(se3.inverse(T_old_new), mapper.clouds[5])
     np.testing.assert_allclose(mapper.clouds[25], expected, atol=1e-4)
-    far = make(redundancy={"distance": 1e-3})
+    far = make(redundancy=1e-3)
     for keyframe in keyframes:
         far.add(keyframe)
     assert far.clouds.loan(25) is None  # 2 mm apart
