@@ -19,6 +19,7 @@ from dpm2_core.slam.registration.point_to_plane import distances
 _YOUNG = 3  # scans
 _SIGHT = (0.99, 1.1)  # quantile of the distances of a scan's points, and times that: farther away it shows nothing
 _NEIGHBORS = 15  # points that a plane is fitted to
+_SCANS = 25  # later, points are forgotten: it bounds memory, and traces of what moves
 _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
@@ -29,8 +30,6 @@ class LocalMapSettings(Settings):
     """A scan enters the map after this much motion, m (or a turn of 10 degrees)."""
     radius: float = Field(100.0, gt=0)
     """Points farther than this from the sensor are forgotten, m."""
-    scans: int = Field(25, ge=1)
-    """Points that entered this many scans ago are forgotten: bounds memory, and traces of moving things."""
 
 
 class LocalMap:
@@ -87,15 +86,15 @@ class LocalMap:
         """
         away = np.linalg.norm(points[:, :3], axis=1)
         sight = np.quantile(away, _SIGHT[0]) if len(away) else 0.0
-        self._sights = np.append(self._sights, sight)[-self._settings.scans :]
+        self._sights = np.append(self._sights, sight)[-_SCANS:]
         taken = T_odom_lidar @ (np.eye(4)[None] if taken is None else taken)
-        self._taken = np.concatenate([self._taken, taken])[-max(self._settings.scans, len(taken)) :]
+        self._taken = np.concatenate([self._taken, taken])[-max(_SCANS, len(taken)) :]
         new = points[:, :3].astype(np.float64) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3]
         joined = np.concatenate([self.points, new])
         entered = np.concatenate([self._entered, np.full(len(new), self._inserted, np.int32)])
         away = joined - T_odom_lidar[:3, 3]
         kept = np.einsum("ij,ij->i", away, away) < self._settings.radius**2
-        kept &= entered > self._inserted - self._settings.scans
+        kept &= entered > self._inserted - _SCANS
         joined, entered = joined[kept], entered[kept]
         first = voxel_first(joined, self._voxel)
         self._grid = PointGrid(joined[first], _CELL * self._voxel)

@@ -30,8 +30,6 @@ class VisualSettings(Settings):
     enabled: bool = True
     """Where scans leave a direction open, ask the intensities of the LiDAR and a camera: the first one; a second one
     only where that has no image."""
-    reach: float = Field(20.0, gt=0)
-    """Farthest that is looked to either side, m; less where the motion so far says more."""
     min_correlation: float = Field(0.3, ge=0, le=1)
     """Minimum correlation; lower values are discarded."""
     distinct: float = Field(0.1, ge=0, le=1)

@@ -22,7 +22,7 @@ from dpm2_core.slam.registration.swept import Beginning, Swept
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
 _BASELINE = 3.0  # m: way after which another image is the one to compare with
-_LEAST_REACH = 0.6  # m: however well the motion is known
+_REACH, _LEAST_REACH = 20.0, 0.6  # m to either side: the farthest that is looked, and however well the motion is known
 _PERIOD = 0.1  # s, of most LiDARs: the prediction is of one period, its error over that time is the error of the speed
 _ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
 
@@ -113,7 +113,7 @@ class VisualScanRegistration:
     def _reach(self, result: Registration, information: Array | None) -> tuple[float, float]:
         """How far to look along the open direction, m, and the standard deviation of the speed along it, m/s."""
         if information is None:
-            return self._settings.reach, _ANY_SPEED
+            return _REACH, _ANY_SPEED
         b = np.concatenate([np.zeros(3), result.open_direction])
         sigma = float(np.sqrt(b @ np.linalg.solve(information, b)))
-        return min(self._settings.reach, max(_LEAST_REACH, 4 * sigma)), sigma / _PERIOD
+        return min(_REACH, max(_LEAST_REACH, 4 * sigma)), sigma / _PERIOD
