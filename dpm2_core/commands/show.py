@@ -29,14 +29,11 @@ def show(
         ),
     ] = None,
     corrupt: Annotated[str | None, typer.Option(help="Let sensors fail, as `dpm2 run --corrupt` does.")] = None,
-    point: Annotated[
-        int | None, typer.Option(help="Reference point whose attention to the image of B is shown.")
-    ] = None,
     settings: InputOverrides = None,
 ) -> None:
     """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.
 
-    With weights that have a camera, also what a reference point reads from the image.
+    With weights that have a camera, also what the reference point nearest to the middle of the image reads there.
     """
     from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
     from dpm2_core.data.open import open_source
@@ -56,8 +53,7 @@ def show(
     title = f"{source.name}, frame {moving.index} to frame {target.index}{f', {corrupt}' if corrupt else ''}"
     panels = []
     for name, model in models.items():
-        requested = point is not None or (model.encoder.image is not None and moving.images)
-        looked = image_attention(model, moving, point) if requested else None
+        looked = image_attention(model, moving) if model.encoder.image is not None and moving.images else None
         panels.append((f"{title}, {Path(name).stem}" if len(models) > 1 else title, model, looked))
     compared_png(out, panels, moving, target)
     note(f"{out}: {title}")
