@@ -51,14 +51,10 @@ class Trajectory:
         return frame_period(self.keys) if self.kind == "tum" else FRAME_PERIOD
 
 
-def write_kitti(path: Path | str, poses: Array, index: Sequence[int] | Keys | None = None) -> None:
-    """(N, 4, 4) poses as 12 numbers a line, row-major; `index` puts the frame number in front, for missing frames."""
-    rows = np.asarray(poses, np.float64)[:, :3].reshape(-1, 12)
+def write_kitti(path: Path | str, poses: Array) -> None:
+    """(N, 4, 4) poses as 12 numbers a line, row-major."""
     with atomic_write(path) as file:
-        if index is None:
-            np.savetxt(file, rows, "%.12e")
-        else:
-            np.savetxt(file, np.column_stack([index, rows]), ["%d"] + ["%.12e"] * 12)
+        np.savetxt(file, np.asarray(poses, np.float64)[:, :3].reshape(-1, 12), "%.12e")
 
 
 def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> None:

@@ -29,6 +29,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.system import SlamResult
 
 from ..helpers.drives import first_scans
+from ..helpers.trajectories import write_indexed
 
 FRAMES = 8
 SET = ["slam.loops.enabled=false", "slam.threads=1"]
@@ -328,7 +329,7 @@ def test_errors_of_use_come_before_anything_runs(recording: Path, tmp_path: Path
     with pytest.raises(UsageError, match=f"3 poses for {FRAMES} frames of 00"):
         OfflineRun(recording, CONFIG, ground_truth=tmp_path / "short.txt")
     poses = np.tile(np.eye(4), (3, 1, 1))
-    write_kitti(tmp_path / "other.txt", poses, [20, 21, 22])
+    write_indexed(tmp_path / "other.txt", poses, [20, 21, 22])
     with pytest.raises(UsageError, match=f"other.txt: poses 20 to 22, but the frames of 00 are 2 to {FRAMES - 1}"):
         OfflineRun(recording, CONFIG, (2, None), tmp_path / "other.txt")
     write_tum(tmp_path / "late.tum", [10**15, 2 * 10**15, 3 * 10**15], poses)

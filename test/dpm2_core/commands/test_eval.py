@@ -21,6 +21,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
 from ...helpers.command import dpm2, refused, succeeded
+from ...helpers.trajectories import write_indexed
 
 
 def evaluated(gt: Path, est: Path, *options: object) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def _drive(count: int = 60) -> np.ndarray:
 def test_frames_that_an_estimate_is_not_of_are_not_said_to_have_failed(tmp_path: Path) -> None:
     """Of a run with `--frames` it said "10 failed, 0 breaks", and the length of all the drive as its path."""
     write_kitti(tmp_path / "gt.txt", _drive())
-    write_kitti(tmp_path / "est.txt", _drive()[:-10], range(50))
+    write_indexed(tmp_path / "est.txt", _drive()[:-10], range(50))
     shown = " ".join(succeeded("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt").stdout.split())
     assert "10 without a pose in the estimate; true path 59.0000 m" in shown
     assert "failed" not in shown
@@ -60,7 +61,7 @@ def test_the_json_holds_the_fixed_keys_and_how_they_were_measured(tmp_path: Path
     est = _drive()
     est[:, 2, 3] *= 1.01
     write_kitti(tmp_path / "gt.txt", _drive())
-    write_kitti(tmp_path / "est.txt", est[:-10], range(50))
+    write_indexed(tmp_path / "est.txt", est[:-10], range(50))
     gt, est, out = tmp_path / "gt.txt", tmp_path / "est.txt", tmp_path / "new" / "m.json"
     assert dpm2("eval", "--gt", gt, "--est", est, "--lengths", "10,20", "--json", out).returncode == 0
     result = json.loads(out.read_text())
@@ -93,7 +94,7 @@ def test_a_gap_makes_no_drive_faster(tmp_path: Path, stamped: bool) -> None:
         write_tum(tmp_path / "gt.txt", np.arange(60) * 100_000_000 + 3_000_000, poses)
         write_tum(tmp_path / "est.txt", there * 100_000_000, poses[there])
     else:
-        write_kitti(tmp_path / "gt.txt", poses[there], there.tolist())
+        write_indexed(tmp_path / "gt.txt", poses[there], there.tolist())
         write_kitti(tmp_path / "est.txt", poses[there])
     found = evaluated(tmp_path / "gt.txt", tmp_path / "est.txt", "--lengths", "10")
     assert [(row["speed_mps"], row["segments"]) for row in found["per_speed"]] == [(8.0, found["segments"])]
@@ -171,7 +172,7 @@ def drive_with_truth(root: Path, numbers: Sequence[int] = range(6)) -> tuple[Pat
 def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
     """--gt may be a drive of any layout: it evaluates an estimate of the left camera that has frame numbers."""
     folder, poses = drive_with_truth(tmp_path)
-    write_kitti(tmp_path / "est.txt", poses[1:], range(1, 6))
+    write_indexed(tmp_path / "est.txt", poses[1:], range(1, 6))
     for drive, options in ((folder, ()), (tmp_path, ("--set", "input.sequence=07"))):
         assert evaluated(drive, tmp_path / "est.txt", *options)["ape_rmse_m"] < 1e-6
     (folder / "poses.txt").unlink()

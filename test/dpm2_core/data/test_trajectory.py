@@ -21,6 +21,8 @@ from dpm2_core.data.trajectory import (
 from dpm2_core.errors import UsageError
 from dpm2_core.geometry import se3
 
+from ...helpers.trajectories import write_indexed
+
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
 EPOCH = 1_317_617_735_123_456_789  # ns; as a float64 in seconds it would lose 100 ns
 
@@ -41,7 +43,7 @@ def test_kitti_keeps_poses_to_a_nanometer(tmp_path: Path) -> None:
 
 def test_kitti_keeps_frame_numbers(tmp_path: Path) -> None:
     numbers = [0, 3, 4, 999_999_999]
-    write_kitti(tmp_path / "t.txt", _poses(4), numbers)
+    write_indexed(tmp_path / "t.txt", _poses(4), numbers)
     read = read_trajectory(tmp_path / "t.txt")
     assert (read.kind, read.keys.tolist()) == ("kitti-indexed", numbers)
     np.testing.assert_allclose(read.poses, _poses(4), atol=1e-9)
