@@ -19,7 +19,7 @@ from dpm2_core.evaluation.pair_set import FAR, NEAR, has_pair
 from dpm2_core.evaluation.run_result import Result
 from dpm2_core.frame import Array, Frame
 from dpm2_core.learning.finetune_settings import DRIVES, HELD_OUT, REHEARSAL, FinetuneSettings
-from dpm2_core.learning.generate import check_same, generate, pack
+from dpm2_core.learning.generate import GenerateSettings, check_same, generate, pack
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.graph.graph_data import components
@@ -122,7 +122,7 @@ def prepare(
             notes.append(f"{name}: the {len(source) - cut} scans that are held out have {lacks}")
         pack(referenced, out / DRIVES / name, network, range(cut), packing, asked)
     if settings.rehearsal_share > 0 and not settings.rehearsal:
-        worlds = settings.rehearsal_worlds.model_copy(update={"preset": network.preset})
+        worlds = GenerateSettings(worlds=6, first_seed=3000, frames=40, preset=network.preset)
         generate(out / REHEARSAL, worlds, 1, _of_many(advance, "rehearsal: world"))
     return notes
 

@@ -10,7 +10,6 @@ from pydantic import Field
 from dpm2_core.config import Settings
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.learning.augment import AugmentSettings
-from dpm2_core.learning.generate import GenerateSettings
 from dpm2_core.learning.registration_loss import LossSettings
 from dpm2_core.learning.trainer import OptimizerSettings
 
@@ -34,11 +33,10 @@ class FinetuneSettings(Settings):
     from the other."""
     loss: LossSettings = LossSettings()
     rehearsal: str = ""
-    """Folder of packed drives of the LiDAR that the weights come from; empty: synthetic worlds are made."""
+    """Folder of packed drives of the LiDAR that the weights come from; empty: worlds of the synthetic city are made,
+    with 64 beams 1.73 m above the ground; `dpm2 train data` makes those of another LiDAR."""
     rehearsal_share: float = Field(default=0.5, ge=0, lt=1)
     """Of the places of the batches."""
-    rehearsal_worlds: GenerateSettings = GenerateSettings(worlds=6, first_seed=3000, frames=40)
-    """The synthetic worlds."""
     held_out: float = Field(default=0.15, ge=0, lt=1)
     """Last part of each drive, to be measured on before and after."""
     groups: int = Field(default=2, gt=0)

@@ -16,6 +16,8 @@ from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, maha
 from dpm2_core.network.matching import softmax_both, take
 from dpm2_core.network.tokens import Tokens
 
+_OWN_LIMIT = 6.0  # m: of the network's own matches those that are wrong by more have no offset to learn
+
 
 class LossSettings(Settings):
     """Weights of the losses, and how pairs are drawn for the offsets."""
@@ -37,10 +39,6 @@ class LossSettings(Settings):
     """Pairs drawn per set pair among those within `offset_limit` of each other."""
     own: int = Field(128, ge=0)
     """Pairs per set pair that are the network's own best matches: what it will be asked at inference."""
-    own_limit: float = Field(6.0, gt=0)
-    """Own matches wrong by more are left out, m."""
-    neutral_is_negative: bool = True
-    """Near-by points other than the nearest count as negatives in the pairing loss."""
 
 
 def registration_loss(
@@ -55,7 +53,7 @@ def registration_loss(
     labels = label_pairs(source.xyz, target.xyz, T_target_source, (source.mask, target.mask))
     correlated = decoder(source, target)
     scores = cosine(decoder.similarity(correlated.source), decoder.similarity(correlated.target)) / temperature
-    pairing = info_nce(scores, labels, settings.neutral_is_negative)
+    pairing = info_nce(scores, labels, neutral_is_negative=True)
     coarse_scores = cosine(decoder.coarse(source.features), decoder.coarse(target.features)) / temperature
     coarse = info_nce(coarse_scores, labels, False)
     limit, masks = decoder.settings.offset_limit, (source.mask, target.mask)
@@ -95,7 +93,7 @@ def offset_pairs(
     if not settings.own:
         return flat, weight
     own = softmax_both(scores, *masks).flatten(1).topk(settings.own)[1]
-    good = (labels.distance.flatten(1).gather(1, own) <= settings.own_limit).float()
+    good = (labels.distance.flatten(1).gather(1, own) <= _OWN_LIMIT).float()
     return torch.cat([flat, own], 1), torch.cat([weight, good], 1)
 
 
