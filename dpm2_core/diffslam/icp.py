@@ -20,6 +20,7 @@ from dpm2_core.diffslam.neighbors import NeighborSearch
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, solve
 from dpm2_core.geometry import se3_torch
 
+_NEIGHBORS = 10  # points of a cloud whose plane gives a normal
 _LEAST_GAP = 1e-3  # of eigenvalues, in units of their sum
 
 
@@ -28,8 +29,6 @@ class IcpSettings(Settings):
 
     solver: SoftLmSettings = SoftLmSettings()
     """Iterations, damping and gradient."""
-    normal_neighbours: int = Field(default=10, ge=3)
-    """Points of the target whose plane gives a normal."""
     max_distance: float = Field(default=3.0, gt=0)
     """Matches farther apart are left out, m."""
     kernel: Literal["huber", "geman_mcclure", "none"] = "huber"
@@ -45,12 +44,12 @@ class Cloud:
         points: (B, N, 3) float64, m. weights: (B, N) 0..1, zero for padding. normals: (B, N, 3) unit.
     """
 
-    def __init__(self, points: Tensor, weights: Tensor | None = None, neighbours: int = 10) -> None:
+    def __init__(self, points: Tensor, weights: Tensor | None = None) -> None:
         """Take points (B, N, 3) and weights (B, N), all one if None; a point of weight zero is not there."""
         self.points = points.double()
         self.weights = self.points.new_ones(points.shape[:2]) if weights is None else weights.double()
         self.search = NeighborSearch(self.points, self.weights.detach() > 0)
-        self.normals = _normals(self.points, self.weights, self.search, neighbours)
+        self.normals = _normals(self.points, self.weights, self.search)
 
     def select(self, index: Sequence[int]) -> Cloud:
         """The clouds of the batch at these places, prepared as they are."""
@@ -143,14 +142,14 @@ def _irls_weight(r: Tensor, settings: IcpSettings) -> Tensor:
     return s / r.abs().clamp(min=s)
 
 
-def _normals(points: Tensor, weights: Tensor, search: NeighborSearch, k: int) -> Tensor:
-    """Unit normals (B, N, 3) by weighted PCA over the k nearest of each point; z where a point has no neighbors.
+def _normals(points: Tensor, weights: Tensor, search: NeighborSearch) -> Tensor:
+    """Unit normals (B, N, 3) by weighted PCA over the nearest of each point; z where a point has no neighbors.
 
     With the gradient of the eigenvector to first order: without it the slope by one point is a third off. The gap to
     the other eigenvalues is kept from zero, where a neighborhood is a line and has no normal.
     """
     at = points.detach()
-    index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), k)
+    index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), _NEIGHBORS)
     flat = index.flatten(1)
     near = _gather(points, flat).unflatten(1, index.shape[1:])
     w = weights.gather(1, flat).unflatten(1, index.shape[1:])[..., None]

@@ -101,7 +101,7 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
     """
     settings = settings or SlamLossSettings()
     points, w = window(clouds, weights, settings.points, settings.voxel, name)
-    scans = Cloud(points, w, settings.icp.normal_neighbours)
+    scans = Cloud(points, w)
     steps = _edges([1], len(points))
     found, evidence = _register(scans, steps, _guessed_steps(guess, points), settings.icp)
     poses = chained(found, settings.truncate)
