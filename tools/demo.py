@@ -46,14 +46,12 @@ class Evaluation:
 def demo(
     src: Annotated[Path | None, typer.Argument(help="KITTI sequence, rosbag2 folder or .mcap; none: simulate")] = None,
     out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("out/demo"),
-    frames: Annotated[int, typer.Option(help="length of the simulated drive", min=20)] = 150,
-    seed: Annotated[int, typer.Option(help="of the simulated drive")] = 7,
     rate: Annotated[float, typer.Option(help="speed of playing; 1: that of the recording", min=0.05)] = 1.0,
 ) -> int:
     """Replay a drive into slam_node and check what comes out. Exit code 1 if a check fails."""
     console = Console()
     out.mkdir(parents=True, exist_ok=True)
-    bag = prepare(src, out, frames, seed, console)
+    bag = prepare(src, out, console)
     source = BagSource(bag, InputSettings(images=False))
     with progress_bar(console) as progress:
         task = progress.add_task("bag_player -> slam_node -> /dpm2/odom", total=len(source))
@@ -70,7 +68,7 @@ def demo(
     return 1 if failed else 0
 
 
-def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Console) -> Path:
+def prepare(src: Path | None, out: Path, console: Console) -> Path:
     """The bag to play: `src` itself, another recording converted, or a simulated one; what was made before is reused.
 
     Raises:
@@ -81,9 +79,9 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     if src is not None and is_rosbag2(src):
         return src
     if src is None:
-        src = out / f"city_{frames}_{seed}"
+        src = out / "city"
         if not src.is_dir():  # it is there when it is whole
-            _simulate(src, frames, seed)
+            _simulate(src)
     bag = out / f"bag_{src.resolve().name}"
     made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
@@ -94,8 +92,8 @@ def prepare(src: Path | None, out: Path, frames: int, seed: int, console: Consol
     return bag
 
 
-def _simulate(out: Path, frames: int, seed: int) -> None:
-    command = ["sim", str(out), "--frames", str(frames), "--seed", str(seed), "--road", "loop"]
+def _simulate(out: Path) -> None:
+    command = ["sim", str(out), "--seed", "7"]  # 15 s around a loop
     if subprocess.run([sys.executable, "-m", "dpm2_core.cli", *command], check=False).returncode:
         raise Dpm2Error(f"dpm2 {' '.join(command)} failed")
 
