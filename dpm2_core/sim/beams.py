@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dpm2_core.data.trajectory import FRAME_PERIOD
 from dpm2_core.frame import Array
 from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.settings import LidarConfig
@@ -53,7 +54,7 @@ class Beams:
         azimuth = np.arange(n) * (2 * np.pi / n)
         # A spinning one turns clockwise and looks straight ahead at the stamp.
         phase = -np.remainder(azimuth + np.pi, 2 * np.pi) + np.pi if self._spinning else azimuth - np.pi
-        self.column_time = (phase / (2 * np.pi) * config.period).astype(np.float32)
+        self.column_time = (phase / (2 * np.pi) * FRAME_PERIOD).astype(np.float32)
 
     def directions(self, time: float) -> Float:
         """(R, 3) unit directions in the LiDAR frame of the turn at a time, s."""

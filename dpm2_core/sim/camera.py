@@ -68,7 +68,7 @@ def _band(
     """(R, 3) light that comes from the directions (R, 3), some rows of pixels."""
     surface, seen, distance = _visible(world, dynamic_objects, eye, view, config)
     lit = np.ones(len(distance), np.float32)
-    if config.shadows and not light.tunnel and light.overcast < 0.85:
+    if not light.tunnel and light.overcast < 0.85:
         lit = _sunlit(world, light.sun, dynamic_objects, surface, seen, config.width)
     color = light.textures.albedo(surface, world.terrain)
     color *= light.shine(surface, lit)

@@ -9,6 +9,8 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.sim.settings import GnssConfig
 
+ORIGIN = (49.0, 8.4, 110.0)
+"""Of every world: latitude and longitude, deg, altitude above the ellipsoid, m. Its x axis points east."""
 _OFFSET = 0.03  # s after the first scan: a fix comes between two scans
 
 
@@ -22,7 +24,7 @@ class Receiver:
     def __init__(self, config: GnssConfig, rng: np.random.Generator) -> None:
         """`rng` draws its noise."""
         self.config, self._rng = config, rng
-        self.T_ecef_world: Array = geodesy.enu_frame(config.origin)
+        self.T_ecef_world: Array = geodesy.enu_frame(ORIGIN)
         self.antenna = np.array(config.antenna, np.float64)
         self.sigmas = np.hypot(config.noise, config.wander) * np.array([1.0, 1.0, 2.0])
 

@@ -13,6 +13,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.sim.settings import ImuConfig
 
 GRAVITY = 9.81
+RATE = 100.0
+"""Samples per second; each is the mean over two periods, as its low-pass filter makes it."""
+_YAW = 90.0  # deg to the left, of the mount: its axes are not those of the LiDAR
 
 
 class Imu:
@@ -25,7 +28,7 @@ class Imu:
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
         """`rng` draws the sensor, and then its noise."""
         self.config, self._rng = config, rng
-        self.R_lidar_imu: Array = Rotation.from_euler("z", config.yaw, degrees=True).as_matrix()
+        self.R_lidar_imu: Array = Rotation.from_euler("z", _YAW, degrees=True).as_matrix()
         off = Rotation.from_rotvec(np.radians(config.misaligned) * rng.standard_normal(3)).as_matrix()
         self._R_imu_lidar = (self.R_lidar_imu @ off).T
         self._gyro_scale, self._force_scale = 1 + config.scale * rng.standard_normal((2, 3))
@@ -34,7 +37,7 @@ class Imu:
 
     def times(self, start: float, end: float) -> Array:
         """(K,) s from start to end, at its rate."""
-        return np.arange(round(start * self.config.rate), round(end * self.config.rate) + 1) / self.config.rate
+        return np.arange(round(start * RATE), round(end * RATE) + 1) / RATE
 
     def measure(self, times: Array, poses: Callable[[Array], Array]) -> tuple[Array, Array]:
         """Rates (K, 3) rad/s and forces (K, 3) m/s2 along its own axes.
@@ -42,7 +45,7 @@ class Imu:
         Args:
             times: (K,) s, evenly spaced. poses: T_world_lidar (M, 4, 4) at times (M,) s; z is up.
         """
-        c, period, count = self.config, 1 / self.config.rate, len(times)
+        c, period, count = self.config, 1 / RATE, len(times)
         T = poses(np.concatenate([times[:1] - period, times, times[-1:] + period]))
         rates = se3.way(T[:-2], T[2:])[:, :3] / (2 * period)
         accelerations = (T[2:, :3, 3] - 2 * T[1:-1, :3, 3] + T[:-2, :3, 3]) / period**2

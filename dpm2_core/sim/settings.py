@@ -68,8 +68,6 @@ class LidarConfig(Settings):
     """Standard deviation of a range, m; rough surfaces add theirs."""
     dropout: float = Field(default=0.01, ge=0, lt=1)
     """Fraction of returns lost at random; glass, dark paint, leaves and grazing far surfaces lose more."""
-    period: float = Field(default=0.1, gt=0)
-    """Of one turn, s."""
     car_body: bool = True
     """The car's own roof hides the lowest beams ahead and behind, as on KITTI's car; of a spinning sensor."""
     roll: float = Field(default=0.0, ge=-180, le=180)
@@ -93,8 +91,6 @@ not hide: how far down a beam looks depends on what it meets."""
 class ImuConfig(Settings):
     """An IMU in the LiDAR's housing, by default as the MEMS ones there are. Its errors are standard deviations."""
 
-    rate: float = Field(default=100.0, ge=10, le=2000)
-    """Samples per second; each is the mean over two periods, as its low-pass filter makes it."""
     gyro_noise: float = Field(default=0.002, ge=0)
     """Of a sample, rad/s."""
     gyro_bias: float = Field(default=0.01, ge=0)
@@ -107,8 +103,6 @@ class ImuConfig(Settings):
     """Of each axis, as a fraction."""
     misaligned: float = Field(default=0.3, ge=0)
     """Of the mount from what the calibration says, deg about each axis."""
-    yaw: float = Field(default=90.0, ge=-180, le=180)
-    """Of the mount, deg to the left."""
 
 
 class GnssConfig(Settings):
@@ -124,8 +118,6 @@ class GnssConfig(Settings):
     """s in which it becomes another one."""
     antenna: tuple[float, float, float] = (-0.4, 0.0, 0.2)
     """In the LiDAR's frame, m."""
-    origin: tuple[float, float, float] = (49.0, 8.4, 110.0)
-    """Of the world: latitude and longitude, deg, altitude above the ellipsoid, m. Its x axis points east."""
 
 
 class CameraConfig(Settings):
@@ -137,8 +129,6 @@ class CameraConfig(Settings):
     """Pixels."""
     focal: float = Field(default=720.0, gt=0)
     """Focal length, pixels."""
-    shadows: bool = True
-    """Cast shadows of the sun."""
     noise: float = Field(default=2.0, ge=0)
     """Standard deviation of a pixel value, of 255."""
     wet: float = Field(default=0.0, ge=0, le=0.8)

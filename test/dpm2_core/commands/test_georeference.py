@@ -67,7 +67,7 @@ def truth(drive: Path) -> tuple[list[int], Array]:
     assert source.poses is not None
     assert source.T_cam_lidar is not None
     first = np.load(source.path / "ground.npz")["T_grid_cam0"]  # the grid's frame is the world's
-    places = geodesy.enu_frame(GNSS.origin) @ first @ source.T_cam_lidar @ source.poses
+    places = geodesy.enu_frame(ORIGIN) @ first @ source.T_cam_lidar @ source.poses
     return source.stamps.tolist(), geodesy.geodetic(places[:, :3, 3])
 
 

@@ -27,7 +27,7 @@ from dpm2_core.slam.settings import SlamSettings
 from ...helpers.drives import InMemory
 
 FRAMES = 5
-CONFIG = CameraConfig(width=208, height=64, focal=120.0, shadows=False)
+CONFIG = CameraConfig(width=208, height=64, focal=120.0)
 AHEAD = calibration(CONFIG)
 BACK = replace(AHEAD, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ AHEAD.T_lidar_cam, name="rear")
 

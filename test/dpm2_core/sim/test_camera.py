@@ -66,7 +66,7 @@ def test_lidar_points_project_onto_the_pixels_that_show_them(city: World) -> Non
 
 def test_white_paint_is_seen_where_the_road_has_it(highway: World) -> None:
     """The edge line of the lane is brighter than the asphalt beside it: image and lane coordinates agree."""
-    config = SMALL.model_copy(update={"width": 640, "height": 192, "focal": 380.0, "shadows": False})
+    config = SMALL.model_copy(update={"width": 640, "height": 192, "focal": 380.0})
     camera = calibration(config)
     T_world_cam = highway.pose_at(150.0) @ camera.T_lidar_cam
     image = render(highway, config, T_world_cam, 0.0, np.random.default_rng(0)).mean(-1)
