@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dpm2_core.frame import Array
+from dpm2_core.descriptors import is_level, levelling
+from dpm2_core.frame import Array, Up
 from dpm2_core.geometry.voxel import voxel_first
 
 _STEEPEST = 40.0  # degrees: a wall beside a sensor that is tilted by no more than this is steeper
@@ -42,6 +43,22 @@ def up_of(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
         normal = normal if normal[2] > 0 else -normal
         height = -float(ground.mean(0) @ normal)
     return normal.astype(np.float32) if _is_ground(xyz, normal, height) else None
+
+
+def tilt_of(cloud: NDArray[np.floating], mounted: Up | None = None) -> NDArray[np.float32] | None:
+    """Unit vector (3,) that points up in a cloud (N, 3+) of a tilted sensor, which is read in level axes.
+
+    None where the sensor is level, or neither the ground nor its mounting shows how it is.
+
+    Args:
+        mounted: which way is up by the mounting; from there the ground is looked for.
+    """
+    if mounted is not None and not is_level(up := np.array(mounted, np.float32)):
+        R = levelling(up)
+        more = tilt_of(np.ascontiguousarray(cloud[:, :3] @ R.T))
+        return up if more is None else more @ R
+    seen = up_of(cloud)
+    return None if seen is None or is_level(seen) else seen
 
 
 def _planes(xyz: Array) -> tuple[Array, Array]:

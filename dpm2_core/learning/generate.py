@@ -21,9 +21,10 @@ from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
 from dpm2_core.geometry.scale import ROOM_SCALE, scale_of
+from dpm2_core.geometry.tilt import tilt_of
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.packed_frames import crop_of
-from dpm2_core.network.pyramid import MIN_POINTS, crop, tilt_of
+from dpm2_core.network.pyramid import MIN_POINTS, crop
 from dpm2_core.network.settings import NetworkSettings, preset
 from dpm2_core.sim.camera import calibration, render
 from dpm2_core.sim.lidar import Lidar

@@ -16,12 +16,13 @@ from dpm2_core.descriptors import Descriptors, levelling
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.frame import Frame, Image
 from dpm2_core.geometry.scale import scale_of
+from dpm2_core.geometry.tilt import tilt_of
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.fusion import Fusion
 from dpm2_core.network.images import in_encoded_axes, small_image
 from dpm2_core.network.pointnext import PointNeXt, Scale, view_axes
 from dpm2_core.network.precision import mixed_precision
-from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop, tilt_of
+from dpm2_core.network.pyramid import PointBatch, build_pyramid, collate, crop
 from dpm2_core.network.registry import image_backbone
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.spatial import paint

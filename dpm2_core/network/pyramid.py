@@ -12,14 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpm2_core.descriptors import is_level, levelling
 from dpm2_core.errors import Dpm2Error
-from dpm2_core.frame import Image, Up
+from dpm2_core.frame import Image
 from dpm2_core.geometry.corners import TEXTURE, Corners, image_corners, no_corners
 from dpm2_core.geometry.edges import vertical_edges
 from dpm2_core.geometry.point_grid import PointGrid
 from dpm2_core.geometry.sampling import farthest_points, interleaved, neighbours
-from dpm2_core.geometry.tilt import up_of
 from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.images import small_image
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
@@ -68,22 +66,6 @@ def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.fl
     """
     xyz = points[voxel_first(points, settings.voxel, settings.near, settings.far), :3]
     return xyz[np.argsort(xyz[:, 0])]
-
-
-def tilt_of(cloud: NDArray[np.float32], mounted: Up | None = None) -> NDArray[np.float32] | None:
-    """Unit vector (3,) that points up in a cropped cloud of a tilted sensor, which the network reads in level axes.
-
-    None where the sensor is level, as the network was trained, or neither the ground nor its mounting shows how it is.
-
-    Args:
-        mounted: which way is up by the mounting; from there the ground is looked for.
-    """
-    if mounted is not None and not is_level(up := np.array(mounted, np.float32)):
-        R = levelling(up)
-        more = tilt_of(np.ascontiguousarray(cloud[:, :3] @ R.T))
-        return up if more is None else more @ R
-    seen = up_of(cloud)
-    return None if seen is None or is_level(seen) else seen
 
 
 def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: Sequence[Image] = ()) -> Pyramid:

@@ -20,6 +20,7 @@ from dpm2_core.config import Settings
 from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
+from dpm2_core.geometry.tilt import tilt_of
 from dpm2_core.network.pretrained import DYNAMIC, PERCEPTION_WEIGHTS, PRETRAINED_DIR, load_once
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
@@ -76,8 +77,6 @@ def without_traffic(net: Dslr, points: Points) -> NDArray[np.bool_]:
 
 def in_level_axes(point_filter: PointFilter, points: Points) -> NDArray[np.bool_]:
     """What a filter that learned from level sensors leaves of one that may be tilted: in the axes of the ground."""
-    from dpm2_core.network.pyramid import tilt_of  # torch is slow to import, and a filter needs it anyway
-
     up = tilt_of(points)
     if up is None:
         return point_filter(points)

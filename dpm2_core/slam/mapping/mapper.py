@@ -38,12 +38,10 @@ class MapSettings(Settings):
     voxel: float = Field(0.3, gt=0)
     """Spacing of its points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
-    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of the first of a drive, and
-    of those by whose picture one can say how far along a tunnel or a highway one is, see `slam.visual`: 6 to 10 kB
-    each."""
+    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of the first of a drive, and of those
+    by whose picture one can say how far along a tunnel or a highway one is, see `slam.visual`: 6 to 10 kB each."""
     moving_window: int = Field(5, ge=0)
-    """So many keyframes before and after one tell which of its points are of moving things, and no part of the map; 0
-    keeps all."""
+    """So many keyframes before and after one tell which of its points move, and are no part of the map; 0 keeps all."""
     redundancy: float = Field(SAME, ge=0)
     """A keyframe gives up its cloud and descriptors for those of an older one that an accepted loop ties it to, within
     this, m, and a turn of 30 degrees; 0 keeps all."""
@@ -196,7 +194,7 @@ class Mapper:
             if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
                 self._mark_moving(robot.window.finish(self.poses))
                 robot.window = MovingWindow(self._settings.moving_window)
-            self._mark_moving(robot.window.add(node, cloud, self.poses, origin))
+            self._mark_moving(robot.window.add(node, cloud, self.poses, origin, keyframe.up))
         finally:
             self._store(node, thumbnail, [*to_before, *self.loops[before:]])
         return self.loops[before:]

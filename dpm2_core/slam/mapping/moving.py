@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
-from dpm2_core.frame import Array, Points
+from dpm2_core.descriptors import levelling
+from dpm2_core.frame import Array, Points, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.ground import height_above_ground
+from dpm2_core.geometry.tilt import tilt_of
 
 Mask = NDArray[np.bool_]
 
@@ -66,7 +68,7 @@ def find_moving(cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImag
     """Which of the (M, 4) points of a keyframe belong to moving things.
 
     Args:
-        cloud: in the keyframe's frame, whose origin is the LiDAR. T_map_kf: (4, 4).
+        cloud: in the keyframe's frame, which is level, and whose origin is the LiDAR. T_map_kf: (4, 4).
         others: range image and T_map_kf of its witnesses.
 
     Returns:
@@ -105,16 +107,18 @@ class MovingWindow:
         self._next = 0  # the first node that has not been checked
 
     def add(
-        self, node: int, cloud: Points, poses: Array, origin: ArrayLike = (0.0, 0.0, 0.0)
+        self, node: int, cloud: Points, poses: Array, origin: ArrayLike = (0.0, 0.0, 0.0), up: Up | None = None
     ) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Take in the whole cloud (M, 4) of the next node; yields the node that can be checked now, and its mask.
 
-        `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is where in its frame the LiDAR was.
+        `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is where in its frame the LiDAR was, `up`
+        which way is up there, if that is known.
         """
         if self._window:
-            T_kf_lidar = se3.make(np.eye(3), origin)
-            cloud = se3.transform(se3.inverse(T_kf_lidar), cloud)
-            self._seen.append((node, cloud, RangeImage(cloud), T_kf_lidar))
+            tilt = tilt_of(cloud, up)
+            T_kf_level = se3.make(np.eye(3) if tilt is None else levelling(tilt).T, origin)
+            cloud = se3.transform(se3.inverse(T_kf_level), cloud)
+            self._seen.append((node, cloud, RangeImage(cloud), T_kf_level))
             if len(self._seen) > self._window:
                 yield from self._compare(self._seen[-1 - self._window][0], poses)
 
@@ -124,10 +128,10 @@ class MovingWindow:
             yield from self._compare(self._seen[-1][0], poses)
 
     def _compare(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        for node, cloud, _, T_kf_lidar in self._seen:
+        for node, cloud, _, T_kf_level in self._seen:
             if self._next <= node <= last:
                 others = [(image, poses[n] @ T) for n, _, image, T in self._seen if n != node]
-                yield node, find_moving(cloud, poses[node] @ T_kf_lidar, others)
+                yield node, find_moving(cloud, poses[node] @ T_kf_level, others)
                 self._next = node + 1
 
 
