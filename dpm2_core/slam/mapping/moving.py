@@ -32,7 +32,8 @@ _CLEARANCE = 0.25  # m above the local ground: lower points stay, for the ground
 _WITNESSES = 2  # so many must look through the place of a point
 _BEHIND = (0.5, 0.03)  # m, and per meter of range: what they see must lie so far behind it
 _FOOTPRINT = 0.3  # m: a return within this of the line of sight counts as seeing the point
-_TOUCHES = 0.7  # m: points this near to a moving one move with it, unless neighbors saw them
+_TOUCHES = 0.7  # m: points this near to a moving one move with it, unless neighbors saw them...
+_EXTENT = 2.0  # ...and so on, no farther than this, m, from those that were looked through: not along a whole wall
 
 
 class RangeImage:
@@ -89,12 +90,20 @@ def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
     """With those candidates that touch a moving point: the rest of a car, against the sky or out of their sight."""
     grown = moving.copy()
     edge = np.flatnonzero(moving)
-    while len(edge) and len(candidates):
-        near, _ = cKDTree(cloud[edge, :3]).query(cloud[candidates, :3], distance_upper_bound=_TOUCHES)
-        edge = candidates[np.isfinite(near)]
+    candidates = _within(_EXTENT, candidates, edge, cloud)
+    while len(edge):
+        edge = _within(_TOUCHES, candidates, edge, cloud)
         edge = edge[~grown[edge]]
         grown[edge] = True
     return grown
+
+
+def _within(reach: float, these: NDArray[np.intp], others: NDArray[np.intp], cloud: Points) -> NDArray[np.intp]:
+    """Those of some points that are so near, m, to one of the others."""
+    if not len(these) or not len(others):
+        return these[:0]
+    near, _ = cKDTree(cloud[others, :3]).query(cloud[these, :3], distance_upper_bound=reach)
+    return these[np.isfinite(near)]
 
 
 class MovingWindow:

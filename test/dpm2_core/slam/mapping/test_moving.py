@@ -50,6 +50,16 @@ def test_a_box_that_stays_is_kept() -> None:
     assert not find_moving(here, np.eye(4), others).any()
 
 
+def test_what_touches_a_thing_that_moved_goes_with_it_no_farther_than_a_car_is_high() -> None:
+    """Where no neighbor looks. On a real street a whole wall went, for one thing that touched it."""
+    along = np.arange(0, 12, 0.25, np.float32)
+    rises = np.column_stack([np.full(len(along), 8), along, 0.3 + along, 0 * along])  # out of sight from 8 degrees on
+    here = np.concatenate([scene((8, 0)), rises.astype(np.float32)])
+    moving = find_moving(here, np.eye(4), [(RangeImage(scene((8, y))), np.eye(4)) for y in (-6.0, 14.0)])[-len(along) :]
+    assert moving[along < 2].all()
+    assert not moving[along > 4].any()
+
+
 def test_one_witness_is_not_enough_and_none_says_nothing() -> None:
     here, empty = scene((8, 0)), RangeImage(scene())
     assert not find_moving(here, np.eye(4), [(empty, np.eye(4))]).any()
