@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from dpm2_core.data.pairing import JUMP
+
 NOMINAL = 0.1
 """Period of a stream of which none is known, s."""
 _FASTEST = 0.005  # s: no stream has a shorter period; frames that arrived together and were stamped then have
@@ -20,11 +22,14 @@ class StreamClock:
 
     Attributes:
         stamp: of the last frame, ns; None before the first. now: s since the first frame.
+        went_back: whether a stamp was more than a second before the last one: a clock that was set, or another drive,
+            as where a bag was looped. It stays so until whoever has looked at it takes it back.
     """
 
     def __init__(self) -> None:
         self.stamp: int | None = None
         self.now = 0.0
+        self.went_back = False
         self._jumped_from: int | None = None
         self._counted = NOMINAL  # s, for the jump
         self._periods: deque[float] = deque(maxlen=_RHYTHM)
@@ -38,6 +43,7 @@ class StreamClock:
         if self._jumped_from is not None and stamp > self._jumped_from:
             dt = (stamp - self._jumped_from) * 1e-9 - self._counted
         self._jumped_from = self.stamp if self.stamp is not None and stamp < self.stamp else None
+        self.went_back |= dt < -JUMP * 1e-9
         if dt < _FASTEST:
             dt = self._counted = self.usual or NOMINAL
         if self.stamp is not None:

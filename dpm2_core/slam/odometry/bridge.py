@@ -60,6 +60,7 @@ class Bridge:
         tries: scans that were registered to the map before, without those after which it had `agreed`: a robot that
             has halted shows no motion.
         held: whether they were held back on their way: the pause may have been as short as a period.
+        endless: time has gone back: it may have been as short, or the stretch is another drive, from anywhere.
     """
 
     def __init__(self, registration: ScanRegistration, motion: MotionState, left: float) -> None:
@@ -68,7 +69,7 @@ class Bridge:
         self.twist, self._motion = motion.twist, motion.known_twist
         self._speed = float(np.linalg.norm(self._motion[3:]))
         self.tries, self.agreed = 0, False
-        self.held = self._stepped = False
+        self.held = self._stepped = self.endless = False
         self._T, self._of_velocity, self._left = motion.T_registered, motion.of_velocity, left
         self._settings = motion.settings
         self._ties: list[_Tie] = []
@@ -90,7 +91,7 @@ class Bridge:
         """
         self._seconds = seconds = now - self._left
         self._stepped |= stepped
-        self.held = self._stepped
+        self.held = self._stepped or self.endless
         self._ties.clear()
         self._after: Array | None = None
         self._turning = None if imu is None else imu.turning
@@ -102,7 +103,8 @@ class Bridge:
         else:
             acceleration, of_velocity = self._settings.steadiness, self._of_velocity
             of_turn = None if imu is None else imu.covariance(seconds)
-            self._of_begin = covariance(self._speed, seconds, acceleration, of_velocity, of_turn=of_turn)
+            unknown = np.inf if self.endless else seconds
+            self._of_begin = covariance(self._speed, unknown, acceleration, of_velocity, of_turn=of_turn)
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:

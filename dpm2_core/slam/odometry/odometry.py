@@ -221,7 +221,7 @@ class Odometry:
         """
         least = SLOWEST if frame.dropped else self._settings.pause
         known = len(self._registration) > 0 and frame.problem is None
-        return known and self._motion.seconds + dt > self._clock.pause(least)
+        return known and (self._clock.went_back or self._motion.seconds + dt > self._clock.pause(least))
 
     def _begin_stretch(self, dt: float, stepped: bool) -> Array:
         """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns; `stepped` if
@@ -230,6 +230,8 @@ class Odometry:
         if self._bridge is None:
             imu, reckoned, step = motion.inertial, motion.reckoned, None if motion.other is None else motion.other.step
             self._bridge = Bridge(self._registration, motion, self._clock.now - motion.seconds - dt)
+        self._bridge.endless |= self._clock.went_back
+        self._clock.went_back = False
         self._registration, self._first = self._registration.fresh(), None
         T_other = None if step is None else motion.T_registered @ step.T
         motion.begin(self._bridge.begin(self._clock.now, T_other, imu, reckoned, stepped))

@@ -54,6 +54,15 @@ def test_a_pause_after_a_stamp_that_jumped_back_is_one() -> None:
     assert clock.now == pytest.approx(2.2)
 
 
+def test_time_that_goes_back_by_more_than_a_second_is_told_until_somebody_has_looked() -> None:
+    clock = StreamClock()
+    told = []
+    for stamp in (9000, 9100, 8100, 8200, 9200, 8100, 8200):
+        clock.advance(stamp * 10**6)
+        told.append(clock.went_back)
+    assert told == [False] * 5 + [True] * 2
+
+
 def test_lost_frames_and_two_of_a_burst_do_not_change_the_usual_period() -> None:
     """Before five periods none is usual."""
     clock = StreamClock()

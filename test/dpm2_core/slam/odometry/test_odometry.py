@@ -492,6 +492,16 @@ def test_stamps_that_repeat_jump_back_or_pause(suburb_drive: Drive, stamps: list
 
 
 @pytest.mark.slow
+def test_a_clock_that_is_set_back_by_seconds_costs_two_scans(suburb_drive: Drive) -> None:
+    """Another drive may have begun: three scans show that the drive goes on where it was."""
+    frames = [replace(f, stamp=f.stamp - (f.index >= 8) * 5 * 10**9) for f in suburb_drive[0][:14]]
+    tracked = track(frames)
+    assert errors(tracked, suburb_drive[1][:14])[:, 0].max() < 0.05
+    assert [t.registration.ok for t in tracked] == [True] * 8 + [False] * 2 + [True] * 4
+    assert {t.state for t in tracked[10:]} == {State.TRACKING}
+
+
+@pytest.mark.slow
 def test_fast_start(suburb_drive: Drive) -> None:
     """Three meters between the first two scans: no velocity is known yet."""
     frames = [replace(f, stamp=i * 10**8) for i, f in enumerate(suburb_drive[0][::3])]
