@@ -14,7 +14,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray, UInt32MultiArray
 
-from dpm2_core.data.thumbnail import image_of
+from dpm2_core.data.thumbnail import image_of, within
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Fix
@@ -31,7 +31,7 @@ have half of it, 325 of 128 channels: beside more the cloud would have too few p
 
 _FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
 _OF_FIX, _OF_THUMBNAIL = "fix", "thumbnail"
-_LARGEST_THUMBNAIL = 20_000  # bytes: one of 320 pixels has 6000; a larger one would cost the cloud its points
+_LARGEST_THUMBNAIL = 20_000  # bytes: more would cost the cloud its points. One of 320 pixels has 6000 to 25 000
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
 
@@ -68,15 +68,15 @@ class Payload(NamedTuple):
 def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
     """Descriptors and payload of a keyframe, the cloud downsampled until both are within `BUDGET`.
 
-    Behind the cloud are its fix and its thumbnail, if it has them, as dimensions more.
+    Behind the cloud are its fix and its thumbnail, if it has them, as dimensions more; a large thumbnail comes smaller.
     """
     d, fix, thumbnail = keyframe.descriptors, keyframe.fix, keyframe.thumbnail
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
     behind = {}
     if fix is not None:
         behind[_OF_FIX] = _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
-    if thumbnail is not None and len(thumbnail) <= _LARGEST_THUMBNAIL:
-        behind[_OF_THUMBNAIL] = thumbnail
+    if thumbnail is not None and (picture := within(thumbnail, _LARGEST_THUMBNAIL)) is not None:
+        behind[_OF_THUMBNAIL] = picture
     room = BUDGET - len(descriptors.data) - sum(map(len, behind.values()))
     cloud, voxel = keyframe.cloud, 0.3
     while len(packed := pack_cloud(cloud, keyframe.origin)) > room:

@@ -30,6 +30,19 @@ def thumbnail(image: Image, width: int) -> bytes:
     return _with_camera(image.camera.resized(width, height), bytes(jpeg)[2:])
 
 
+def within(jpeg: bytes, most: int) -> bytes | None:
+    """A `thumbnail`, made smaller until it has so many bytes at most; None for a larger JPEG without a camera."""
+    if len(jpeg) <= most:
+        return jpeg
+    if (image := usable_image(jpeg)) is None:
+        return None
+    width = image.camera.size[0]
+    while len(jpeg) > most:
+        width = round(0.9 * width)
+        jpeg = thumbnail(image, width)
+    return jpeg
+
+
 def moved_thumbnail(jpeg: bytes, T_new_old: Array) -> bytes:
     """A `thumbnail` with its camera placed in another frame than the LiDAR's, by (4, 4) T_new_old."""
     (length,) = struct.unpack_from(">H", jpeg, 4)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import PointField
 
-from dpm2_core.data.thumbnail import thumbnail
+from dpm2_core.data.thumbnail import image_of, thumbnail
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Fix
@@ -54,10 +54,27 @@ def test_fix_thumbnail_and_origin_travel_with_the_cloud(
     assert len(payload.cloud) + len(picture or b"") < BUDGET
 
 
-def test_a_picture_that_would_cost_the_cloud_its_points_stays_at_home(noise: np.random.Generator) -> None:
-    picture = thumbnail(make_image(noise, (1024, 768)), 1024)
+@pytest.mark.parametrize(("size", "width"), [((1024, 768), 1024), ((720, 720), 320)], ids=["wide", "square"])
+def test_a_picture_that_would_cost_the_cloud_its_points_comes_smaller(
+    noise: np.random.Generator, size: tuple[int, int], width: int
+) -> None:
+    """As wide as `slam.map.thumbnail` may be; or of a square camera, as wide as those by which places are found."""
+    picture = thumbnail(make_image(noise, size), width)
     assert len(picture) > 20_000
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1])
+    assert payload.fix is not None
+    assert payload.thumbnail is not None
+    assert 14_000 < len(payload.thumbnail) <= 20_000  # it has not lost more than it must
+    whole, small = image_of(picture), image_of(payload.thumbnail)
+    assert small.camera.size[0] / small.camera.size[1] == pytest.approx(size[0] / size[1], rel=0.01)  # whole pixels
+    np.testing.assert_array_equal(small.camera.K, whole.camera.resized(*small.camera.size).K)
+    np.testing.assert_array_equal(small.camera.T_lidar_cam, whole.camera.T_lidar_cam)
+
+
+def test_a_large_picture_without_a_camera_stays_at_home(noise: np.random.Generator) -> None:
+    """It could not be used; no node makes such a one."""
+    picture = thumbnail(make_image(noise, (1024, 768)), 1024)
+    payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture.replace(b'"size"', b'"seize"')), "a/3")[1])
     assert payload.thumbnail is None
     assert payload.fix is not None
 
