@@ -132,21 +132,29 @@ def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
 
     A node's neighbors are joined to that one of them which the odometry ties to it best, each by the composition of
     two edges: one edge less a node, as on a chain. (Exact marginalisation would join every one with every other.)
-    Rejected loops of a node go with it.
+    Rejected loops of a node go with it. Of what is composed between the same two the surest stays: else the loops of
+    all laps would be carried along to the last one.
     """
     left: dict[int, Edge] = dict(enumerate(edges))
     at: dict[int, set[int]] = {}
     for number, edge in left.items():
         at.setdefault(edge.from_node, set()).add(number)
         at.setdefault(edge.to_node, set()).add(number)
-    count = len(left)
+    count, made = len(left), dict[tuple[int, int, str], int]()
     for node in nodes:
         numbers = sorted(at.pop(node, ()))
         incident = [left.pop(number) for number in numbers]
         for number, edge in zip(numbers, incident, strict=True):
             at[edge.from_node if edge.to_node == node else edge.to_node].discard(number)
         for edge in _joined(node, [edge for edge in incident if edge.ok]):
-            left[count] = edge
+            ends = edge.from_node, edge.to_node, edge.kind
+            if (known := left.get(before := made.get(ends, -1))) is not None:
+                if np.trace(known.covariance) <= np.trace(edge.covariance):
+                    continue
+                del left[before]
+                at[edge.from_node].discard(before)
+                at[edge.to_node].discard(before)
+            left[count], made[ends] = edge, count
             at[edge.from_node].add(count)
             at[edge.to_node].add(count)
             count += 1
