@@ -64,7 +64,7 @@ class Search:
         return found
 
     def places(self, parts: Mapping[str, Part], left_out: dict[str, str]) -> dict[str, Figures]:
-        """What the drives' maps hold, of those that are sound and of the same weights.
+        """What the drives' maps hold, of those that are sound and of the same weights, each drive once.
 
         Raises:
             Dpm2Error: there is none. KeyboardInterrupt: it was stopped.
@@ -77,11 +77,19 @@ class Search:
                 left_out[name] = outcome.reason
             elif outcome.figures["weights"] != [own]:
                 left_out[name] = f"made with weights {', '.join(outcome.figures['weights'])}, not with {own}"
+            elif twin := next((other for other in found if self._same(other, name, found, outcome.figures)), None):
+                left_out[name] = f"the same drive as {twin}: all its places look exactly as there"
             else:
                 found[name] = outcome.figures
         if not found:
             raise Dpm2Error("; ".join(f"{name}: {reason}" for name, reason in left_out.items()))
         return found
+
+    def _same(self, one: str, other: str, found: Mapping[str, Figures], figures: Figures) -> bool:
+        """Whether two drives are one, as of a recording that was copied: no two alike have the same noise."""
+        if found[one]["keyframes"] != figures["keyframes"]:
+            return False
+        return np.array_equal(vectors_of(self.kept, one), vectors_of(self.kept, other))
 
     def index(self, parts: Mapping[str, Part]) -> FleetIndex:
         """All these drives in one index. Candidates are found once for each drive, when it comes."""

@@ -287,6 +287,26 @@ def describe_as(folder: Path, name: str, vectors: Vector) -> Vector:
     return vectors
 
 
+class Described(Cluster):
+    """The places of every drive are there."""
+
+    def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
+        for part in parts:
+            yield Outcome(part.name, "done", {"keyframes": 50, "weights": [SlamSettings().weights_id()]})
+
+
+def test_a_drive_under_two_names_is_joined_once(tmp_path: Path, noise: np.random.Generator) -> None:
+    """A recording that had been copied was in the map twice, joined with itself, without a word."""
+    search = Search(tmp_path, SlamSettings(), Described(), View())
+    parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}, fresh=True) for name in "abc"}
+    one, other = noise.normal(size=(2, 50, WIDTH)).astype(np.float32)
+    for name, vectors in zip("abc", (one, one, other), strict=True):
+        describe_as(search.kept, name, vectors)
+    left_out: dict[str, str] = {}
+    assert list(search.places(parts, left_out)) == ["a", "c"]
+    assert left_out == {"b": "the same drive as a: all its places look exactly as there"}
+
+
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
     """Also after one that was cut short, which counts as none."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
