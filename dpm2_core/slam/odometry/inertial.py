@@ -212,13 +212,22 @@ class InertialMotion:
         s, parts = self._samples, np.append((np.arange(_PARTS) + 0.5) / _PARTS, 1.0)
         return turned((s.stamps - before) * 1e-9, s.rates - self._bias, parts * (stamp - before) * 1e-9)
 
+    def denied(self, scans: Array, seconds: float) -> bool:
+        """Whether scans that show a turn (3, 3) in the `seconds` since the last registered frame deny the measured one.
+
+        A drive's first map is of scans that were straightened by it before any has confirmed it.
+        """
+        return self.turn is not None and self._off(self.turn, scans, seconds) > _UNSEEN
+
     def _judge(self, measured: Array, scans: Array, seconds: float) -> None:
         """Compare two turns (3, 3)."""
-        angle = _angle(measured)
-        if max(angle, _angle(scans)) < _TURNING * seconds:
-            return
-        variance = (3 * _TURN) ** 2 + (0.05 * angle) ** 2 + self._variance * seconds**2
-        self._doubt.add(_angle(measured.T @ scans) ** 2 / variance)
+        if max(_angle(measured), _angle(scans)) >= _TURNING * seconds:
+            self._doubt.add(self._off(measured, scans, seconds))
+
+    def _off(self, measured: Array, scans: Array, seconds: float) -> float:
+        """Squared sigmas between two turns (3, 3)."""
+        variance = (3 * _TURN) ** 2 + (0.05 * _angle(measured)) ** 2 + self._variance * seconds**2
+        return _angle(measured.T @ scans) ** 2 / variance
 
     def _correct(self, R: Array) -> None:
         """The bias, by what the scans say of the last second or more; the last of them has the axes R (3, 3)."""

@@ -174,7 +174,12 @@ class Odometry:
         self._clock.correct(dt)
         if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
             frame, self._motion.reckoned = replace(frame, imu=None), None
-        match, motion = self._unbent(frame, match, twist, dt), self._motion
+        motion, imu = self._motion, self._motion.inertial
+        if self._first is not None and imu is not None and match.result.ok:
+            T_first_this = se3.inverse(motion.T) @ match.result.T_target_source
+            if imu.denied(T_first_this[:3, :3], motion.seconds + dt):
+                self._first, frame = replace(self._first, imu=None), replace(frame, imu=None)
+        match = self._unbent(frame, match, twist, dt)
         known = motion.twist is not None and match.result.method not in ("none", "first")
         if known and motion.turn is not None and not match.result.ok:
             again = self._matcher.again_without_imu(frame, dt, self._sweep.span / 2)
