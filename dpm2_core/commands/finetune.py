@@ -41,9 +41,9 @@ def finetune(
     data: dict[str, object] = {"SRC": [str(path.resolve()) for path in src]}
     if chosen.rehearsal:
         data["content of rehearsal"] = packed_digest(open_packed(Path(chosen.rehearsal)))
+    sources = [open_source(path, chosen.input) for path in src]  # before anything is written
     begin_or_resume(out, resume, chosen, [start], data)
     network = load_network(chosen.weights, threads=2).settings
-    sources = [open_source(path, chosen.input) for path in src]
     console = Console(stderr=True)
     with console.status("") as status:
         for text in finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update):

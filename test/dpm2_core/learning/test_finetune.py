@@ -262,6 +262,7 @@ def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: F
         assert done.returncode == 2
         assert message in done.stderr
         assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "o").exists()  # as of every request that cannot be carried out
 
 
 def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
