@@ -38,6 +38,8 @@ LATCHED = (naming.TF_STATIC, naming.VERTICAL_ANGLE_CORRECTION)
 _STATIC = naming.TF_STATIC, "tf2_msgs/msg/TFMessage"  # and its type
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
+HELD_UP = 1.0
+"""Seconds that a message may be late and those after it catch up: a node has room for ten clouds."""
 DELIVERY = 5.0
 """Seconds that the end of a recording may take to arrive: a receipt that is lost is asked for again after three."""
 
@@ -242,7 +244,7 @@ class BagPlayer:
             if not count:
                 origin = log_time, time.monotonic()
             if self._lockstep is None:
-                self._pace(log_time, *origin)
+                origin = self._pace(log_time, *origin)
             else:
                 self._lockstep.turn(topic, data)
             if STOP.is_set():
@@ -258,12 +260,21 @@ class BagPlayer:
                 self._published.append(f"{topic},{log_time},{published}\n")
         return count
 
-    def _pace(self, log_time: int, origin: int, began: float) -> None:
-        """Until a message is due, of a recording that begins at `origin` ns and was begun at `began` s."""
+    def _pace(self, log_time: int, origin: int, began: float) -> tuple[int, float]:
+        """Until a message is due, of a recording that begins at `origin` ns and was begun at `began` s; returns both.
+
+        Where it was due long ago, as the process was stopped or the disk kept it waiting, it is the beginning of the
+        rest: what was due meanwhile, all at once, would be more than who listens has room for.
+        """
         due = began + (log_time - origin) * 1e-9 / self._options.rate
         while (left := due - time.monotonic()) > 0 and not STOP.is_set():
             self._tick(log_time - round(left * self._options.rate * 1e9))
             STOP.wait(min(left, CLOCK_PERIOD))
+        if left >= -HELD_UP:
+            return origin, began
+        text = f"{-left:.1f} s behind, as after a stop: goes on from there, at its pace"
+        self._node.get_logger().warning(text, throttle_duration_sec=5)
+        return log_time, time.monotonic()
 
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the stretch that is asked for."""

@@ -125,6 +125,35 @@ def test_each_message_goes_out_when_it_is_due(
     assert np.abs(late).max() < 1e6  # ns: a microsecond for each look at the clock
 
 
+def test_after_a_stop_the_rest_keeps_its_pace(
+    listener: Listener, bag: Path, drive: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As of a terminal (Ctrl-Z), or of a disk that keeps it waiting: the clouds of that time do not come at once. One
+    that is late by less is caught up with."""
+    for seconds in (0.5, 4.0):
+        virtual, log = VirtualTime(), tmp_path / f"{seconds}.csv"
+        began, stopped = virtual.now, seconds
+
+        def monotonic(virtual: VirtualTime = virtual, began: float = began) -> float:
+            nonlocal stopped
+            virtual.now += 1e-6
+            if virtual.now > began + 0.72 and stopped:  # in the middle of the drive
+                virtual.now, stopped = virtual.now + stopped, 0.0
+            return virtual.now
+
+        monkeypatch.setattr(virtual, "monotonic", monotonic)
+        for name in ("time", "STOP"):
+            monkeypatch.setattr(f"dpm2_ros.bag_player.{name}", virtual)
+        listener.hear_here(bag, log=log, topics=(naming.POINTS,))
+        with log.open() as file:
+            rows = list(csv.DictReader(file))
+        recorded, published = (np.array([int(r[key]) * 1e-9 for r in rows]) for key in ("log_time_ns", "published_ns"))
+        late = (published - published[0]) - (recorded - recorded[0])
+        assert len(rows) == drive.frames
+        assert late[-1] == pytest.approx(0.0 if seconds < 1 else 4.0, abs=0.1)  # s: a period
+        assert (np.diff(published).min() < 0.01) == (seconds < 1)
+
+
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
     listener.hear_here(bag, start=0.45, duration=0.4, topics=(naming.POINTS, naming.TF_STATIC))
     listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
