@@ -99,21 +99,23 @@ class ActiveMap:
         """End the map that grows, if it does, and look for the robot in its file; says so in words.
 
         Args:
-            name: of another map in the folder of maps.
+            name: of another map in the folder of maps. One that grows without a file is saved in its folder first.
 
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
         self._complete()
-        path = self._maps.file(name) if name else None
+        path, saved = self._maps.file(name) if name else None, ""
         if path is not None and (self._path is None or path.resolve() != self._path.resolve()):
+            saved = self.keep() if self._store is None else ""  # else nothing would have it
             self._exchange(open_for_localization(path, self._config.slam))
         else:
             if self.localizer is None:
                 self._check_places()
                 self.close()  # before it is opened again: beside a reader FILE-wal would stay
             self._exchange(self._opened())
-        return f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
+        looking = f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
+        return "; ".join(filter(None, (saved, looking)))
 
     def _check_places(self) -> None:
         """Whether one could find oneself in the map that grows."""

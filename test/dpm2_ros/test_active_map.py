@@ -331,6 +331,28 @@ def test_a_growing_map_that_does_not_serve_goes_on(tmp_path: Path, descriptors: 
     assert check_map(tmp_path / "drive.dpm2map").keyframes == 5
 
 
+def another_map(folder: Path) -> None:
+    """A map of one keyframe, saved in that folder as town, in which one may find oneself."""
+    made = ActiveMap(described(map_directory=str(folder)), "", LOG)
+    made.add(street(0))
+    made.save("town")
+    made.close()
+
+
+@pytest.mark.weights
+def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: Path) -> None:
+    """Nothing else would have it; a name that names no map leaves the drive in one piece."""
+    another_map(tmp_path)
+    active = driven(3, map_directory=str(tmp_path), map_file="")
+    with pytest.raises(UsageError, match="no such map file"):
+        active.localise("nowhere")
+    active.add(keyframes(4)[3])
+    folder, looking = tmp_path / "drive", f"looking for the robot in {tmp_path / 'town.dpm2map'}, 1 keyframes"
+    assert active.localise("town") == f"map of 4 keyframes saved in {folder}; {looking}"
+    active.close()
+    assert len((folder / "trajectory.tum").read_text().splitlines()) == 1 + 4
+
+
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
     """A looped bag, a clock that was set back: a stretch of its own, whose ids count on."""
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
