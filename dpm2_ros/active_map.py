@@ -45,6 +45,7 @@ class ActiveMap:
         self._maps = MapFolder(Path(ros.map_directory) if ros.map_directory else None, robot)
         self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
         self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
+        self._copies: dict[Path, Path] = {}  # map files that were saved last under a name, by what it asks for
         self.located: LocalizationResult | None = None
         self.file_problem = ""
         self._unreadable = False  # a keyframe of the map to be found in
@@ -99,13 +100,15 @@ class ActiveMap:
         """End the map that grows, if it does, and look for the robot in its file; says so in words.
 
         Args:
-            name: of another map in the folder of maps. One that grows without a file is saved in its folder first.
+            name: of another map in the folder of maps; that which was saved last under it, if one was. A map that grows
+                without a file is saved in its folder first.
 
         Raises:
             UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
         """
         self._complete()
-        path, saved = self._maps.file(name) if name else None, ""
+        asked, saved = self._maps.file(name) if name else None, ""
+        path = None if asked is None else self._copies.get(asked, asked)
         if path is not None and (self._path is None or path.resolve() != self._path.resolve()):
             saved = self.keep() if self._store is None else ""  # else nothing would have it
             self._exchange(open_for_localization(path, self._config.slam))
@@ -228,6 +231,7 @@ class ActiveMap:
         if name and isinstance(self._store, MapStore):
             path = file_beside(folder)
             self._store.copy_to(path)
+            self._copies[self._maps.file(name)] = path
         file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
         if self.file_problem:
             file = f", but there is no map file: {self.file_problem}"

@@ -95,8 +95,9 @@ class RosSettings(Settings):
     these."""
 
     map_name: str = Field(default="", pattern=r"^(\w[\w.-]{0,99})?$")
-    """Name within `map_directory`, such as town: ~/save_map also writes NAME.dpm2map, beside the folder NAME, and
-    ~/load_map looks for the robot in that map. Empty: the drive's own."""
+    """Name within `map_directory`, such as town: ~/save_map also writes NAME.dpm2map, beside the folder NAME, with a
+    number where another drive has it; ~/load_map looks for the robot in what was saved last under that name, else in
+    NAME.dpm2map. Empty: the drive's own."""
 
     map_file: str = "auto"
     """Map file that is written as the drive goes on, so that a crash costs no more than a keyframe; `dpm2 map` reads

@@ -353,6 +353,19 @@ def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: 
     assert len((folder / "trajectory.tum").read_text().splitlines()) == 1 + 4
 
 
+@pytest.mark.weights
+def test_what_was_saved_last_under_a_name_is_what_is_loaded_by_it(tmp_path: Path) -> None:
+    """Not the map of another drive that has the name, and for which the copy has got a number."""
+    another_map(tmp_path)
+    active = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
+    for n in (0, 5):
+        active.add(street(n))
+    assert str(tmp_path / "town-2.dpm2map") in active.save("town")
+    for name in ("town", "town.dpm2map", "town"):
+        assert active.localise(name) == f"looking for the robot in {tmp_path / 'town-2.dpm2map'}, 2 keyframes"
+    active.close()
+
+
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
     """A looped bag, a clock that was set back: a stretch of its own, whose ids count on."""
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
