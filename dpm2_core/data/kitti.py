@@ -25,7 +25,7 @@ from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import parse_row, read_lines, read_numbers
 from dpm2_core.data.time_order import out_of_order
 from dpm2_core.data.velodyne import VelodyneDrive
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, checked_correction
+from dpm2_core.data.vertical_angle import checked_correction
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
@@ -116,7 +116,7 @@ class KittiSource(VelodyneDrive):
         try:
             message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
-            return HDL64_CORRECTION_DEG
+            return self._kittis_correction()
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
         return checked_correction(message, str(note))

@@ -17,7 +17,6 @@ from dpm2_core.data.scan_file import KITTI_RAW, chosen
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.text import read_keyed, read_numbers, required
 from dpm2_core.data.velodyne import VelodyneDrive
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -42,7 +41,8 @@ class KittiRawSource(VelodyneDrive):
         self.path = _find(Path(path), settings.sequence)
         scans = self.path / "velodyne_points"
         super().__init__(self.path.absolute().name, scans / "data", self.path / "image_02" / "data", settings)
-        self.vertical_angle_correction_deg = settings.angle_correction(HDL64_CORRECTION_DEG)
+        requested = settings.vertical_angle_correction_deg
+        self.vertical_angle_correction_deg = self._kittis_correction() if requested == "auto" else requested
         self.stamps = self._read_stamps(scans / "timestamps.txt")
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
         date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)

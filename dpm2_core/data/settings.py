@@ -99,7 +99,8 @@ class InputSettings(Settings):
 
     vertical_angle_correction_deg: Annotated[float, Field(ge=-5, le=5)] | Literal["auto"] = "auto"
     """Added to the elevation of each point, degrees. auto: what the recording says (dpm2_sim.json of a folder, topic
-    /kitti/vertical_angle_correction_deg of a bag), else KITTI's 0.205 for folders and topics under /kitti/, else 0."""
+    /kitti/vertical_angle_correction_deg of a bag), else KITTI's 0.205 for topics under /kitti/ and for its folders,
+    unless their scans show another LiDAR, else 0."""
 
     ground_truth_topic: str = ""
     """Odometry or Path topic with true poses; empty takes odom, else path, of /kitti/ground_truth, else of

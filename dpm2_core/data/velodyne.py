@@ -13,7 +13,7 @@ from dpm2_core.data.scan_file import image_of, image_size, images_of, numbered_s
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource
 from dpm2_core.data.text import date_ns, read_lines
-from dpm2_core.data.vertical_angle import correct_vertical_angle
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle, may_be_hdl64
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Frame, Points
 
@@ -73,6 +73,18 @@ class VelodyneDrive(IndexedSource):
             number = self.numbers[stamps.index(None)]
             raise UsageError(f"{path}:{number + 1}: {lines[number].strip()!r} is no time")
         return np.array(stamps, np.int64)
+
+    def _kittis_correction(self) -> float:
+        """Degrees to add to the elevation of each point where nothing is set: KITTI's, unless scans show that another
+        LiDAR made them."""
+        for position in {0, len(self) // 2, len(self) - 1}:
+            if not may_be_hdl64(read_scan(self._scans[position])[0]):
+                self.notes.append(
+                    f"{self._scans[position]}: beams that KITTI's LiDAR does not have; its correction of"
+                    f" {HDL64_CORRECTION_DEG} degrees is not applied (input.vertical_angle_correction_deg)"
+                )
+                return 0.0
+        return HDL64_CORRECTION_DEG
 
     def _image_size(self) -> tuple[int, int] | None:
         """None without images, or where none are wanted."""

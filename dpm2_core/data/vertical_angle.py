@@ -12,6 +12,20 @@ HDL64_CORRECTION_DEG = 0.205
 """What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
 
+_HIGHEST = 5.0  # degrees above level: 1.7 more than any of its points is that is...
+_FAR = 10.0  # ...so far away, m, in the drives 00 and 04
+_FEW = 100, 0.005  # points, and of the far ones, at most
+
+
+def may_be_hdl64(points: Points) -> bool:
+    """Whether (N, 4) points can be of KITTI's LiDAR, whose highest beam is 2 degrees above level: most other ones look
+    up by 10 degrees or more."""
+    level = np.hypot(points[:, 0], points[:, 1])
+    far = level > _FAR  # False for NaN
+    high = points[far, 2] > level[far] * np.float32(np.tan(np.radians(_HIGHEST)))
+    return bool(high.sum() <= max(_FEW[0], _FEW[1] * len(high)))
+
+
 def checked_correction(value: float, where: str) -> float:
     """A correction from a file or a message, within the bounds of the setting.
 

@@ -13,7 +13,7 @@ import pytest
 
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
-from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
+from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle, may_be_hdl64
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 
@@ -152,6 +152,25 @@ def test_correction_is_on_for_kitti_and_off_where_the_simulator_says_so(kitti_fo
         UsageError, match=r"dpm2_sim.json: want a vertical angle correction of -5 to 5 degrees, got nan"
     ):
         KittiSource(folder)
+
+
+def test_scans_of_another_lidar_in_its_layout_are_not_corrected(kitti_folder: MakeFolder) -> None:
+    """One of 16 beams up to 15 degrees, with what stands around it 5 to 45 m away."""
+    folder, noise = kitti_folder(), np.random.default_rng(0)
+    angle, up = noise.uniform(-np.pi, np.pi, 8000), np.radians(noise.integers(-7, 8, 8000) * 2)
+    away = np.where(up < 0, np.minimum(1.7 / np.maximum(np.tan(-up), 0.01), 45), noise.uniform(5, 45, 8000))
+    other = np.column_stack([away * np.cos(angle), away * np.sin(angle), away * np.tan(up), 0 * up]).astype("<f4")
+    other.tofile(folder / "velodyne" / "000004.bin")  # the last of five
+    source = KittiSource(folder)
+    assert source.vertical_angle_correction_deg == 0
+    assert [note for note in source.notes if "000004.bin: beams that KITTI's LiDAR does not have" in note]
+    assert KittiSource(folder, InputSettings(vertical_angle_correction_deg=0.205)).notes == []
+
+
+@pytest.mark.parametrize("sequence", ["00", "04"])
+def test_no_real_scan_is_taken_for_one_of_another_lidar(kitti_root: Path, sequence: str) -> None:
+    scans = sorted((kitti_root / "sequences" / sequence / "velodyne").iterdir())[::5]
+    assert all(may_be_hdl64(np.fromfile(path, "<f4").reshape(-1, 4)) for path in scans)
 
 
 def test_intensities_of_other_recorders_become_one_at_most(kitti_folder: MakeFolder) -> None:
