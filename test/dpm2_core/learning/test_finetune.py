@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -266,13 +267,16 @@ def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: F
 
 
 def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
-    packed: Path, samples: list[Sample], tmp_path: Path, settings: FinetuneSettings
+    recording: Path, packed: Path, samples: list[Sample], tmp_path: Path, settings: FinetuneSettings
 ) -> None:
     """Packed again, with another drive, they gave other weights without a word."""
-    asked = ["finetune", tmp_path / "none", "--out", tmp_path / "o", "--set", f"weights={settings.weights}"]
+    short = tmp_path / "short" / "velodyne" / "000000.bin"
+    short.parent.mkdir(parents=True)
+    shutil.copy(recording / "sequences" / "00" / "velodyne" / "000000.bin", short)
+    asked = ["finetune", tmp_path / "short", "--out", tmp_path / "o", "--set", f"weights={settings.weights}"]
     asked += ["--set", f"rehearsal={packed}"]
-    assert "none: no such file" in dpm2(*asked).stderr  # after what was asked for has been written
+    assert "nothing to learn" in dpm2(*asked).stderr  # after what was asked for has been written
     (tmp_path / "o" / "checkpoint.pt").touch()
-    assert "none: no such file" in dpm2(*asked, "--resume").stderr
+    assert "nothing to learn" in dpm2(*asked, "--resume").stderr
     write_packed(packed / "another", samples[:2], {"source": "boxes"})
     assert "began with content of rehearsal" in dpm2(*asked, "--resume").stderr
