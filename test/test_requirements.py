@@ -138,3 +138,11 @@ def test_a_machine_is_asked_only_for_what_exists_for_it(declared: dict[str, list
 def test_what_make_demo_and_make_test_install_has_their_extras() -> None:
     (line,) = (text for text in (ROOT / "Makefile").read_text().splitlines() if text.startswith("EXTRAS ?="))
     assert {"plot", "sim", "test"} <= set(line.partition("=")[2].strip().split(","))
+
+
+def test_make_dist_check_installs_every_extra_of_a_user(declared: dict[str, list[Requirement]]) -> None:
+    """What it leaves out its help says: a program to compare with, what makes a release, and a sum of the others."""
+    extras = r"^dist-check:.* every extra but (.*)\n\t.*tools\.check_dist dist (.*)$"
+    ((left_out, installed),) = re.findall(extras, (ROOT / "Makefile").read_text(), re.M)
+    assert set(re.findall(r"\w+", left_out.replace(" and ", " "))) == {"peers", "release", "dev"}
+    assert set(installed.split()) == declared.keys() - {"", "peers", "release", "dev"}
