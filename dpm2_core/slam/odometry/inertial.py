@@ -137,7 +137,7 @@ class InertialMotion:
         if found is None or of_turn is None:
             return None
         at, found = np.r_[0.0, at, seconds], np.r_[found[:1], found, found[-1:]]
-        farther, faster = (np.trapezoid(a, at, axis=0) for a in ((seconds - at)[:, None] * found, found))
+        farther, faster = (_integral(a, at) for a in ((seconds - at)[:, None] * found, found))
         gained, sigma = np.stack([farther, faster]) @ R, self._vertical.sigma
         way = velocity * seconds + gained[0]
         along = of_velocity * seconds**2 + (0.5 * sigma * seconds**2) ** 2 * np.eye(3)
@@ -286,3 +286,8 @@ def _at_rest(rates: Array, forces: Array) -> bool:
     noise, mean, shaking = _STEADY
     still = rates.std(0).max() < noise and np.abs(rates.mean(0)).max() < mean
     return bool(still and metric(forces).std(0).max() < shaking)  # False where they are unknown
+
+
+def _integral(values: Array, at: Array) -> Array:
+    """(3,) of (N, 3) values at (N,) s, by trapezoids: `np.trapezoid`, which numpy before 2.0 does not have."""
+    return np.asarray((np.diff(at)[:, None] * (values[1:] + values[:-1]) / 2.0).sum(0))

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +142,17 @@ def test_errors_of_use(recording: Path, tmp_path: Path, arguments: list[str], wo
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments", [["--out", "FILE"], ["--out", "FILE/below"], ["--record", "/nowhere/run.rrd"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--out", "FILE"],
+        ["--out", "FILE/below"],
+        pytest.param(
+            ["--record", "/nowhere/run.rrd"],
+            marks=pytest.mark.skipif(find_spec("rerun") is None, reason="needs the extra view"),
+        ),
+    ],
+)
 def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map_and_no_settings(
     recording: Path, tmp_path: Path, arguments: list[str]
 ) -> None:
