@@ -85,7 +85,7 @@ class Descriptors:
     @property
     def R_level_set(self) -> NDArray[np.float32]:
         """(3, 3) turns the frame of the set into the level axes nearest to it."""
-        return np.eye(3, dtype=np.float32) if self.up is None else levelling(self.up)
+        return levelling(self.up)
 
     def as_encoded(self) -> Descriptors:
         """The same as the network saw it: in level axes, `R_level_set`, and enlarged by `scale`."""
@@ -110,9 +110,11 @@ def is_level(up: NDArray[np.floating]) -> bool:
     return bool(up[2] >= _LEVEL)
 
 
-def levelling(up: NDArray[np.floating]) -> NDArray[np.float32]:
+def levelling(up: NDArray[np.floating] | None) -> NDArray[np.float32]:
     """(3, 3) the smallest rotation that turns a unit vector (3,) into the z axis; if it points down, after half a turn
-    about x: straight down that leaves no choice, on which rounding would decide."""
+    about x: straight down that leaves no choice, on which rounding would decide. None, of what is level: no turn."""
+    if up is None:
+        return np.eye(3, dtype=np.float32)
     x, y, z = (float(value) for value in up)
     if z < 0:
         return levelling(np.array([x, -y, -z])) * np.array([1, -1, -1], np.float32)

@@ -108,15 +108,12 @@ class KittiSource(VelodyneDrive):
             self.notes.append(f"{path}: the antenna is taken for the LiDAR: no Tr_gnss_to_velo in calib.txt")
         return sorted(found, key=lambda fix: fix.stamp)
 
-    def _correction(self) -> float:
-        requested = self._settings.vertical_angle_correction_deg
-        if requested != "auto":
-            return requested
+    def _known_correction(self) -> float:
         note = self.path / "dpm2_sim.json"  # a simulated sensor has no such error, and says so
         try:
             message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
-            return self._kittis_correction()
+            return super()._known_correction()
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
         return checked_correction(message, str(note))

@@ -41,8 +41,7 @@ class KittiRawSource(VelodyneDrive):
         self.path = _find(Path(path), settings.sequence)
         scans = self.path / "velodyne_points"
         super().__init__(self.path.absolute().name, scans / "data", self.path / "image_02" / "data", settings)
-        requested = settings.vertical_angle_correction_deg
-        self.vertical_angle_correction_deg = self._kittis_correction() if requested == "auto" else requested
+        self.vertical_angle_correction_deg = self._correction()
         self.stamps = self._read_stamps(scans / "timestamps.txt")
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
         date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)

@@ -74,9 +74,13 @@ class VelodyneDrive(IndexedSource):
             raise UsageError(f"{path}:{number + 1}: {lines[number].strip()!r} is no time")
         return np.array(stamps, np.int64)
 
-    def _kittis_correction(self) -> float:
-        """Degrees to add to the elevation of each point where nothing is set: KITTI's, unless scans show that another
-        LiDAR made them."""
+    def _correction(self) -> float:
+        """Degrees to add to the elevation of each point: what is set, else what is known of the recording."""
+        requested = self._settings.vertical_angle_correction_deg
+        return self._known_correction() if requested == "auto" else requested
+
+    def _known_correction(self) -> float:
+        """KITTI's, unless scans show that another LiDAR made them."""
         for position in {0, len(self) // 2, len(self) - 1}:
             if not may_be_hdl64(read_scan(self._scans[position])[0]):
                 self.notes.append(

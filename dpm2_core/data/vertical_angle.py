@@ -11,7 +11,6 @@ from dpm2_core.frame import Points
 HDL64_CORRECTION_DEG = 0.205
 """What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
-
 _HIGHEST = 5.0  # degrees above level: 1.7 more than any of its points is that is...
 _FAR = 10.0  # ...so far away, m, in the drives 00 and 04
 _FEW = 100, 0.005  # points, and of the far ones, at most

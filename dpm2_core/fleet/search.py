@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -71,25 +72,20 @@ class Search:
         """
         own = weights_id(self.settings.neural.weights)
         found: dict[str, Figures] = {}
+        drives: dict[bytes, str] = {}  # by all their places: no two look alike, but of a recording that was copied
         outcomes = self._done(list(parts.values()))
         for name, outcome in zip(parts, outcomes, strict=True):
             if outcome.figures is None:
                 left_out[name] = outcome.reason
             elif outcome.figures["weights"] != [own]:
                 left_out[name] = f"made with weights {', '.join(outcome.figures['weights'])}, not with {own}"
-            elif twin := next((other for other in found if self._same(other, name, found, outcome.figures)), None):
+            elif (twin := drives.setdefault(sha256(vectors_of(self.kept, name).tobytes()).digest(), name)) != name:
                 left_out[name] = f"the same drive as {twin}: all its places look exactly as there"
             else:
                 found[name] = outcome.figures
         if not found:
             raise Dpm2Error("; ".join(f"{name}: {reason}" for name, reason in left_out.items()))
         return found
-
-    def _same(self, one: str, other: str, found: Mapping[str, Figures], figures: Figures) -> bool:
-        """Whether two drives are one, as of a recording that was copied: no two alike have the same noise."""
-        if found[one]["keyframes"] != figures["keyframes"]:
-            return False
-        return np.array_equal(vectors_of(self.kept, one), vectors_of(self.kept, other))
 
     def index(self, parts: Mapping[str, Part]) -> FleetIndex:
         """All these drives in one index. Candidates are found once for each drive, when it comes."""

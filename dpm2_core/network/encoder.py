@@ -95,7 +95,7 @@ class Encoder(nn.Module):
             cloud = crop(frame.points[:, :3] * np.float32(scale), self.settings.points)
         if up is None and scale == 1:
             return self._encode(cloud, images)
-        R = np.eye(3, dtype=np.float32) if up is None else levelling(up)
+        R = levelling(up)
         views = [in_encoded_axes(image, R, scale) for image in images]
         made = self._encode(np.ascontiguousarray(cloud @ R.T), views)
         return replace(made, xyz=made.xyz @ R / np.float32(scale), up=up, scale=scale)

@@ -124,8 +124,7 @@ class MovingWindow:
         which way is up there, if that is known.
         """
         if self._window:
-            tilt = tilt_of(cloud, up)
-            T_kf_level = se3.make(np.eye(3) if tilt is None else levelling(tilt).T, origin)
+            T_kf_level = se3.make(levelling(tilt_of(cloud, up)).T, origin)
             cloud = se3.transform(se3.inverse(T_kf_level), cloud)
             self._seen.append((node, cloud, RangeImage(cloud), T_kf_level))
             if len(self._seen) > self._window:
