@@ -212,7 +212,7 @@ class Frame:
         stepped: whether less time may have passed since the frame before than the stamps say: a clock was set.
         up: (3,) unit vector along the LiDAR's axes, by its mounting upwards: so is the odometry's frame level where a
             drive begins with this frame, and what the network sees; None: both have the LiDAR's axes, as where the
-            mounting is not known or counts elsewhere.
+            mounting is not known.
     """
 
     stamp: int

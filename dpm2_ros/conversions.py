@@ -109,10 +109,10 @@ class BodyMotion:
         T_odom_other = self.T_odom_body @ se3.inverse(T_other_body)
         return BodyMotion(self.stamp, T_odom_other, A @ self.covariance @ A.T, A @ self.twist)
 
-    def of_base(self, T_base_body: Array) -> BodyMotion:
-        """That of the base, in an odom that begins at the base's first pose."""
+    def of_base(self, T_base_body: Array, T_start_odom: Array) -> BodyMotion:
+        """That of the base, in an odom that begins at the base's first pose: T_start_odom (4, 4) is odom in it."""
         moved = self.of_other(T_base_body)
-        return replace(moved, T_odom_body=T_base_body @ moved.T_odom_body)
+        return replace(moved, T_odom_body=T_start_odom @ moved.T_odom_body)
 
 
 def odometry_to_msg(
@@ -181,8 +181,9 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
     return message
 
 
-def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-    """The same place seen from the base: its pose, cloud and LiDAR, descriptors, edge, fix and picture."""
+def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Array) -> Keyframe:
+    """The same place seen from the base: its pose, in an odom that begins at the base's first pose (see `of_base`),
+    cloud and LiDAR, descriptors, edge, fix and picture."""
     edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
     if edge is not None:
         T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
@@ -195,7 +196,8 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
         keyframe,
         fix=fix,
         thumbnail=None if picture is None else moved_thumbnail(picture, T_base_lidar),
-        T_odom_kf=T_base_lidar @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
+        T_odom_kf=T_start_odom @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
+        up=None,  # a base stands
         cloud=se3.transform(T_base_lidar, keyframe.cloud),
         origin=T_base_lidar[:3, :3] @ keyframe.origin + T_base_lidar[:3, 3],
         edge=edge,

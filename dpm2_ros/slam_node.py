@@ -187,7 +187,7 @@ class SlamNode(ManagedNode):
         self._lidar_frame = lidar_frame
         self._look_for_base(lidar_frame)
         x, y, z = self._base.T_start_lidar[2, :3].tolist()
-        self._frames.up = (x, y, z) if self._base.name else None  # what is up for the base is to be up in odom
+        self._frames.up = (x, y, z) if self._base.name else None  # for the base, and so in odom
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(replace(frame, dropped=bundle.dropped, stepped=bundle.stepped))
         if tracked.imu and tracked.registration.method == "first":  # of the level; diagnostics may miss one cloud
@@ -250,14 +250,15 @@ class SlamNode(ManagedNode):
     def _hand_on(self, tracked: OdometryResult) -> OdometryResult:
         """The keyframe to the map, pose and transforms published; returns what was published."""
         mapper, T_start_lidar = self._mapper, self._base.T_start_lidar
+        T_start_odom = T_start_lidar @ se3.inverse(self._slam.odometry.T_start)
         if tracked.keyframe is not None:
-            make = partial(self._finished, tracked.keyframe, T_start_lidar)
+            make = partial(self._finished, tracked.keyframe, T_start_lidar, T_start_odom)
             if mapper is not None:
                 mapper.add(make)
             else:
                 self._line.submit(make).add_done_callback(self._report)
         tracked = replace(tracked, keyframe=None, state=self._slam.state(tracked.state))
-        self._publish(tracked, BodyMotion.of_lidar(tracked).of_base(T_start_lidar))
+        self._publish(tracked, BodyMotion.of_lidar(tracked).of_base(T_start_lidar, T_start_odom))
         self._state.send(tracked)
         return tracked
 
@@ -300,20 +301,15 @@ class SlamNode(ManagedNode):
         elif T_own_odom is not None:
             self._tf.send(T_own_odom, motion.stamp + ros.ahead, ros.odom_frame)
 
-    def _finished(self, keyframe: Keyframe, T_base_lidar: Array) -> Keyframe:
-        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as the LiDAR sees it.
-
-        One that is mounted at an angle sees it in the axes of the base.
-        """
-        described = self._slam.mapper.described
-        if not is_level(T_base_lidar[2, :3]):  # descriptors are of LiDARs that stand
-            keyframe = keyframe_to_base(keyframe, se3.make(T_base_lidar[:3, :3], np.zeros(3)))
-            T_base_lidar = se3.make(np.eye(3), T_base_lidar[:3, 3])
-            level = described(replace(keyframe, descriptors=None))
-            keyframe = keyframe if level.descriptors is None else level
-        keyframe = described(keyframe)
+    def _finished(self, keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Array) -> Keyframe:
+        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as a LiDAR that stands
+        would have them."""
+        x, y, z = T_base_lidar[2, :3].tolist()
+        if keyframe.up is None and not is_level(T_base_lidar[2, :3]):  # of a scan from before the base was known
+            keyframe = replace(keyframe, up=(x, y, z), descriptors=None)
+        keyframe = self._slam.mapper.described(keyframe)
         if not np.array_equal(T_base_lidar, np.eye(4)):
-            keyframe = keyframe_to_base(keyframe, T_base_lidar)
+            keyframe = keyframe_to_base(keyframe, T_base_lidar, T_start_odom)
         self._sender.send(keyframe)
         return keyframe
 

@@ -115,7 +115,7 @@ class BagSource:
             # By less than a second only where the cloud came when it was due: others may have been lost on the way.
             stepped = step - gone > (min(AHEAD * period, JUMP) if is_due(gone, period) else JUMP)
             period = period if stepped or step <= 0 else step
-            frame = replace(self._frames.frame(stamp, cloud, index, beside), up=self._frames.up, stepped=stepped)
+            frame = replace(self._frames.frame(stamp, cloud, index, beside), stepped=stepped)
             before, recorded_before, count = stamp, recorded, count + 1
             found.update(list(beside))
             unusable.update([topic for topic in beside if topic in self._frames.problems and not frame.problem])

@@ -96,7 +96,7 @@ class FrameBuilder:
         imu, gnss: where their messages come in; None where none are wanted.
 
     Attributes:
-        up: see `Inertial`.
+        up: that of each `Frame`, and of its `Inertial`.
         problems: topic of a sensor beside the LiDAR to why its last message could not be used; only where that is so.
         time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
     """
@@ -130,7 +130,7 @@ class FrameBuilder:
             points, offset = self._points(cloud)
         except MessageError as error:
             problem = self._tell(topic, error)
-            return Frame(stamp, NO_POINTS, index=index, problem=problem)
+            return Frame(stamp, NO_POINTS, index=index, up=self.up, problem=problem)
         expected = self._settings.time_field is None and not topic.startswith("/kitti/") and len(points)
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
@@ -142,7 +142,7 @@ class FrameBuilder:
         taken = [(camera, *beside[camera.topic]) for camera in self._calibration.cameras if camera.topic in beside]
         found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in taken)
         images = tuple(image for image in found if image is not None)
-        return Frame(stamp, points, offset, images, index, imu=imu, fix=fix)
+        return Frame(stamp, points, offset, images, index, up=self.up, imu=imu, fix=fix)
 
     def _check_frame(self, frame: str) -> None:
         """Raises MessageError for that of another LiDAR: poses of two would be taken for the motion of one."""

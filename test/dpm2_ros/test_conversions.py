@@ -145,32 +145,33 @@ def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> No
         return uv[shown], texture
 
     from_lidar, before = pixels(keyframe)
-    from_base, after = pixels(conversions.keyframe_to_base(keyframe, T_base_lidar))
+    from_base, after = pixels(conversions.keyframe_to_base(keyframe, T_base_lidar, T_base_lidar))
     assert len(from_lidar) > 1000
     np.testing.assert_allclose(from_base, from_lidar, atol=1e-2)  # the cloud is float32
     np.testing.assert_array_equal(after.levels[0], before.levels[0])  # the JPEG itself is not made anew
 
 
-@given(tangents, tangents)
-def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray) -> None:
-    """The base starts at the origin, a world point stays where it is, and steps of base and LiDAR are one motion."""
-    T_base_lidar, T_odom_lidar = se3.exp(mount), se3.exp(xi)
+@given(tangents, tangents, tangents)
+def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray, first: np.ndarray) -> None:
+    """The base starts at the origin wherever in its odometry the LiDAR does, a world point stays where it is, and steps
+    of base and LiDAR are one motion."""
+    T_base_lidar, T_odom_first, T_first_lidar = se3.exp(mount), se3.exp(first), se3.exp(xi)
+    T_start_odom, T_odom_lidar = T_base_lidar @ se3.inverse(T_odom_first), T_odom_first @ T_first_lidar
     cloud = np.array([[1, 2, 3, 0.5]], np.float32)
-    edge = Registration(T_odom_lidar, spd(4), 1.0, 0.0, "geometric")
+    edge = Registration(T_first_lidar, spd(4), 1.0, 0.0, "geometric")
     fix = Fix(5, np.array([49.0, 8.4, 110.0]), np.eye(3), np.array([1.0, 2.0, 3.0]))  # where that point is
     keyframe = Keyframe(1, 5, 0, T_odom_lidar, cloud, edge, fix=fix)
-    base = motion(T_odom_lidar).of_base(T_base_lidar)
-    start = motion(np.eye(4)).of_base(T_base_lidar)
+    base = motion(T_odom_lidar).of_base(T_base_lidar, T_start_odom)
+    start = motion(T_odom_first).of_base(T_base_lidar, T_start_odom)
     np.testing.assert_allclose(start.T_odom_body, np.eye(4), atol=EXACT)
-    # odom of the base is the base at the start: T_odombase_odomlidar = T_base_lidar
-    np.testing.assert_allclose(base.T_odom_body @ T_base_lidar, T_base_lidar @ T_odom_lidar, atol=EXACT)
-    seen = conversions.keyframe_to_base(keyframe, T_base_lidar)
+    np.testing.assert_allclose(base.T_odom_body @ T_base_lidar, T_base_lidar @ T_first_lidar, atol=EXACT)
+    seen = conversions.keyframe_to_base(keyframe, T_base_lidar, T_start_odom)
     assert seen.edge is not None
     assert seen.fix is not None
     np.testing.assert_allclose(seen.fix.antenna, seen.cloud[0, :3], atol=1e-5)
     np.testing.assert_allclose(seen.origin, T_base_lidar[:3, 3], atol=EXACT)
     in_odom = seen.T_odom_kf @ np.append(seen.cloud[0, :3].astype(float), 1)
-    expected = T_base_lidar @ T_odom_lidar @ np.append(cloud[0, :3].astype(float), 1)
+    expected = T_base_lidar @ T_first_lidar @ np.append(cloud[0, :3].astype(float), 1)
     np.testing.assert_allclose(in_odom, expected, atol=1e-5)  # the cloud is float32
     np.testing.assert_allclose(seen.edge.T_target_source, seen.T_odom_kf, atol=EXACT)
     # exp(twist dt) of the base is the conjugated one of the LiDAR

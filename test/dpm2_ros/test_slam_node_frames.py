@@ -84,6 +84,21 @@ def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Ri
     np.testing.assert_allclose(found.T_target_source, se3.make(np.eye(3), -T_base_lidar[:3, 3]), atol=0.1)
 
 
+@pytest.mark.weights
+def test_the_network_is_told_how_a_lidar_hangs(rig: Callable[..., Rig], drive: Any) -> None:
+    """Where the odometry is the network's alone: with its poses level, the base still begins at the origin."""
+    T_base_lidar = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5])
+    r = rig("slam.registration:=neural")
+    publish_static(r, "base_link", "lidar", T_base_lidar)
+    for n in range(6):
+        hanging = se3.transform(se3.exp([-np.pi, 0, 0, 0, 0, 0]), scan(drive.pose(n)))
+        r.lidar.publish(cloud_to_msg(hanging.astype(np.float32), drive.stamp(n), "lidar"))
+        r.processed(n + 1)
+    np.testing.assert_allclose(r.node.slam.odometry.T_start[2, :3], T_base_lidar[2, :3], atol=1e-9)
+    T_base_standing = se3.make(np.eye(3), T_base_lidar[:3, 3])
+    assert r.off(lambda n: T_base_standing @ drive.pose(n) @ se3.inverse(T_base_standing)) < ACCURATE
+
+
 def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     rig: Callable[..., Rig], drive: Any
 ) -> None:

@@ -80,4 +80,4 @@ def contents(frame: Frame) -> list[Any]:
     offset = None if frame.time_offset is None else frame.time_offset.tobytes()
     imu = None if frame.imu is None else [frame.imu.stamps.tolist(), frame.imu.rates.tobytes()]
     fix = None if frame.fix is None else frame.fix.stamp
-    return [frame.index, frame.stamp, frame.problem, frame.points.tobytes(), offset, images, imu, fix]
+    return [frame.index, frame.stamp, frame.problem, frame.points.tobytes(), offset, images, imu, fix, frame.up]

@@ -35,6 +35,7 @@ class MotionState:
     Attributes:
         settings: of what a vehicle can do.
         T, covariance: the last frame's pose (4, 4), registered or predicted, and its covariance (6, 6) [rad, m].
+        T_start: (4, 4) the pose of the first frame, level by its `Frame.up`.
         twist: (6,) [rad/s, m/s] in the middle of the sweep of the last registered frame, or else from the one before to
             it; None until there are two.
         sweep: the motion during the sweep of the last registered frame, where its points have shown it.
@@ -49,6 +50,7 @@ class MotionState:
     def __init__(self, settings: OdometrySettings) -> None:
         self.settings = settings
         self.T, self.covariance = np.eye(4), np.zeros((6, 6))
+        self.T_start = self.T
         self.twist: Array | None = None
         self.sweep: Swept | None = None
         self.change = np.zeros(6)
@@ -66,7 +68,7 @@ class MotionState:
     def start(self, up: Up | None) -> None:
         """Of the first frame: its pose has `up` (3,), of `Frame`, upwards. Later ones change nothing."""
         if not self._started and up is not None:
-            self.T = self.T_registered = se3.make(leveled(up), np.zeros(3))
+            self.T = self.T_registered = self.T_start = se3.make(leveled(up), np.zeros(3))
         self._started = True
 
     def look(self, frame: Frame, starts: bool) -> Frame:

@@ -59,6 +59,11 @@ class Odometry:
         return ""
 
     @property
+    def T_start(self) -> Array:
+        """(4, 4) the pose with which it began, without what an IMU says of the vertical: level by `Frame.up`."""
+        return self._motion.T_start
+
+    @property
     def uses_images(self) -> bool:
         """Whether frames should come with their images."""
         return self._registration.uses_images
