@@ -38,7 +38,8 @@ from dpm2_core.slam.mapping.prune import prune, redundant_nodes
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.cloud_codec import unpack_mask
-from dpm2_core.slam.store.map_data import MapData, load_map, map_cloud, save_as
+from dpm2_core.slam.store.map_cloud import map_cloud
+from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 

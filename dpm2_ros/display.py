@@ -25,6 +25,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
 from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg, poses_to_msgs
 
+_REST = 4.0  # times as long as the work at one message took, from its begin to that of the next at least
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
 
@@ -120,20 +121,28 @@ class Projection:
 
 
 class Display:
-    """A large message that is built only if it has a subscriber, has changed, and its period has passed."""
+    """A large message that is built only if it has a subscriber, has changed, and its period has passed.
+
+    Of a large map it takes longer: after so much work the thread of the map has three times as long for the rest.
+    """
 
     def __init__(self, publisher: Any, period: Callable[[], float], make: Callable[[], Any]) -> None:
+        """`make`: called in the map's thread; None: there is more to do, and it is called again."""
         self._publisher, self._period, self._make = publisher, period, make
         self._shown = 0
-        self._last = -np.inf
-        self._working = False
+        self._last, self._worked = -np.inf, 0.0
+        self._working = self._begun = False
 
     def due(self, changes: int) -> bool:
         """Whether to publish now; if so, `publish` is expected to follow."""
-        waited = time.monotonic() - self._last >= self._period()
-        if self._working or changes == self._shown or not waited or not self._publisher.get_subscription_count():
+        if self._working or not self._publisher.get_subscription_count():
             return False
-        self._working, self._shown, self._last = True, changes, time.monotonic()
+        if not self._begun:
+            waited = time.monotonic() - self._last >= max(self._period(), _REST * self._worked)
+            if changes == self._shown or not waited:
+                return False
+            self._begun, self._shown, self._last, self._worked = True, changes, time.monotonic(), 0.0
+        self._working = True
         return True
 
     def again(self) -> None:
@@ -141,8 +150,16 @@ class Display:
         self._shown = -1
 
     def publish(self) -> None:
-        """Build and send it."""
+        """Build and send it, or a part of the work for it."""
+        begin, message = time.monotonic(), None
         try:
-            self._publisher.publish(self._make())
+            message = self._make()
+            if message is not None:
+                self._publisher.publish(message)
+        except Exception:
+            self._begun = False
+            raise
         finally:
+            self._worked += time.monotonic() - begin
+            self._begun &= message is None
             self._working = False

@@ -72,7 +72,8 @@ class RosSettings(Settings):
     """slam_node hosts the mapper; false where a mapper_node runs apart."""
 
     map_period: Period = 5.0
-    """Least time between two /dpm2/map, s; it is built only while there is a subscriber and it has changed."""
+    """Least time between two /dpm2/map, s, and four times what one takes to build, of a large map more. It is built
+    only while there is a subscriber and it has changed."""
 
     map_max_points: int = Field(default=200_000, ge=1000, le=10_000_000)
     """Largest /dpm2/map; a larger one is downsampled evenly for publishing, not in memory and not on disk."""

@@ -24,7 +24,8 @@ from dpm2_core.slam.mapping.occupancy import ground_tilt, occupancy_grid, why_of
 from dpm2_core.slam.mapping.occupancy_map import OccupancySettings
 from dpm2_core.slam.mapping.parts import first_part, placed_on_earth
 from dpm2_core.slam.mapping.tiles import write_tiles
-from dpm2_core.slam.store.map_data import MapData, Way, load_map, map_cloud, trajectory, ways
+from dpm2_core.slam.store.map_cloud import map_cloud
+from dpm2_core.slam.store.map_data import MapData, Way, load_map, trajectory, ways
 from dpm2_core.slam.store.map_store import MapStore
 
 

@@ -16,7 +16,8 @@ from dpm2_core.evaluation.page import asset, data_url, escape, page
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.voxel import voxel_first
-from dpm2_core.slam.store.map_data import MapData, map_cloud, ways
+from dpm2_core.slam.store.map_cloud import map_cloud
+from dpm2_core.slam.store.map_data import MapData, ways
 
 MOST_POINTS = 1_000_000
 """6 MB, 8 MB as text."""

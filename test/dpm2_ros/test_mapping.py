@@ -8,7 +8,7 @@ import sqlite3
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +19,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMsg
+from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from dpm2_core.data.trajectory import read_trajectory
@@ -26,8 +27,9 @@ from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.estimates import Edge, Registration
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.closure import LoopCloser
+from dpm2_core.slam.store.map_cloud import map_cloud_in_steps
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_ros.display import path_to_msg
+from dpm2_ros.display import Display, path_to_msg
 from dpm2_ros.guard import GuardedNode, respond, slow_service
 from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.runtime import lower_priority
@@ -121,6 +123,48 @@ def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatc
     mapped(mapper, 2)
     assert mapper.mapper.errors == 0
     hung.destroy_node()
+
+
+def test_keyframes_come_to_their_turn_while_a_large_map_is_built(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of 2,000 keyframes takes 6 s, for which the thread of the map took none in."""
+    end = time.monotonic() + 30
+
+    def large(*given: Any) -> Iterator[None]:
+        while len(core(mapper).keyframes) < 2 and time.monotonic() < end:
+            time.sleep(0.01)
+            yield
+        return (yield from map_cloud_in_steps(*given))
+
+    monkeypatch.setattr("dpm2_ros.mapping.map_cloud_in_steps", large)
+    shown = mapper.hear(PointCloud2, "/dpm2/map")
+    mapper.wait(lambda: mapper.mapper.count_subscribers("/dpm2/map"), "the subscription")
+    send_all(mapper, 0)
+    mapped(mapper, 1)
+    assert not shown
+    send_all(mapper, 1)
+    mapper.wait(lambda: shown, "the map")
+    assert time.monotonic() < end
+    assert shown[0].width <= 500  # of the first keyframe, as it was when the work began
+
+
+def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
+    publisher = mapper.publisher(PathMsg, "/shown")
+    heard, work = mapper.hear(PathMsg, "/shown"), iter([None, PathMsg(), PathMsg()])
+    mapper.wait(publisher.get_subscription_count, "the subscription")
+
+    def make() -> PathMsg | None:
+        time.sleep(0.05)
+        return next(work)
+
+    display, begin = Display(publisher, lambda: 0.0, make), time.monotonic()
+    for change in (1, 2):  # in two parts, the second whatever has changed or not
+        assert display.due(change)
+        assert not display.due(change)
+        display.publish()
+    while not display.due(3):
+        time.sleep(0.001)
+    assert time.monotonic() - begin >= 4 * 2 * 0.05
+    mapper.wait(lambda: len(heard) == 1, "the message")
 
 
 class Failing(GuardedNode):

@@ -25,7 +25,8 @@ from dpm2_core.slam.mapping.redundancy import SAME, lender, to_lender
 from dpm2_core.slam.mapping.restore import restore_solved
 from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_core.slam.store.cloud_store import CloudStore
-from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map, map_cloud
+from dpm2_core.slam.store.map_cloud import map_cloud
+from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.writer import MapWriter
 
@@ -255,9 +256,7 @@ class Mapper:
 
     def update_grid(self, grid: OccupancyMap, seconds: float) -> bool:
         """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
-        if not self.keyframes:
-            return True
-        return grid.update(self.clouds, self.poses, seconds, self.placed)
+        return not self.keyframes or grid.update(self.clouds, self.poses, seconds, self.placed)
 
     def _load(self, store: MapStore) -> None:
         data, channels = load_map(store), self._closer.channels

@@ -16,9 +16,7 @@ from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.files import named, part_beside
-from dpm2_core.frame import NO_POINTS, Array, Georeference, Points
-from dpm2_core.geometry import se3
-from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_file import check_new, name_map, remove_map
 from dpm2_core.slam.store.map_store import Change, MapStore
@@ -252,28 +250,6 @@ def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: It
         lambda node: data.describe(where[node]),
         data.georeference,
     )
-
-
-def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[int] | None = None) -> Points:
-    """The cloud (M, 4) float32 of a map in its frame, one point in each voxel of `voxel` m.
-
-    `nodes`: those whose clouds are in it; None: all.
-    """
-    own = [node for node in (range(len(poses)) if nodes is None else nodes) if clouds.loan(node) is None]
-    parts: list[tuple[int, Points]] = []  # in parts, since memory is to be that of the map, not of all the clouds
-    for start in range(0, len(own), 50):
-        joined = _thinned([se3.transform(poses[node], clouds[node]) for node in own[start : start + 50]], voxel)
-        size = 1
-        while parts and parts[-1][0] == size:  # equal ones, so that no point is thinned more than log2 of their number
-            joined, size = _thinned([parts.pop()[1], joined], voxel), 2 * size
-        parts.append((size, joined))
-    return _thinned([NO_POINTS, *(cloud for _, cloud in parts)], voxel)
-
-
-def _thinned(clouds: Sequence[Points], voxel: float) -> Points:
-    """One after the other, the first point in each voxel."""
-    cloud = np.concatenate(clouds)
-    return cloud[voxel_first(cloud, voxel)]
 
 
 @dataclass(frozen=True, eq=False)
