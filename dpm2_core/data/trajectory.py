@@ -167,13 +167,19 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
 
 
 def placed(trajectory: Trajectory, keys: Keys) -> Array:
-    """Poses (N, 4, 4) at `keys` (N,), NaN where there is none of that frame number, or of that stamp but for its
-    rounding."""
-    order = np.argsort(keys, kind="stable")
-    rows, apart = _nearest(keys[order], trajectory.keys)
+    """Poses (N, 4, 4) at `keys` (N,), NaN where there is none of that frame number, or of a stamp nearer than a quarter
+    of a period: one that differs by more than its rounding, as of another clock, is moved along the way to the next."""
+    trajectory = _ordered(trajectory)
+    rows, apart = _nearest(trajectory.keys, keys)
     near = apart <= (_SAME_TIME if trajectory.kind == "tum" else 0)
     poses = np.full((len(keys), 4, 4), np.nan)
-    poses[order[rows[near]]] = trajectory.poses[near]
+    poses[near] = trajectory.poses[rows[near]]
+    if trajectory.kind == "tum" and len(trajectory) > 1:
+        beside = ~near & (apart < 0.25e9 * min(trajectory.period, frame_period(np.sort(keys))))
+        left = np.clip(np.searchsorted(trajectory.keys, keys[beside]) - 1, 0, len(trajectory) - 2)
+        begin, end = trajectory.keys[left], trajectory.keys[left + 1]
+        part = (keys[beside] - begin) / (end - begin)
+        poses[beside] = se3.interpolated(trajectory.poses[left], trajectory.poses[left + 1], part)
     return poses
 
 
