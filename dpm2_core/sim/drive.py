@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.signal import savgol_filter
 
 from dpm2_core.console import Advance, untold
 from dpm2_core.data.trajectory import FRAME_PERIOD
@@ -218,6 +217,8 @@ class _Drive:
     def _smooth_poses(self, times: Array) -> Array:
         """As `_poses`, 0.01 s apart, of a car that has been on its way before 0 s, and on a course without corners:
         roads are straight from sample to sample, and an IMU would feel a blow of some g at each."""
+        from scipy.signal import savgol_filter  # takes longer to import than all else here
+
         T, early = self._poses(np.maximum(times, 0.0)), times < 0
         first, soon = self._poses(np.array([0.0, 0.02]))
         T[early] = first @ np.array([se3.exp(se3.log(se3.inverse(first) @ soon) * t / 0.02) for t in times[early]])

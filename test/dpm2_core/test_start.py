@@ -86,6 +86,11 @@ def test_a_player_of_bags_starts_without_what_reads_their_messages() -> None:
     assert "imported set()" in output
 
 
+def test_a_simulator_starts_without_the_filter_of_an_imu() -> None:
+    """It took half of its start."""
+    assert python("import sys, dpm2_core.sim.drive; print('scipy.signal' in sys.modules)") == "False\n"
+
+
 def test_what_the_user_chose_stays() -> None:
     output = python(
         "import os; os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'] = 'active', '2'\n"
