@@ -27,12 +27,15 @@ def finetune(
 
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """
+    import torch  # slow to import
+
     from dpm2_core.data.open import open_source
     from dpm2_core.data.packed import open_packed, packed_digest
     from dpm2_core.learning import finetune as work
     from dpm2_core.learning import finetune_data, finetune_settings
     from dpm2_core.learning.begun import begin_or_resume, check_one_process
-    from dpm2_core.network.pretrained import load_network, weights_path  # torch is slow to import
+    from dpm2_core.network.pretrained import weights_path
+    from dpm2_core.network.weights import network_settings
     from dpm2_core.slam.settings import SlamSettings
 
     check_one_process("finetune")
@@ -43,10 +46,10 @@ def finetune(
         data["content of rehearsal"] = packed_digest(open_packed(Path(chosen.rehearsal)))
     sources = [open_source(path, chosen.input) for path in src]  # before anything is written
     begin_or_resume(out, resume, chosen, [start], data)
-    network = load_network(chosen.weights, threads=2).settings
+    slam = SlamSettings(threads=torch.get_num_threads())  # of the whole process: the training is to have them, too
     console = Console(stderr=True)
     with console.status("") as status:
-        for text in finetune_data.prepare(sources, chosen, network, SlamSettings(), out, status.update):
+        for text in finetune_data.prepare(sources, chosen, network_settings(start), slam, out, status.update):
             console.print(text, soft_wrap=True)
         status.update("measuring")
         before = work.measure(start, chosen, out)

@@ -220,6 +220,22 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     assert (metadata["phase"], metadata["finetuned_from"]) == ("2", "start")
 
 
+@pytest.mark.long
+def test_the_reference_leaves_as_many_threads_as_there_were(
+    recording: Path, packed: Path, tmp_path: Path, settings: FinetuneSettings
+) -> None:
+    """The SLAM took all but one, and --resume, for which there is nothing left to refer, had them: other weights."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        asked = ["--set", f"weights={settings.weights}", "--set", f"rehearsal={packed}", "--set", "optimiser.steps=1"]
+        done = dpm2("finetune", recording, "--out", tmp_path / "o", *asked, "--set", "frames=3")
+        assert done.returncode == 0, done.stderr
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.mark.slow
 def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
     recording: Path, tmp_path: Path, settings: FinetuneSettings
