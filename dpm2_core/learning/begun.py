@@ -19,6 +19,7 @@ from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS, held
 _ASKED = "begun.json"
 """What was asked for when the training in this folder began."""
 _FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
+_CONTENT = "content of "
 
 
 def begin_training(
@@ -63,7 +64,8 @@ def begin_or_resume(
 
     Raises:
         UsageError: another training is writing there, there is one that is not to be resumed, there is none to resume,
-            or it was asked for something else; the message names the first setting that differs, and both values.
+            or it was asked for something else; the message names the first setting that differs, and both values, or
+            one that there is no more.
     """
     _check_free(folder)
     asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
@@ -75,10 +77,13 @@ def begin_or_resume(
     if not resume or not asked.is_file():
         write_json(asked, now)
         return
-    before = _before(asked)
-    if differing := [key for key in now if key in before and before[key] != now[key]]:
-        name, old, new = _difference(differing[0], before[differing[0]], now[differing[0]])
-        raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
+    before = {**_plain(dict(_values(type(settings)()))), **_before(asked)}  # a setting of later was as by default
+    for key in [*now, *before]:
+        if key in now and before.get(key, now[key]) != now[key]:
+            name, old, new = _difference(key, before[key], now[key])
+            raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
+        if key not in now and not key.startswith(_CONTENT):  # that of other files is named by the settings
+            raise UsageError(f"{folder}: began with {key} {before[key]}, a setting of another version of dpm2")
 
 
 def check_one_process(command: str) -> None:
@@ -105,10 +110,13 @@ def _processes() -> int:
 
 def _asked(settings: Settings, read: Sequence[Path], data: dict[str, Any] | None) -> dict[str, Any]:
     """All that changes what is learned, as it is read again."""
-    content = {f"content of {path}": _content(path) for path in read}
-    return dict(
-        json.loads(json_text({**dict(_values(settings)), **content, **(data or {}), "processes": _processes()}))
-    )
+    content = {f"{_CONTENT}{path}": _content(path) for path in read}
+    return _plain({**dict(_values(settings)), **content, **(data or {}), "processes": _processes()})
+
+
+def _plain(tree: dict[str, Any]) -> dict[str, Any]:
+    """As it is read from a file."""
+    return dict(json.loads(json_text(tree)))
 
 
 def _before(asked: Path) -> dict[str, Any]:

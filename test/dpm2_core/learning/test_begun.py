@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,22 @@ def test_a_training_is_not_resumed_with_something_else(
     with pytest.raises(UsageError, match=f"began with {difference}; --resume goes on with the same alone"):
         begin_or_resume(tmp_path, True, Training.model_validate(tree), data=data)
     begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
+
+
+def test_a_training_of_another_version_is_resumed_where_its_settings_are_the_same(tmp_path: Path) -> None:
+    """It went on without a setting that is gone, and with any value of one that had not been there."""
+    begin_or_resume(tmp_path, False, Training())
+    left(tmp_path)
+    asked = tmp_path / "begun.json"
+    now = json.loads(asked.read_text())
+    asked.write_text(json.dumps({**now, "optimiser.lookahead": 3}))
+    with pytest.raises(UsageError, match=r"began with optimiser\.lookahead 3, a setting of another version of dpm2"):
+        begin_or_resume(tmp_path, True, Training())
+    del now["optimiser.seed"]
+    asked.write_text(json.dumps(now))
+    with pytest.raises(UsageError, match=r"began with optimiser\.seed 0, not 9"):
+        begin_or_resume(tmp_path, True, Training(optimiser=OptimizerSettings(seed=9)))
+    begin_or_resume(tmp_path, True, Training())
 
 
 def test_weights_of_another_content_and_other_processes_are_something_else(
