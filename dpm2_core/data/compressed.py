@@ -15,6 +15,7 @@ _SENSOR_BITS = (10, 12, 14, 16)
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that give the size
+_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # both are escaped within the data of a scan
 _BARE = {0x01, *range(0xD0, 0xD8)}  # and those without a length
 
 
@@ -52,6 +53,8 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
         raise ValueError(f"{found[0]} x {found[1]} pixels, the camera has {size[0]} x {size[1]}")
     if not 0 < found[0] * found[1] <= MAX_PIXELS:
         raise ValueError(f"{found[0]} x {found[1]} pixels, at most {MAX_PIXELS} are decoded")
+    if data.startswith(_JPEG) and data.rfind(_END) < data.rfind(_SCAN):  # OpenCV 4 makes the rest of it gray
+        raise ValueError("cut off")
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
