@@ -130,10 +130,11 @@ def _anchor(data: MapData, node: int, near: Index) -> int:
 def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
     """Edges of a graph from which nodes are taken, one after the other.
 
-    A node's neighbors are joined to that one of them which the odometry ties to it best, each by the composition of
-    two edges: one edge less a node, as on a chain. (Exact marginalisation would join every one with every other.)
-    Rejected loops of a node go with it. Of what is composed between the same two the surest stays: else the loops of
-    all laps would be carried along to the last one.
+    A node's neighbors are joined by compositions of two of its edges, one less than it had, as on a chain: each to the
+    one that an edge of its kind ties to the node best, and the best loop to the best odometry. (Exact marginalisation
+    would join every one with every other.) Where a street was driven again, its loops stay at their places: the
+    odometry takes one of them on to the next node, not all those of the nodes before. Rejected loops of a node go with
+    it. Of what is composed between the same two the surest stays, else laps would add up.
     """
     left: dict[int, Edge] = dict(enumerate(edges))
     at: dict[int, set[int]] = {}
@@ -164,10 +165,12 @@ def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
 def _joined(node: int, incident: list[Edge]) -> list[Edge]:
     """The edges between its neighbors that replace those of a node."""
     spokes = [edge if edge.from_node == node else inverted(edge) for edge in incident]
-    if len(spokes) < 2:
-        return []
-    hub = min(spokes, key=lambda edge: (edge.kind != "odometry", np.trace(edge.covariance)))
-    out = [composed(inverted(hub), spoke) for spoke in spokes if spoke.to_node != hub.to_node]
+    surest: dict[str, Edge] = {}
+    for spoke in sorted(spokes, key=lambda edge: float(np.trace(edge.covariance))):
+        surest.setdefault(spoke.kind, spoke)
+    hub = surest.get("odometry", surest.get("loop"))
+    pairs = [(hub if spoke is surest[spoke.kind] else surest[spoke.kind], spoke) for spoke in spokes]
+    out = [composed(inverted(one), other) for one, other in pairs if one and one.to_node != other.to_node]
     return [edge if edge.from_node < edge.to_node else inverted(edge) for edge in out]
 
 

@@ -110,8 +110,20 @@ def test_many_laps_leave_no_more_edges_than_few() -> None:
         return {node: min(np.trace(e.covariance) for e in loops if e.from_node == node) for node in range(12)}
 
     few, many = left(3), left(6)
-    assert len(few) == len(many) == 12 + 13  # the odometry; a loop to each place, and that of the last keyframe itself
+    assert len(few) == len(many) == 12 + 14  # the odometry; between neighboring places, and two of the last keyframe
     assert sure(many) == pytest.approx(sure(few), rel=1e-6)  # those of the last lap
+
+
+def test_loops_of_a_street_that_is_driven_again_stay_at_their_places() -> None:
+    """All were carried along the second drive: its length squared was to be composed, and none told much any more."""
+    data = laps(2, 60)
+    street = eliminate(data.edges, range(60, len(data) - 1))
+    loops = [edge for edge in street if edge.kind == "loop"]
+    assert len(loops) == 60
+    assert {edge.to_node - edge.from_node for edge in loops if edge.to_node < 60} == {1}
+    step, measured = data.edges[0], Edge("loop", 0, 60, Registration(np.eye(4), SIGMA))
+    there_and_back = composed(composed(measured, replace(step, from_node=60, to_node=61)), measured)
+    assert max(np.trace(edge.covariance) for edge in loops) <= np.trace(there_and_back.covariance) * 1.01
 
 
 def test_the_next_storey_is_no_revisit() -> None:
