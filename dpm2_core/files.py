@@ -63,11 +63,12 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
 
 
 def part_beside(path: Path) -> Path:
-    """The hidden file or folder beside `path` in which this process writes what takes that name once it is whole.
+    """The hidden file or folder beside `path` in which this process writes what takes that name once it is whole; where
+    `path` is a symbolic link, beside what it leads to, which may be on another disk.
 
     Those of processes that were killed are removed, with what SQLite keeps beside them.
     """
-    own = os.getpid()
+    own, path = os.getpid(), path.resolve()
     for left in path.parent.glob(".*.part*"):
         # a map that was to take that name began as another part, of this one
         part = re.fullmatch(rf"\.+{re.escape(path.name)}(?:\.\d+\.part)?\.(\d+)\.part(-\w+)?", left.name)

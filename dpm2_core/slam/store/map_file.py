@@ -75,7 +75,8 @@ def _holds(log: Path) -> bool:
 
 
 def move_map(source: Path, target: Path) -> None:
-    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it.
+    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it. A symbolic
+    link stays one.
 
     Raises:
         Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
@@ -83,8 +84,8 @@ def move_map(source: Path, target: Path) -> None:
     """
     _check_whole(source, target)
     with explaining(target):
-        _remove_log(target)
-        source.replace(target)
+        _remove_log(target.resolve())
+        source.replace(target.resolve())
 
 
 def name_map(source: Path, target: Path) -> None:
@@ -96,7 +97,7 @@ def name_map(source: Path, target: Path) -> None:
     _check_whole(source, target)
     check_new(target)
     try:
-        os.link(source, target)
+        os.link(source, target.resolve())
         source.unlink()
     except FileExistsError:
         raise already_there(target) from None

@@ -34,6 +34,33 @@ def saved(source: Path, path: Path) -> None:
         save_as(load_map(store), path)
 
 
+def copied(source: Path, path: Path) -> None:
+    """As the node saves one."""
+    with MapStore.open(source) as store:
+        store.copy_to(path)
+
+
+@pytest.mark.parametrize("make", [begun, saved, copied])
+@pytest.mark.parametrize("there", [False, True])
+def test_a_map_under_a_link_is_made_where_the_link_leads(
+    tmp_path: Path, map_file: Path, make: Callable[[Path, Path], None], there: bool
+) -> None:
+    """As on a larger disk. It was refused after all the work, or took the place of the link."""
+    link, disk = tmp_path / "link.dpm2map", tmp_path / "disk"
+    disk.mkdir()
+    link.symlink_to(disk / "new.dpm2map")
+    if there:
+        shutil.copyfile(map_file, link)
+    if there and make is not copied:
+        with pytest.raises(UsageError, match=r"link\.dpm2map: there is a file already"):
+            make(map_file, link)
+        return
+    make(map_file, link)
+    assert link.is_symlink()
+    assert [path.name for path in disk.iterdir()] == ["new.dpm2map"]
+    assert not check_map(link).problems
+
+
 @pytest.mark.parametrize("make", [begun, saved])
 def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], make: Callable[[Path, Path], None]
