@@ -84,6 +84,10 @@ def run(
     if localise is None and hint is not None:
         raise UsageError("--hint: only with --localise")
     T_hint = None if hint is None else parse_hint(hint)
+    if view or record is not None:
+        from dpm2_core.evaluation.live_view import check_view
+
+        check_view(view, record, out)
     source: Source | Path = src
     if corruption is not None:
         wanted = chosen.slam.registration != "geometric" or chosen.slam.visual.enabled or chosen.slam.map.thumbnail > 0

@@ -32,27 +32,42 @@ _PATIENCE = 10.0  # s, for a viewer to take what is left
 _PORT = 9876  # of a viewer that runs already, also on another machine: forwarded by ssh
 
 
+def check_view(viewer: bool, record: Path | None, out: Path) -> None:
+    """Raise what is known to go wrong with a `LiveView` before anything is read or written.
+
+    Args:
+        out: the folder of the results, which will be there.
+
+    Raises:
+        MissingPackageError: the extra `view` is not installed. UsageError: no such folder for the recording.
+        Dpm2Error: there is no display.
+    """
+    with needs("view", "--view and --record"):
+        import rerun  # noqa: F401
+    if record is not None and not record.parent.is_dir() and record.parent.resolve() != out.resolve():
+        raise UsageError(f"--record {record}: no such folder")
+    if viewer and not _shown():
+        raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
+
+
 class LiveView:
     """Shows each frame as it has been processed. A context manager: leaving it completes the recording."""
 
     def __init__(self, name: str, viewer: bool, record: Path | None) -> None:
         """Open rerun's viewer, or a recording, or both.
 
+        See `check_view`.
+
         Raises:
-            MissingPackageError: the extra `view` is not installed. UsageError: no such folder for the recording.
             Dpm2Error: the viewer does not start.
         """
-        with needs("view", "--view and --record"):
-            import rerun
-            from rerun import blueprint
-        if record is not None and not record.parent.is_dir():
-            raise UsageError(f"--record {record}: no such folder")
+        import rerun
+        from rerun import blueprint
+
         self._rr = rerun
         self._stream = rerun.RecordingStream(f"dpm2 {name}")
         layout = _layout(blueprint)
         if viewer:
-            if not _shown():
-                raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
             try:
                 self._stream.spawn(default_blueprint=layout)
             except Exception as error:

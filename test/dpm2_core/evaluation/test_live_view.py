@@ -42,6 +42,7 @@ def test_without_a_display_a_view_is_an_error_at_once(
     done = dpm2("run", str(recording), "--out", str(tmp_path / "out"), "--view", "--frames", "0:3")
     assert done.returncode == 1
     assert "there is no display" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
@@ -58,6 +59,7 @@ def test_a_recording_that_cannot_be_written_is_said_before_the_run(recording: Pa
     done = dpm2("run", recording, "--out", tmp_path / "out", "--record", tmp_path / "no" / "run.rrd", *FAST)
     assert done.returncode == 2
     assert "no such folder" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def entities(path: Path) -> dict[str, int]:
