@@ -26,13 +26,16 @@ from dpm2_core.data import naming
 from dpm2_core.data.bags import BagSource
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.evaluation.metrics import ape_rmse
 from dpm2_ros.mapping import KEEP_ALL, LAST_ONE
 from dpm2_ros.runtime import Stop, end_ros, ros_context
+from dpm2_ros.slam_node import SlamNode
 from tools.demo import evaluate_replay, map_poses
 from tools.replay import replay, ros_environment, start
 
 from ..helpers.harness import Harness
+from ..helpers.rig import Rig
 
 QUICK = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
 """Neither camera nor network: it starts in half the time."""
@@ -52,10 +55,8 @@ def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Ite
     assert "Traceback" not in (folder / "log").read_text()
 
 
-@pytest.mark.parametrize(("name", "times"), [("SIGINT", 2), ("SIGTERM", 1)])
-def test_slam_node_saves_its_map_when_stopped(
-    ros: Callable[..., Any], drive: Any, tmp_path: Path, name: str, times: int
-) -> None:
+def test_slam_node_saves_its_map_when_stopped(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
+    """By two SIGINT, as `ros2 launch` sends them."""
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     lidar = harness.publisher(PointCloud2, naming.POINTS)
@@ -63,8 +64,8 @@ def test_slam_node_saves_its_map_when_stopped(
         for n in range(8):
             lidar.publish(drive.cloud(n))
         harness.wait(lambda: odometry, "odometry")
-        for _ in range(times):
-            process.send_signal(getattr(signal, name))
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
             time.sleep(0.02)
         assert process.wait(180) == 0
     assert f"saved in {tmp_path / 'map' / 'drive'}" in (tmp_path / "log").read_text()
@@ -172,28 +173,21 @@ def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
     return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
 
 
-def test_what_cannot_listen_leaves_no_map(run: Callable[..., Any], tmp_path: Path) -> None:
+def test_what_cannot_listen_leaves_no_map(ros: Callable[..., Any], tmp_path: Path) -> None:
     """Its map was opened before."""
-    pairs = [f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={naming.POINTS}"]
-    done = run("slam_node", "--ros-args", *GEOMETRIC, *(part for pair in pairs for part in ("-p", pair)))
-    assert done.returncode == 2
-    assert "is that of the first LiDAR" in done.stderr
+    ros(f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={naming.POINTS}")
+    with pytest.raises(UsageError, match="is that of the first LiDAR"):
+        SlamNode()
     assert not (tmp_path / "map").exists()
 
 
-def test_a_map_that_cannot_be_saved_at_the_end_is_exit_code_1(
-    ros: Callable[..., Any], drive: Any, tmp_path: Path
-) -> None:
-    harness = ros()
-    odometry = harness.hear(Odometry, "/dpm2/odom")
-    lidar = harness.publisher(PointCloud2, naming.POINTS)
+def test_a_map_that_cannot_be_saved_at_the_end_is_an_error(rig: Callable[..., Rig], tmp_path: Path) -> None:
+    """With the exit code of the next test."""
     (tmp_path / "map").write_text("in the way")
-    with running(harness, lidar, tmp_path) as process:
-        lidar.publish(drive.cloud(0))
-        harness.wait(lambda: odometry, "odometry")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(180) == 1
-    assert f"error: {tmp_path / 'map'}" in (tmp_path / "log").read_text()
+    r = rig(f"ros.map_directory:={tmp_path / 'map'}")
+    r.send_and_wait(0)
+    with pytest.raises(Dpm2Error, match=rf"^{tmp_path / 'map'}"):
+        r.harness.remove(r.node)
     assert (tmp_path / "map").read_text() == "in the way"
 
 
@@ -224,7 +218,8 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
 def test_a_drive_through_player_slam_node_and_mapper_node(
     ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """Three processes, the mapper apart: every cloud comes out, and the mapper saves the map of all keyframes."""
+    """Three processes, the mapper apart: every cloud comes out, and the mapper, which SIGTERM ends, saves the map of
+    all keyframes."""
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
     paths = harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
@@ -245,7 +240,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     slam.send_signal(signal.SIGINT)
     assert slam.wait(180) == 0
     harness.wait(lambda: paths and len(paths[-1].poses) == made(), "the last keyframe in the map")
-    mapper.send_signal(signal.SIGINT)
+    mapper.send_signal(signal.SIGTERM)
     assert mapper.wait(180) == 0
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in odometry] == stamps

@@ -23,10 +23,12 @@ from dpm2_core.data import naming
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.store.check import check_map
 from dpm2_ros.conversions import cloud_to_msg, header, pose_to_msg
+from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.tf_message import TFMessage
 
 from ..helpers.command import dpm2
@@ -260,9 +262,7 @@ def test_another_map_by_its_name_while_the_node_runs(
         assert check_map(maps / f"{name}.dpm2map").problems == []
 
 
-def test_a_map_that_is_not_there_ends_the_node_with_one_line(run: Callable[..., Any], tmp_path: Path) -> None:
-    pairs = [f"ros.map_file:={tmp_path / 'none'}", "ros.localization_mode:=true"]
-    done = run("slam_node", "--ros-args", *(part for pair in pairs for part in ("-p", pair)))
-    assert done.returncode == 2
-    assert "no such map file" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_map_that_is_not_there_is_an_error_of_use(ros: Callable[..., Any], tmp_path: Path) -> None:
+    ros(f"ros.map_file:={tmp_path / 'none'}", "ros.localization_mode:=true")
+    with pytest.raises(UsageError, match="no such map file"):
+        SlamNode()
