@@ -111,6 +111,7 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
         ],
         "byLength": _errors(run.metrics.get("per_length", ()), "length_m"),
         "bySpeed": _errors(run.metrics.get("per_speed", ()), "speed_mps"),
+        "segments": _of(_lengths(run)),
     }
 
 

@@ -169,8 +169,12 @@ for (const group of JSON.parse(document.getElementById("data").textContent)) {
   const charts = html("div", "", section, "charts"), of = (pick) => group.runs.map((run, i) => [i, pick(run)]);
   chart(charts, "Translation error by length, %", "m", of((run) => run.byLength.map((row) => [row[0], row[1]])));
   chart(charts, "Rotation error by length, deg/100 m", "m", of((run) => run.byLength.map((row) => [row[0], row[2]])));
-  chart(charts, "Translation error by speed, %", "m/s", of((run) => run.bySpeed.map((row) => [row[0], row[1]])));
-  chart(charts, "Rotation error by speed, deg/100 m", "m/s", of((run) => run.bySpeed.map((row) => [row[0], row[2]])));
+  // Errors by speed are means over all lengths: of other lengths they are other figures.
+  for (const lengths of new Set(group.runs.map((run) => run.segments))) {
+    const bySpeed = (k) => of((run) => (run.segments === lengths ? run.bySpeed : []).map((row) => [row[0], row[k]]));
+    chart(charts, `Translation error by speed, %${lengths}`, "m/s", bySpeed(1));
+    chart(charts, `Rotation error by speed, deg/100 m${lengths}`, "m/s", bySpeed(2));
+  }
   chart(charts, "Time of a frame along the drive, ms", "% of the drive", of((run) => run.time.map((ms, k) => [100 * k / run.time.length, ms])));
   stages(group, section);
   states(group, section);

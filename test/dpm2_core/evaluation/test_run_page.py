@@ -93,6 +93,8 @@ def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Pat
     here, other = "t_err %", "t_err % of 20, 50 m"
     assert (table["official"][here], table["official"][other]) == (f"{whole.t_err_percent:.3f}", "-")
     assert (table["short"][here], table["short"][other]) == ("-", f"{known['t_err_percent']:.3f}")
+    (together,) = data_of(text)
+    assert {run["name"]: run["segments"] for run in together["runs"]} == {"official": "", "short": " of 20, 50 m"}
 
 
 @pytest.mark.parametrize("known", [False, True])
