@@ -15,7 +15,7 @@ from dpm2_core.files import explaining
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_connection import explained
 from dpm2_core.slam.store.map_data import MapData, save_as
-from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, missing_log
+from dpm2_core.slam.store.map_file import check_new, copy_with_log, foreign_log, missing_log
 from dpm2_core.slam.store.salvage import Findings, Salvage
 
 
@@ -28,11 +28,13 @@ def check_map(
         complete: is given that part, and gives it back with what can be made anew of what was lost.
 
     Raises:
-        UsageError: no map at all, or one of another version. Dpm2Error: nothing can be read, `recover` cannot be
-            written, or there is no room for a copy in the folder for temporary files.
+        UsageError: no map at all, or one of another version; `recover` is no new file. Dpm2Error: nothing can be read,
+            `recover` cannot be written, or there is no room for a copy in the folder for temporary files.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
+    if recover is not None:
+        check_new(recover)
     findings = Findings()
     with explained(path):
         findings.problems += filter(None, (missing_log(path), foreign_log(path)))

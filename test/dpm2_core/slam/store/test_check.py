@@ -233,6 +233,9 @@ def test_nothing_left_to_recover(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such"):
         check_map(tmp_path / "none")
     assert not (tmp_path / "out").exists()
+    (tmp_path / "there").touch()
+    with pytest.raises(UsageError, match="there is a file already"):  # before the work, of minutes
+        check_map(path, tmp_path / "there")
 
 
 def test_the_tail_of_a_killed_drive_is_recovered_too(map_file: Path) -> None:
