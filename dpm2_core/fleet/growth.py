@@ -205,14 +205,14 @@ class _Region:
 
     def _read(self, store: MapStore, spans: Sequence[range], settings: RobustSettings) -> None:
         own = [node for span in spans for node in span]
-        edges = store.rows("edges", where=_within(spans, "from_node", "to_node"))
-        read = [(int(row[0]), edge_of(row)) for row in edges]
+        edges = _rows(store, "edges", spans, "from_node", "to_node")
+        read = sorted({int(row[0]): edge_of(row) for row in edges}.items())
         chain = odometry_by_node(edge for _, edge in read)
         self._loops = {number: edge for number, edge in read if edge.ok and chain.get(edge.to_node) is not edge}
         known = set(own)
         self._outer = sorted({end for loop in self._loops.values() for end in (loop.from_node, loop.to_node)} - known)
-        beside = [range(node, node + 1) for node in self._outer]
-        self._poses = {row[0]: pose_of(row[1]) for part in (spans, beside) for row in _poses(store, part)}
+        nodes = [*spans, *(range(node, node + 1) for node in self._outer)]
+        self._poses = {row[0]: pose_of(row[1]) for row in _rows(store, "poses", nodes, "node")}
         self._graph, self._at = PoseGraph(settings), dict[int, int]()
         self._add(own, self._poses, chain)
         self._add(self._outer, self._poses, {})
@@ -285,9 +285,10 @@ def _within(spans: Sequence[range], *columns: str) -> str:
     return " OR ".join(f"{column} BETWEEN {s.start} AND {s.stop - 1}" for s in spans for column in columns) or "FALSE"
 
 
-def _poses(store: MapStore, spans: Sequence[range]) -> Iterator[tuple[Any, ...]]:
+def _rows(store: MapStore, table: str, spans: Sequence[range], *columns: str) -> Iterator[tuple[Any, ...]]:
+    """Rows of a table of which a column is a node of these, some more than once."""
     for first in range(0, len(spans), _TOGETHER):  # SQLite's expressions have a depth
-        yield from store.rows("poses", where=_within(spans[first : first + _TOGETHER], "node"))
+        yield from store.rows(table, where=_within(spans[first : first + _TOGETHER], *columns))
 
 
 def _between(edge: Edge, at: Mapping[int, int]) -> Edge:

@@ -27,7 +27,7 @@ from dpm2_core.slam.graph.robust import RobustSettings
 from dpm2_core.slam.store.check import check_map
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_store import MapStore
-from test.helpers.fleets import fleet_maps
+from test.helpers.fleets import drive_map, fleet_maps
 from test.helpers.maps import FIRM
 
 SETTINGS = RobustSettings()
@@ -97,6 +97,23 @@ def test_what_a_new_drive_does_not_touch_is_neither_read_nor_moved(tmp_path: Pat
         growth = grown(_standing(store, inside), {"d19": maps["d19"]}, joins[-11:])
     assert growth is not None
     assert min(growth.moved, default=10**6) >= 900, "a far drive was moved"
+
+
+def test_a_drive_that_meets_hundreds_of_others_is_added(tmp_path: Path) -> None:
+    """As the way to a depot. SQLite took no question about more than 500 drives."""
+    poses, names, path = fleet_maps(1)[0]["d0"][:3], [f"d{number:03}" for number in range(502)], tmp_path / "map"
+    maps = {name: _at(drive_map(poses, number), poses) for number, name in enumerate(names)}
+    same = Registration(np.eye(4), FIRM)
+    joins = [Join(one, other, Edge("loop", k, k, same)) for one, other in pairwise(names) for k in range(3)]
+    *there, new = names
+    inside = dict.fromkeys(there, 3)
+    with MapStore.create(path) as store:
+        with store.together():
+            add_drives(store, {}, Growth({name: maps[name] for name in there}, _of(joins, there)))
+        met = [Join(name, new, Edge("loop", k, k, same)) for name in there for k in range(3)]
+        growth = grown(_standing(store, inside), {new: maps[new]}, met)
+    assert growth is not None
+    assert list(growth.maps) == [new]
 
 
 def test_a_kill_while_a_drive_is_written_leaves_the_map_as_it_was(tmp_path: Path) -> None:
