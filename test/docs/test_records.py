@@ -173,3 +173,16 @@ def test_the_times_beside_kiss_icp_are_those_of_the_records() -> None:
         for name in ("neural.json", "neural_avx2.json")
     )
     assert all(map(equals, written, (*with_bf16, *without)))
+
+
+def test_what_is_expected_of_a_large_fleet_follows_from_what_was_measured() -> None:
+    fleet = record("fleet.json")
+    index, whole = fleet["index"], fleet["whole"]
+    graph = whole["cpu_s"]["graph"]
+    table = {row[0]: row[1:] for row in rows("docs/fleet.md", "| | a keyframe | 2 million |")}
+    into, look_up = re.findall(r"([\d.]+) ms", table["into the index of 200,000; a look-up there"][0])
+    assert equals(into, 1000 * index["build_s"] / index["places"])
+    assert equals(look_up, index["ms_a_query"]["index"])
+    (solved,) = re.findall(r"([\d.]+) ms", table["pose graph, 20,000 at once"][0])
+    assert equals(solved, 1000 * graph / whole["keyframes"])
+    assert f"100 regions of {graph:.0f} s" in table["pose graph, 20,000 at once"][1]
