@@ -83,9 +83,9 @@ def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Ed
     loops = find_loops(a, b)
     if not loops:
         return None
-    guesses = [a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops]
+    guesses = np.array([a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops])
     # The one that the others are nearest to: a start for the optimization, which weighs them all.
-    apart = [np.median([np.linalg.norm((T - other)[:3, 3]) for other in guesses]) for T in guesses]
+    apart = [np.median(np.linalg.norm(guesses[:, :3, 3] - T[:3, 3], axis=1)) for T in guesses]
     return se3.orthonormalized(guesses[int(np.argmin(apart))]), loops  # else each merge doubles the rounding
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -277,6 +278,15 @@ def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
     both = optimized(merge_maps(a, b, T, used[:3]), PoseGraph(RobustSettings()))
     np.testing.assert_allclose(both.poses[40:], both.poses[:40], atol=1e-3)
     assert align(a, b, lambda one, two: []) is None
+
+
+def test_maps_with_thousands_of_loops_between_them_are_aligned_at_once() -> None:
+    """Each of 1,000 was compared with each in Python: 2.7 s, and 100 times as long of 10 times as many."""
+    a = laps(1)
+    loops = [Edge("loop", node % 40, node % 40, Registration(np.eye(4), SIGMA)) for node in range(2000)]
+    began = time.process_time()
+    assert align(a, a, lambda one, two: loops) is not None
+    assert time.process_time() - began < 2
 
 
 def test_a_map_that_is_merged_again_and_again_stays_rigid() -> None:
