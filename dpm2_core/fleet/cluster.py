@@ -23,6 +23,7 @@ from dpm2_core._version import __version__
 from dpm2_core.errors import Dpm2Error, UsageError, one_line
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.extras import needs
+from dpm2_core.files import part_beside
 from dpm2_core.fleet.part import Outcome, Part, do_part
 
 ATTEMPTS = 3
@@ -32,7 +33,7 @@ MEMORY = 2 * 10**9
 _POLL = 0.5  # s between two looks at what goes on, and between two reports of a part
 _PATIENCE = 5.0  # s for an address to answer
 _STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: parts hand over little
-_LONGEST = 25  # characters of the folder for temporary files, in which Ray makes sockets, whose names have 107
+_LONGEST = 20  # characters of the folder for temporary files, in which Ray makes sockets, whose names have 107
 
 
 class Status(NamedTuple):
@@ -104,7 +105,8 @@ class Cluster:
             ray.init(self._address, **quiet)
             return
         temporary = tempfile.gettempdir()
-        self._folder = Path(tempfile.mkdtemp(prefix="ray_", dir=temporary if len(temporary) < _LONGEST else "/tmp"))
+        self._folder = part_beside(Path(temporary if len(temporary) < _LONGEST else "/tmp") / "ray")
+        self._folder.mkdir(mode=0o700)
         workers = self._workers or max(processors() // cores, 1)
         ray.init(
             "local", num_cpus=workers * cores, include_dashboard=False, object_store_memory=_STORE,

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -117,8 +118,15 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
         raise Exception("The current node timed out\n during startup.")  # as Ray does after 30 s
 
     monkeypatch.setattr(ray, "init", slow)
+    monkeypatch.setattr(tempfile, "tempdir", "/tmp")
+    with subprocess.Popen("true") as ended:
+        pass
+    left = Path(f"/tmp/.ray.{ended.pid}.part")  # as of a fleet that was killed
+    left.mkdir()
     with pytest.raises(UsageError, match=r"^Ray: The current node timed out during startup\.$"):
         Cluster().start()
+    assert not left.exists()
+    assert not Path(f"/tmp/.ray.{os.getpid()}.part").exists()
 
 
 @pytest.mark.slow
