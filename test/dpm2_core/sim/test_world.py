@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,16 @@ from scipy.spatial import cKDTree
 from dpm2_core.errors import UsageError
 from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.materials import Label
+from dpm2_core.sim.settings import PresetName
 from dpm2_core.sim.world import World, build_world
 
 GROUND = [Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.TERRAIN]
+
+
+@cache
+def built(road: str | Path, preset: PresetName) -> World:
+    """150 m of a road, or along the poses of a file."""
+    return build_world(str(road), preset, seed=2, length=150)
 
 
 @pytest.mark.slow
@@ -41,17 +49,17 @@ def _low_vertices(world: World, labels: list[Label] | None = None) -> np.ndarray
     [("loop", "city"), ("figure8", "suburb"), ("random", "rural"), ("straight", "tunnel"),
      ("file", "city"), ("file", "highway")],
 )  # fmt: skip
-def test_nothing_stands_in_the_way(road: str, preset: str, poses_file: Path) -> None:
-    world = build_world(str(poses_file) if road == "file" else road, preset, seed=2, length=150)
+def test_nothing_stands_in_the_way(road: str, preset: PresetName, poses_file: Path) -> None:
+    world = built(poses_file if road == "file" else road, preset)
     drive = world.road.drive.xy
     assert cKDTree(drive).query(_low_vertices(world))[0].min() > 1.1  # half a car and a hand
     assert world.terrain.edge_at(drive).max() < 0.3  # it keeps to the roads
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["figure8", "file"])
-def test_no_building_reaches_onto_any_street(road: str, poses_file: Path) -> None:
-    world = build_world(str(poses_file) if road == "file" else road, "city", seed=4, length=200)
+@pytest.mark.parametrize(("road", "preset"), [("loop", "city"), ("figure8", "suburb"), ("file", "city")])
+def test_no_building_reaches_onto_any_street(road: str, preset: PresetName, poses_file: Path) -> None:
+    world = built(poses_file if road == "file" else road, preset)
     footprints = _low_vertices(world, [Label.BUILDING])
     assert len(footprints) > 100
     assert world.terrain.edge_at(footprints).min() > 0.3
