@@ -23,7 +23,7 @@ from dpm2_core.sim.settings import ImuConfig
 from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
-from ...helpers.command import dpm2, dpm2_process, refused, started, succeeded
+from ...helpers.command import dpm2, refused, started, succeeded
 from ...helpers.drives import first_scans
 from ...helpers.full_disk import largest_file
 
@@ -76,8 +76,7 @@ def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
 
 def test_writes_everything_and_is_right(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = dpm2_process("run", recording, "--out", out)
-    assert done.returncode == 0, done.stderr
+    done = succeeded("run", recording, "--out", out)
     assert {path.name for path in out.iterdir()} == RESULTS
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["frames"] == FRAMES
