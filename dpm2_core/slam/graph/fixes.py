@@ -17,6 +17,7 @@ from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.graph.graph_data import GraphData, Index
+from dpm2_core.slam.graph.lag import STRETCH, Stretch, lag_of, moved_by
 
 _FEWEST = 5
 _HEADING = np.radians(2.0)  # standard deviation from which on the heading counts as known
@@ -26,6 +27,7 @@ _TRIALS = 100  # headings
 _NEAR = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
 _TILT = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
 _ANY_TURN, _ANY_PLACE = 1e2, 1e6  # rad and m, standard deviations of what is not measured
+_SLOWEST = 5.0  # s between two fixes that tell a speed
 _FLAT = 100.0  # m, standard deviation of a height from which on it counts as not measured
 
 
@@ -34,13 +36,17 @@ class Fixes:
 
     Attributes:
         georeference: of the map; None before it is known.
+        uncertain: (6, 6) covariance of T_map_enu by how late the fixes may be.
     """
 
     def __init__(self) -> None:
         self._fixes: list[tuple[int, Fix]] = []
+        self._rows: dict[int, list[int]] = {}  # positions of the fixes of each trajectory
         self._used: list[bool] = []
         self._solved = 0  # fixes at the last optimization
         self.georeference: Georeference | None = None
+        self.uncertain = np.zeros((6, 6))
+        self._lag = self._located_with = 0.0  # s that the fixes are stamped too late, as far as that is known
 
     def __len__(self) -> int:
         return len(self._fixes)
@@ -54,8 +60,9 @@ class Fixes:
         """How many have come since the last optimization."""
         return len(self) - self._solved
 
-    def add(self, node: int, fix: Fix) -> None:
-        """One that was measured near a node."""
+    def add(self, node: int, fix: Fix, trajectory: int) -> None:
+        """One that was measured near a node, which is in that trajectory."""
+        self._rows.setdefault(trajectory, []).append(len(self))
         self._fixes.append((node, fix))
         self._used.append(True)
 
@@ -72,26 +79,66 @@ class Fixes:
 
         `poses`: (N, 4, 4). `placed`: as in `chosen`.
         """
-        known = [(node, fix) for node, fix in self._fixes if placed[node]]
-        if len(known) < _FEWEST:
+        which = np.array([placed[node] for node, _ in self._fixes], np.bool_)
+        if which.sum() < _FEWEST:
             return
-        here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in known])[:, :3]
-        there = geodesy.ecef([fix.geodetic for _, fix in known])
-        sigmas = np.array([np.sqrt(np.trace(fix.covariance[:2, :2]) / 2) for _, fix in known])
+        here, velocities = self._antennas(poses)
+        here = (here - self._lag * velocities)[which]
+        there, sigmas = (part[which] for part in self._measured())
         middle = np.linalg.norm(here - np.median(here, axis=0), axis=1)
         sigmas = np.hypot(sigmas, _SLACK + _DRIFT * middle)
         near = np.linalg.norm(there - np.median(there, axis=0), axis=1) < _NEAR
-        origin = known[int(np.argmax(near))][1].geodetic
+        origin = self._fixes[np.flatnonzero(which)[np.argmax(near)]][1].geodetic
         if self.georeference is not None:
             origin, T = self.georeference.origin, self.georeference.T_enu_map
             apart = np.linalg.norm((se3.transform(T, here) - _local(origin, there))[:, :2], axis=1)
-            if np.median(apart / sigmas) < 2 * _KERNEL:
+            if np.median(apart / sigmas) < 2 * _KERNEL and self._lag == self._located_with:
                 return
-        T_enu_map = fitted(here, _local(origin, there), sigmas)
+        T_enu_map, self._located_with = fitted(here, _local(origin, there), sigmas), self._lag
         if T_enu_map is None:  # if there was one most fixes deny it, as those of another robot, and no other is better
             self.georeference = None
         else:
             self.georeference, self._solved = Georeference(origin, T_enu_map), 0
+
+    def find_lag(self, odometry: Array, placed: NDArray[np.bool_]) -> None:
+        """Find how late the fixes are; `odometry`: (N, 4, 4), each trajectory as it was driven. `placed`: as in
+        `chosen`."""
+        assert self.georeference is not None
+        T_enu_map, (here, velocities) = self.georeference.T_enu_map, self._antennas(odometry)
+        here, moving = se3.transform(T_enu_map, here), velocities @ T_enu_map[:3, :3].T
+        there, sigmas = self._measured()
+        there, stretches = _local(self.georeference.origin, there), []
+        for row in self._rows.values():
+            timed = [k for k in row if velocities[k].any() and placed[self._fixes[k][0]]]
+            for k in (timed[first : first + STRETCH] for first in range(0, len(timed), STRETCH)):
+                stretches.append(Stretch(here[k], there[k], moving[k], sigmas[k]))
+        lag = lag_of(stretches)
+        late = lag.seconds if lag.known else 0.0
+        if abs(late - self._lag) > lag.sigma:
+            self._lag = late
+        moves = moved_by(stretches)
+        beyond_chance = max(0.0, (lag.seconds - self._lag) ** 2 - lag.sigma**2)
+        self.uncertain = beyond_chance * np.outer(moves, moves)
+
+    def loaded(self) -> None:
+        """The georeference is that of a map with these fixes, which was optimized."""
+        self._located_with, self._solved = self._lag, len(self)
+
+    def _antennas(self, poses: Array) -> tuple[Array, Array]:
+        """(K, 3) m where the map has the antenna at the stamp of each fix, and (K, 3) m/s how fast it was since the fix
+        before, 0 where that is not known; `poses`: (N, 4, 4)."""
+        here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in self._fixes])[:, :3]
+        stamps, velocities = np.array([fix.stamp for _, fix in self._fixes], np.int64), np.zeros_like(here)
+        for row in self._rows.values():
+            seconds = np.diff(stamps[row])[:, None] * 1e-9
+            tells = (seconds > 0) & (seconds < _SLOWEST)
+            velocities[row[1:]] = np.where(tells, np.diff(here[row], axis=0) / np.where(tells, seconds, 1.0), 0.0)
+        return here, velocities
+
+    def _measured(self) -> tuple[Array, Array]:
+        """(K, 3) m where the fixes have the antenna on Earth, and (K,) m, their horizontal standard deviations."""
+        sigmas = np.array([np.sqrt(np.trace(fix.covariance[:2, :2]) / 2) for _, fix in self._fixes])
+        return geodesy.ecef([fix.geodetic for _, fix in self._fixes]), sigmas
 
     def joined(self, data: GraphData, places: Index, chosen: Sequence[int]) -> GraphData:
         """The graph with the local frame as its last node, and an edge from there for each of the fixes chosen.
@@ -107,6 +154,7 @@ class Fixes:
         T = self.georeference.T_enu_map @ data.poses[at]  # with the rotations of now: theirs is not measured
         R = T[:, :3, :3]
         arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
+        arms -= self._lag * self._antennas(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
         local = _local(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
         measured = np.array([fix.covariance for fix in fixes])
         # A residual is the logarithm of a pose: where heights are free to go far, they take up those of east and north.

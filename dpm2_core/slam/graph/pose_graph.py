@@ -137,7 +137,7 @@ class PoseGraph:
 
     def add_fix(self, node: int, fix: Fix) -> bool:
         """A position by satellites at a node; returns whether so many have come that it is time to optimize."""
-        self._fixes.add(node, fix)
+        self._fixes.add(node, fix, self._trajectories.of[node])
         if self._fixes.georeference is None:
             self._fixes.locate(self.poses, self.placed)
             return self._fixes.georeference is not None
@@ -147,7 +147,8 @@ class PoseGraph:
     def set_georeference(self, georeference: Georeference) -> None:
         """Where on Earth a map is that was loaded."""
         self._fixes.georeference = georeference
-        self._fixes.sent()
+        self._find_lag()
+        self._fixes.loaded()
         chosen, first = self._chosen(), len(self._loops)
         if chosen:
             data = self._data()
@@ -237,7 +238,7 @@ class PoseGraph:
             return None
         data = self._data()
         try:
-            return robust.joint_covariance(data, self._kept(), np.array([len(self)]))
+            return robust.joint_covariance(data, self._kept(), np.array([len(self)])) + self._fixes.uncertain
         except RuntimeError:  # gtsam's: the system is singular, as with one fix, which says nothing of the heading
             return None
 
@@ -298,10 +299,21 @@ class PoseGraph:
 
     def _sending(self) -> GraphData:
         """The graph that is about to be solved."""
+        self._find_lag()
         self._fixes.locate(self.poses, self.placed)
         self._sent, self._sent_fixes = len(self._loops), self._chosen()
         self._fixes.sent()
         return self._data()
+
+    def _find_lag(self) -> None:
+        """Of the fixes, once it is known about where they are."""
+        if self.georeference is None or not len(self._fixes):
+            return
+        odometry = self.poses
+        for node, step in enumerate(self._steps):
+            if step is not None:
+                odometry[node] = odometry[step.from_node] @ step.T_from_to
+        self._fixes.find_lag(odometry, self.placed)
 
     def _move(self, part: int, T: Array) -> None:
         """All of a part to T @ T_map_kf."""

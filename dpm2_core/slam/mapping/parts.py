@@ -42,7 +42,7 @@ def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
     fixes = Fixes()
     for node in np.flatnonzero(own).tolist():
         if (fix := data.keyframes[node].fix) is not None:
-            fixes.add(node, fix)
+            fixes.add(node, fix, data.keyframes[node].session)
     fixes.locate(data.poses, own)
     return fixes.georeference
 
