@@ -122,6 +122,14 @@ def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, wei
     assert "input.images=false" in driven[0].arguments["drive"]["settings"]
 
 
+def test_table_4_has_as_many_reference_points_as_the_papers(kitti: Path, tmp_path: Path) -> None:
+    """256, whose figures in its Table 3 are those of biased attention; with the shipped weights it had 320."""
+    _, trained, _ = fusion.parts(Request(kitti, tmp_path, weights="small"))
+    for part in trained:
+        training = training_of(**part.arguments["training"], network=part.arguments["network"], packed=())
+        assert preset(training.preset, training.network).fusion.points == 256
+
+
 def test_a_row_of_table_3_has_as_many_reference_points_as_its_name_says(kitti: Path, tmp_path: Path) -> None:
     """Two rows of 256 had those of the weights: 320 of `small`, a quarter more than the rows that they stand beside."""
     _, trained, _ = reference_points.parts(Request(kitti, tmp_path, weights="small"))
