@@ -77,7 +77,8 @@ def begin_or_resume(
     if not resume or not asked.is_file():
         write_json(asked, now)
         return
-    before = {**_plain(dict(_values(type(settings)()))), **_before(asked)}  # a setting of later was as by default
+    by_default = type(settings).model_construct()  # of the overlap's training, which needs `start`, all the others
+    before = {**_plain(dict(_values(by_default))), **_before(asked)}  # a setting of later was as by default
     for key in [*now, *before]:
         if key in now and before.get(key, now[key]) != now[key]:
             name, old, new = _difference(key, before[key], now[key])

@@ -13,6 +13,7 @@ from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.learning.begun import begin_or_resume, begin_training
 from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS
+from dpm2_core.learning.train_overlap import OverlapTrainingSettings
 from dpm2_core.learning.trainer import OptimizerSettings
 
 from ...helpers.command import dpm2
@@ -122,6 +123,16 @@ def test_a_training_of_another_version_is_resumed_where_its_settings_are_the_sam
     with pytest.raises(UsageError, match=r"began with optimiser\.seed 0, not 9"):
         begin_or_resume(tmp_path, True, Training(optimiser=OptimizerSettings(seed=9)))
     begin_or_resume(tmp_path, True, Training())
+
+
+def test_a_training_that_needs_a_setting_is_resumed_with_the_same(tmp_path: Path) -> None:
+    """That of the overlap, which needs `start`: its --resume ended with a traceback."""
+    asked = OverlapTrainingSettings(start="phase1")
+    begin_or_resume(tmp_path, False, asked)
+    left(tmp_path)
+    begin_or_resume(tmp_path, True, asked)
+    with pytest.raises(UsageError, match="began with start phase1, not phase2"):
+        begin_or_resume(tmp_path, True, OverlapTrainingSettings(start="phase2"))
 
 
 def test_weights_of_another_content_and_other_processes_are_something_else(
