@@ -286,8 +286,7 @@ class Odometry:
         motion = self._motion
         match = self._matcher.match(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
-        burst = dt < _BURST * usual
-        if burst and self._bridge is not None:
+        if (burst := dt < _BURST * usual) and self._bridge is not None:
             self._bridge.held = True
         if motion.twist is None:
             return match, usual if burst else dt
