@@ -123,9 +123,8 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
     if found != recipe:
         differ = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
         differ += [key for key in found if key not in recipe] if isinstance(found, dict) else []
-        raise UsageError(
-            f"{out}: holds a drive with other {', '.join(differ) or 'settings'}; remove it or choose another"
-        )
+        what = f"a drive with other {', '.join(differ) or 'settings'}, or of another version of dpm2"
+        raise UsageError(f"{out}: holds {what}; remove it or choose another")
     return True
 
 
