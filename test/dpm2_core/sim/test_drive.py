@@ -93,7 +93,7 @@ def test_another_folder_is_never_touched(tmp_path: Path) -> None:
 
 def test_without_images_there_are_none(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()  # an empty folder is as good as none
-    simulate(tmp_path / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
+    simulate(tmp_path / "out", DriveConfig(frames=1, preset="tunnel", images=False, lidar=LIDAR))
     assert not (tmp_path / "out" / "sequences" / "00" / "image_2").exists()
     assert len(KittiSource(tmp_path / "out")) == 1
 
@@ -101,7 +101,7 @@ def test_without_images_there_are_none(tmp_path: Path) -> None:
 def test_a_drive_too_short_for_a_fix_into_the_folder_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    simulate(Path("."), DriveConfig(frames=1, images=False, lidar=LIDAR, gnss=GnssConfig()))
+    simulate(Path("."), DriveConfig(frames=1, preset="tunnel", images=False, lidar=LIDAR, gnss=GnssConfig()))
     assert len(KittiSource(Path("."))) == 1
     assert (tmp_path / "here" / "sequences" / "00" / "gnss.txt").read_text() == ""
     assert [p.name for p in tmp_path.iterdir()] == ["here"]
@@ -113,7 +113,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
         raise RuntimeError("no more")
 
     with pytest.raises(RuntimeError, match="no more"):
-        simulate(tmp_path / "out", DriveConfig(frames=5, images=False, lidar=LIDAR), progress=fail)
+        simulate(tmp_path / "out", DriveConfig(frames=5, preset="tunnel", images=False, lidar=LIDAR), progress=fail)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,7 +121,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up(tmp_path: Path) -> None:
     program = (
         "import sys, pathlib; from dpm2_core.sim.drive import simulate; from dpm2_core.sim.settings import DriveConfig;"
-        "drive = DriveConfig(frames=300, images=False, lidar={'beams': 16, 'columns': 360});"
+        "drive = DriveConfig(frames=300, preset='tunnel', images=False, lidar={'beams': 16, 'columns': 360});"
         "simulate(pathlib.Path(sys.argv[1]), drive)"
     )
     child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "out")])
@@ -136,7 +136,7 @@ def test_a_killed_run_leaves_nothing_that_looks_whole_and_the_next_one_cleans_up
         child.wait()
     assert not (tmp_path / "out").exists()
     assert list(tmp_path.glob(".out.*.part"))
-    assert simulate(tmp_path / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
+    assert simulate(tmp_path / "out", DriveConfig(frames=1, preset="tunnel", images=False, lidar=LIDAR))
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
@@ -171,4 +171,4 @@ def test_bad_arguments_are_rejected_before_anything_is_written(tmp_path: Path, a
 def test_a_place_that_cannot_be_written_is_a_failure_of_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(Dpm2Error, match="not written"):
-        simulate(tmp_path / "file" / "out", DriveConfig(frames=1, images=False, lidar=LIDAR))
+        simulate(tmp_path / "file" / "out", DriveConfig(frames=1, preset="tunnel", images=False, lidar=LIDAR))
