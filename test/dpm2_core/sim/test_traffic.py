@@ -71,11 +71,15 @@ def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: W
 @pytest.mark.slow
 def test_the_note_of_a_drive_names_its_traffic_and_another_one_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "drive"
-    assert simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR, traffic=5))
+    assert simulate(
+        out, DriveConfig(frames=2, seed=3, road="straight", preset="highway", images=False, lidar=LIDAR, traffic=5)
+    )
     assert json.loads((out / "sequences" / "00" / NOTE).read_text())["traffic"] == 5
-    assert not simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR, traffic=5))
+    assert not simulate(
+        out, DriveConfig(frames=2, seed=3, road="straight", preset="highway", images=False, lidar=LIDAR, traffic=5)
+    )
     with pytest.raises(UsageError, match="other traffic"):
-        simulate(out, DriveConfig(frames=2, seed=3, road="straight", images=False, lidar=LIDAR))
+        simulate(out, DriveConfig(frames=2, seed=3, road="straight", preset="highway", images=False, lidar=LIDAR))
 
 
 @pytest.mark.parametrize("traffic", [-1.0, 2000.0, float("nan")])
