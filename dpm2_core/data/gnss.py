@@ -14,7 +14,7 @@ from dpm2_core.data.pairing import JUMP
 from dpm2_core.frame import Fix
 
 _NO_FIX = -1  # -2, Jazzy's default, says that the driver sets no status at all
-_MOST = 100  # fixes kept; bounds memory where no cloud comes
+_MOST = 1000  # fixes kept; bounds memory where no cloud comes
 _LEAST = 0.01  # m, added to every standard deviation: no antenna's place and no clock is known better
 _ASSUMED = np.array([5.0, 5.0, 10.0])  # m east, north, up where none is stated: that of a plain receiver, open sky
 _UNKNOWN = 1e4  # m, of an altitude that is not known
