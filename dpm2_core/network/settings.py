@@ -198,7 +198,12 @@ def _misfits(s: NetworkSettings) -> Iterator[str]:
         yield f"points.upsample {s.points.upsample} of {len(sizes)} stages"
     if decoder.width % decoder.heads:
         yield f"decoder.width {decoder.width} is no multiple of decoder.heads {decoder.heads}"
+    if s.image.backbone == "convnext":
+        yield from _misfits_of_convnext(s.image)
     if fusion.kind == "none":
+        level = len(sizes) - 1 - s.points.upsample
+        if level >= 0 and (own := s.points.stages[level].channels) != s.channels:
+            yield f"channels {s.channels}: without fusion those of points.stages.{level}, which has {own}"
         return
     if s.channels % fusion.heads:
         yield f"channels {s.channels} is no multiple of fusion.heads {fusion.heads}"
@@ -208,3 +213,11 @@ def _misfits(s: NetworkSettings) -> Iterator[str]:
         yield f"fusion.points {fusion.points}: the first of points.stages has {sizes[0]}"
     if len(fusion.alpha_image) not in (1, fusion.heads):
         yield f"fusion.alpha_image has {len(fusion.alpha_image)} values, want 1 or one of each of {fusion.heads} heads"
+
+
+def _misfits_of_convnext(image: ImageSettings) -> Iterator[str]:
+    if len(image.depths) != len(image.channels):
+        yield f"image.depths has {len(image.depths)} stages, image.channels {len(image.channels)}"
+    strides = [4 << stage for stage in range(len(image.channels))]
+    if not set(image.strides) <= set(strides):
+        yield f"image.strides {list(image.strides)}: want some of {', '.join(map(str, strides))}"

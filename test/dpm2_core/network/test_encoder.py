@@ -78,6 +78,9 @@ def test_unknown_preset_and_backbone_are_rejected() -> None:
     [
         ({"decoder": {"width": 33}}, r"decoder.width 33 is no multiple of decoder.heads 4"),
         ({"channels": 30}, r"channels 30 is no multiple of fusion.heads 4"),
+        ({"channels": 64, "fusion": {"kind": "none"}}, r"channels 64: without fusion .* points.stages.\d, which"),
+        ({"image": {"depths": [1, 1]}}, r"image.depths has 2 stages, image.channels 4"),
+        ({"image": {"strides": [8, 12]}}, r"image.strides \[8, 12\]: want some of 4, 8, 16, 32"),
         ({"fusion": {"levels": [1, 4]}}, r"fusion.levels \[1, 4\]: want some of 0 to 3"),
         ({"fusion": {"points": 4096}}, r"fusion.points 4096: the first of points.stages has 2048"),
         ({"fusion": {"alpha_image": [0.3, 1.0]}}, r"fusion.alpha_image has 2 values"),
