@@ -88,8 +88,9 @@ def _told(stretch: Stretch) -> tuple[float, float]:
         turn *= np.exp(1j * np.linalg.lstsq(B[:, :4], B[:, 4])[0][0])
     rest = A[:, 3:] - A[:, :3] @ np.linalg.lstsq(A[:, :3], A[:, 3:])[0]
     (information, pull), (_, square) = rest.T @ rest
-    off = square - pull**2 / (information + 1 / _UNKNOWN**2)
-    return (information, pull) if off < _OFF * len(A) else (0.0, 0.0)
+    off = (square - pull**2 / (information + 1 / _UNKNOWN**2)) / len(A)
+    worse = max(off, 1.0)  # than stated, as many receivers are
+    return (information / worse, pull / worse) if off < _OFF else (0.0, 0.0)
 
 
 def _level(at: NDArray[Any]) -> NDArray[np.complex128]:

@@ -40,6 +40,19 @@ def test_none_is_found_where_there_is_none() -> None:
     assert lag.sigma < 0.05
 
 
+def test_fixes_that_are_worse_than_they_state_tell_no_more_than_they_know() -> None:
+    """A receiver whose errors last for seconds, and are three times what it states: over 60 fixes without a lag what
+    was found was 2.1 standard deviations off, and in 6 of 100 drives beyond doubt."""
+    off = []
+    for seed in range(100):
+        noise = np.random.default_rng(seed).normal(size=(3, STRETCH + 3, 3))
+        errors = 1.5 * np.lib.stride_tricks.sliding_window_view(noise, 4, axis=1).sum(-1)
+        ways = zip(stretches(3, 0.0, 1.0), errors, strict=True)
+        lag = lag_of([way._replace(there=way.here + error) for way, error in ways])
+        off.append(lag.seconds / lag.sigma)
+    assert np.std(off) < 1.6
+
+
 def test_straight_on_at_one_speed_the_place_is_as_uncertain_as_the_lag() -> None:
     way = stretches(1, 0.5, 0.0)
     lag, moves = lag_of(way), moved_by(way)
