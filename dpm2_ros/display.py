@@ -26,6 +26,7 @@ from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
 from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg, poses_to_msgs
 
 _REST = 4.0  # times as long as the work at one message took, from its begin to that of the next at least
+_AGAIN = -1  # in place of the changes that were shown
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
 
@@ -138,7 +139,8 @@ class Display:
         if self._working or not self._publisher.get_subscription_count():
             return False
         if not self._begun:
-            waited = time.monotonic() - self._last >= max(self._period(), _REST * self._worked)
+            rest = _REST * self._worked if self._shown != _AGAIN else 0.0
+            waited = time.monotonic() - self._last >= max(self._period(), rest)
             if changes == self._shown or not waited:
                 return False
             self._begun, self._shown, self._last, self._worked = True, changes, time.monotonic(), 0.0
@@ -147,7 +149,7 @@ class Display:
 
     def again(self) -> None:
         """It is not complete yet: due once more."""
-        self._shown = -1
+        self._shown = _AGAIN
 
     def publish(self) -> None:
         """Build and send it, or a part of the work for it."""

@@ -167,6 +167,25 @@ def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
     mapper.wait(lambda: len(heard) == 1, "the message")
 
 
+def test_what_is_made_of_as_much_as_its_time_allows_goes_on_after_its_period(mapper: Any) -> None:
+    """The grid of a loaded map had a part of 0.3 s every 1.2 s, no longer every 0.5 s: Nav2 waited twice as long."""
+    publisher = mapper.publisher(PathMsg, "/shown")
+    mapper.hear(PathMsg, "/shown")
+    mapper.wait(publisher.get_subscription_count, "the subscription")
+
+    def make() -> PathMsg:
+        time.sleep(0.3)
+        display.again()
+        return PathMsg()
+
+    display = Display(publisher, lambda: 0.5, make)
+    assert display.due(1)
+    display.publish()
+    assert not display.due(1)
+    time.sleep(0.3)
+    assert display.due(1)
+
+
 class Failing(GuardedNode):
     """A service whose work has a bug."""
 
