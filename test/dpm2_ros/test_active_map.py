@@ -162,6 +162,19 @@ def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
     assert (tmp_path / "town-2" / "map.ply").is_file()
 
 
+def test_a_name_that_leads_to_the_file_of_the_drive_itself_is_no_copy(tmp_path: Path) -> None:
+    """A copy took the file's place under the node, and no keyframe after it was kept."""
+    active, town = driven(2, map_directory=str(tmp_path)), tmp_path / "town.dpm2map"
+    active.save("town")
+    town.unlink()
+    town.symlink_to("drive.dpm2map")
+    active.save("town")
+    active.add(keyframes(3)[2])
+    active.close()
+    result = check_map(tmp_path / "drive.dpm2map")
+    assert (result.problems, result.keyframes) == ([], 3)
+
+
 @pytest.mark.parametrize("name", ["../town", "a/b", ".hidden", "", "x" * 200, "a b", "town\n"])
 def test_a_name_stays_within_the_folder(name: str) -> None:
     if name:

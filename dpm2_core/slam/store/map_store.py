@@ -237,11 +237,14 @@ class MapStore:
                 self._connection.execute("ROLLBACK")
 
     def copy_to(self, path: Path) -> None:
-        """All that is in it now as another map file, whole or not at all; an older one there is replaced.
+        """All that is in it now as another map file, whole or not at all; an older one there is replaced. Nothing
+        where `path` leads to its own file.
 
         Raises:
             Dpm2Error: it could not be written.
         """
+        if path.resolve() == self.path.resolve():
+            return
         part = part_beside(path)
         with explained(path):
             try:
