@@ -177,6 +177,8 @@ def placed(trajectory: Trajectory, keys: Keys) -> Array:
     if trajectory.kind == "tum" and len(trajectory) > 1:
         beside = ~near & (apart < 0.25e9 * min(trajectory.period, frame_period(np.sort(keys))))
         left = np.clip(np.searchsorted(trajectory.keys, keys[beside]) - 1, 0, len(trajectory) - 2)
+        gap = trajectory.keys[left + 1] - trajectory.keys[left] > _GAP  # beside one: the way on its other side
+        left = np.where(gap, np.clip(2 * rows[beside] - left - 1, 0, len(trajectory) - 2), left)
         begin, end = trajectory.keys[left], trajectory.keys[left + 1]
         part = (keys[beside] - begin) / (end - begin)
         poses[beside] = se3.interpolated(trajectory.poses[left], trajectory.poses[left + 1], part)

@@ -160,6 +160,20 @@ def test_frames_whose_stamps_differ_by_more_than_their_rounding_are_no_failures(
     np.testing.assert_allclose(found[kept, 0, 3], true[kept, 0, 3], atol=100_001)  # within the rounding the pose itself
 
 
+def test_the_way_across_a_gap_moves_no_frame() -> None:
+    """In a bend, 8 s without a pose: the frames beside them were 0.23 m off."""
+
+    def driven(stamps: np.ndarray) -> Trajectory:
+        return Trajectory(se3.exp(stamps[:, None] * 1e-9 * np.array([0, 0, 0.5, 10, 0, 0])), stamps, "tum")
+
+    numbers, gone = np.arange(200), np.arange(61, 141)
+    stamps = numbers * 100_000_000
+    late = stamps + np.where(numbers % 3 == 0, np.where(numbers < 90, -15_000_000, 15_000_000), 0)  # 60 and 141, too
+    true, found, _ = matched(driven(stamps), driven(np.delete(late, gone)))
+    assert np.flatnonzero(np.isnan(found[:, 0, 3])).tolist() == gone.tolist()
+    np.testing.assert_allclose(np.delete(found, gone, 0), np.delete(true, gone, 0), atol=1e-9)
+
+
 def _clock(hz: float, count: int, begin: float = 0.0) -> Trajectory:
     return _trajectory(np.round((begin + np.arange(count) / hz) * 1e9).astype(np.int64).tolist(), "tum")
 
