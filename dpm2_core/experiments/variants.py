@@ -37,10 +37,12 @@ from dpm2_core.slam.settings import Config
 
 LEARNED = ("00", "01", "02", "03", "04", "05")
 AS_PAPER: dict[str, Any] = {
-    "fusion": {"reference": "fps", "points": 256, "reference_features": False, "relative": False, "pixel": False}
+    "fusion": {"reference": "fps", "reference_features": False, "relative": False, "pixel": False}
 }
 """What all variants have in common but for what one changes: nothing but the fusion tells where a reference point is,
-and what is there. The paper's Table 4 has the figures of 256 points in its Table 3."""
+and what is there."""
+_POINTS = 256
+"""Reference points where a variant does not say: the paper's Table 4 has the figures of so many in its Table 3."""
 TABLE_3: dict[str, dict[str, Any]] = {
     "FPS 128": {"fusion": {"points": 128}},
     "FPS 256": {},
@@ -185,7 +187,7 @@ def _check_drive(request: Request) -> None:
 
 
 def _joined(change: Mapping[str, Any]) -> dict[str, Any]:
-    return {"fusion": {**AS_PAPER["fusion"], **change.get("fusion", {})}}
+    return {"fusion": {"points": _POINTS, **AS_PAPER["fusion"], **change.get("fusion", {})}}
 
 
 def _learned(request: Request) -> list[str]:

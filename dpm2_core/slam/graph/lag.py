@@ -71,7 +71,7 @@ def moved_by(stretches: Sequence[Stretch]) -> Array:
     if stretches:
         A = _level(np.concatenate([stretch.here for stretch in stretches])[:, :2] @ [1, 1j])
         v = np.concatenate([stretch.velocities for stretch in stretches])[:, :2] @ [1, 1j]
-        moves[2:5] = np.linalg.lstsq(np.concatenate([A.real, A.imag]), np.concatenate([v.real, v.imag]))[0]
+        moves[2:5] = np.linalg.lstsq(np.concatenate([A.real, A.imag]), np.concatenate([v.real, v.imag]), rcond=None)[0]
     return moves
 
 
@@ -85,8 +85,8 @@ def _told(stretch: Stretch) -> tuple[float, float]:
         columns = np.column_stack([_level(turn * at), -turn * v, to - turn * at])
         A = np.concatenate([columns.real, columns.imag]) * weights
         B = np.concatenate([A, [[0, 0, 0, 1 / _UNKNOWN, 0]]])
-        turn *= np.exp(1j * np.linalg.lstsq(B[:, :4], B[:, 4])[0][0])
-    rest = A[:, 3:] - A[:, :3] @ np.linalg.lstsq(A[:, :3], A[:, 3:])[0]
+        turn *= np.exp(1j * np.linalg.lstsq(B[:, :4], B[:, 4], rcond=None)[0][0])
+    rest = A[:, 3:] - A[:, :3] @ np.linalg.lstsq(A[:, :3], A[:, 3:], rcond=None)[0]
     (information, pull), (_, square) = rest.T @ rest
     off = (square - pull**2 / (information + 1 / _UNKNOWN**2)) / len(A)
     worse = max(off, 1.0)  # than stated, as many receivers are
