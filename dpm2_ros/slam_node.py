@@ -18,7 +18,7 @@ from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.descriptors import is_level
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import Keyframe, OdometryResult, State
-from dpm2_core.frame import Array, Frame
+from dpm2_core.frame import Array, Frame, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.sweep import Sweep
 from dpm2_core.slam.build import make_slam
@@ -137,6 +137,7 @@ class SlamNode(ManagedNode):
         self._base.restart()
         self._sweep = Sweep()
         self._held: list[OdometryResult] = []  # until the base frame is known
+        self._up: Up | None = None  # of `Frame`, for all of it
         self._covariance = np.zeros((6, 6))
         self._before: BodyMotion | None = None  # the last registered frame, of which `_covariance` is
         self._unsent: BodyMotion | None = None  # the last frame, if the other odometry was not known at its stamp
@@ -186,8 +187,10 @@ class SlamNode(ManagedNode):
             self._begin_again("time went back by more than a second (a looped bag, a clock that was set)")
         self._lidar_frame = lidar_frame
         self._look_for_base(lidar_frame)
-        x, y, z = self._base.T_start_lidar[2, :3].tolist()
-        self._frames.up = (x, y, z) if self._base.name else None  # for the base, and so in odom
+        if self._before is None and not self._held:  # what it began with is not compared with level scans
+            x, y, z = self._base.T_start_lidar[2, :3].tolist()
+            self._up = (x, y, z) if self._base.name else None  # for the base, and so in odom
+        self._frames.up = self._up
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(replace(frame, dropped=bundle.dropped, stepped=bundle.stepped))
         if tracked.imu and tracked.registration.method == "first":  # of the level; diagnostics may miss one cloud
@@ -305,7 +308,7 @@ class SlamNode(ManagedNode):
         """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as a LiDAR that stands
         would have them."""
         x, y, z = T_base_lidar[2, :3].tolist()
-        if keyframe.up is None and not is_level(T_base_lidar[2, :3]):  # of a scan from before the base was known
+        if keyframe.up is None and not is_level(T_base_lidar[2, :3]):  # of a drive that began before the base was known
             keyframe = replace(keyframe, up=(x, y, z), descriptors=None)
         keyframe = self._slam.mapper.described(keyframe)
         if not np.array_equal(T_base_lidar, np.eye(4)):
