@@ -59,11 +59,11 @@ class LiveView:
         See `check_view`.
 
         Raises:
-            Dpm2Error: the viewer does not start.
+            MissingPackageError: the extra `view` is not installed. Dpm2Error: the viewer does not start.
         """
-        import rerun
-        from rerun import blueprint
-
+        with needs("view", "--view and --record"):
+            import rerun
+            from rerun import blueprint
         self._rr = rerun
         self._stream = rerun.RecordingStream(f"dpm2 {name}")
         layout = _layout(blueprint)
