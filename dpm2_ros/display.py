@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import array
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -128,22 +128,27 @@ class Display:
     """
 
     def __init__(self, publisher: Any, period: Callable[[], float], make: Callable[[], Any]) -> None:
-        """`make`: called in the map's thread; None: there is more to do, and it is called again."""
+        """`make`: called in the map's thread; returns the message, or a generator that does, with pauses between the
+        parts of its work; None if there is none after all."""
         self._publisher, self._period, self._make = publisher, period, make
         self._shown = 0
         self._last, self._worked = -np.inf, 0.0
-        self._working = self._begun = False
+        self._working = False
+        self._steps: Generator[None, None, Any] | None = None  # of what is being built
 
     def due(self, changes: int) -> bool:
         """Whether to publish now; if so, `publish` is expected to follow."""
-        if self._working or not self._publisher.get_subscription_count():
+        if self._working:
             return False
-        if not self._begun:
+        if not self._publisher.get_subscription_count():
+            self._steps = None  # who comes next gets the map of then
+            return False
+        if self._steps is None:
             rest = _REST * self._worked if self._shown != _AGAIN else 0.0
             waited = time.monotonic() - self._last >= max(self._period(), rest)
             if changes == self._shown or not waited:
                 return False
-            self._begun, self._shown, self._last, self._worked = True, changes, time.monotonic(), 0.0
+            self._shown, self._last, self._worked = changes, time.monotonic(), 0.0
         self._working = True
         return True
 
@@ -153,15 +158,18 @@ class Display:
 
     def publish(self) -> None:
         """Build and send it, or a part of the work for it."""
-        begin, message = time.monotonic(), None
+        begin, steps, self._steps = time.monotonic(), self._steps, None
         try:
-            message = self._make()
-            if message is not None:
-                self._publisher.publish(message)
-        except Exception:
-            self._begun = False
-            raise
+            made = steps or self._make()
+            if isinstance(made, Generator):
+                try:
+                    next(made)
+                except StopIteration as done:
+                    made = done.value
+                else:
+                    self._steps, made = made, None
+            if made is not None:
+                self._publisher.publish(made)
         finally:
             self._worked += time.monotonic() - begin
-            self._begun &= message is None
             self._working = False

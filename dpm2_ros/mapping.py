@@ -21,10 +21,9 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.estimates import Edge, Keyframe
-from dpm2_core.frame import Array, Points
+from dpm2_core.frame import Array
 from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.mapping.admission import RejectedError
-from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy import why_of_no_use
 from dpm2_core.slam.mapping.occupancy_map import OccupancyMap
 from dpm2_core.slam.store.map_cloud import map_cloud_in_steps
@@ -88,7 +87,6 @@ class MapperThread:
         ]
         self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
         self._of_no_use = ""  # why it is, in words
-        self._cloud: tuple[Mapper, Generator[None, None, Points]] | None = None  # what is built, of which map
         self._settled: Future[None] = self._submit(lambda: None)  # done: nobody looks for what has been solved
         self._settled_at = time.monotonic()
         node.create_timer(0.1, self._show)
@@ -295,17 +293,16 @@ class MapperThread:
             self._node.get_logger().warning(f"dpm2/grid: {self._of_no_use}")
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
-    def _map(self) -> Any:
-        """A part of the work, so that keyframes come to their turn; the message when all is done."""
+    def _map(self) -> Generator[None, None, PointCloud2 | None]:
+        """In steps, so that keyframes come to their turn; None where the map is another one by now."""
         mapper, ros = self.active.mapper, self._config.ros
-        if self._cloud is None or self._cloud[0] is not mapper:
-            nodes, voxel = np.flatnonzero(mapper.placed).tolist(), self._config.slam.map.voxel
-            self._cloud = mapper, map_cloud_in_steps(mapper.clouds, mapper.poses, voxel, nodes)
-        before, self._cloud = self._cloud, None
-        try:
-            next(before[1])
-        except StopIteration as done:
-            shown = done.value[evenly(len(done.value), ros.map_max_points)]
-            return cloud_to_msg(shown, self._stamp, ros.map_frame)
-        self._cloud = before
+        nodes, voxel = np.flatnonzero(mapper.placed).tolist(), self._config.slam.map.voxel
+        steps = map_cloud_in_steps(mapper.clouds, mapper.poses, voxel, nodes)
+        while self.active.mapper is mapper:
+            try:
+                next(steps)
+            except StopIteration as done:
+                shown = done.value[evenly(len(done.value), ros.map_max_points)]
+                return cloud_to_msg(shown, self._stamp, ros.map_frame)
+            yield
         return None

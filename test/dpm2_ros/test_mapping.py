@@ -8,7 +8,7 @@ import sqlite3
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -149,12 +149,14 @@ def test_keyframes_come_to_their_turn_while_a_large_map_is_built(mapper: Any, mo
 
 def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
     publisher = mapper.publisher(PathMsg, "/shown")
-    heard, work = mapper.hear(PathMsg, "/shown"), iter([None, PathMsg(), PathMsg()])
+    heard = mapper.hear(PathMsg, "/shown")
     mapper.wait(publisher.get_subscription_count, "the subscription")
 
-    def make() -> PathMsg | None:
+    def make() -> Generator[None, None, PathMsg]:
         time.sleep(0.05)
-        return next(work)
+        yield
+        time.sleep(0.05)
+        return PathMsg()
 
     display, begin = Display(publisher, lambda: 0.0, make), time.monotonic()
     for change in (1, 2):  # in two parts, the second whatever has changed or not
@@ -165,6 +167,50 @@ def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
         time.sleep(0.001)
     assert time.monotonic() - begin >= 4 * 2 * 0.05
     mapper.wait(lambda: len(heard) == 1, "the message")
+
+
+def test_what_nobody_waits_for_any_more_is_not_built_on(mapper: Any) -> None:
+    """Else who came next got the map of when another one had left, and until then it was kept in memory."""
+    publisher, begun = mapper.publisher(PathMsg, "/shown"), []
+
+    def make() -> Generator[None, None, PathMsg]:
+        begun.append(0)
+        yield
+        return PathMsg()
+
+    display = Display(publisher, lambda: 0.0, make)
+    for change in (1, 2):
+        listener = rclpy.create_node("listener", use_global_arguments=False)
+        listener.create_subscription(PathMsg, "/shown", lambda message: None, 1)
+        mapper.wait(publisher.get_subscription_count, "the subscription")
+        assert display.due(change)
+        display.publish()
+        listener.destroy_node()
+        mapper.wait(lambda: not publisher.get_subscription_count(), "its end")
+        assert not display.due(change)
+    assert len(begun) == 2
+
+
+def test_a_map_that_is_replaced_while_it_is_built_is_not_shown(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = [core(mapper)]
+
+    def large(*given: Any) -> Iterator[None]:
+        while core(mapper) is maps[0]:
+            time.sleep(0.01)
+            yield
+        return (yield from map_cloud_in_steps(*given))
+
+    monkeypatch.setattr("dpm2_ros.mapping.map_cloud_in_steps", large)
+    send_all(mapper, 0, 1)
+    mapped(mapper, 2)
+    shown = mapper.hear(PointCloud2, "/dpm2/map")
+    mapper.wait(lambda: mapper.mapper.count_subscribers("/dpm2/map"), "the subscription")
+    time.sleep(0.3)  # it is being built
+    assert mapper.call(Trigger, "/mapper_node/reset").success
+    send_all(mapper, 0, session="5f3a9c02")
+    mapper.wait(lambda: shown, "the new map")
+    assert shown[0].width <= 500  # of one keyframe
+    assert mapper.mapper.errors == 0
 
 
 def test_what_is_made_of_as_much_as_its_time_allows_goes_on_after_its_period(mapper: Any) -> None:

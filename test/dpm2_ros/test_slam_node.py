@@ -25,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from dpm2_core.data.messages import stamp_ns
 from dpm2_core.data.transforms import transform_matrix
+from dpm2_core.slam.store.map_cloud import map_cloud_in_steps
 from dpm2_ros.active_map import ActiveMap
 from dpm2_ros.conversions import EARLIER
 from dpm2_ros.keyframe_messages import BUDGET, received_to_msg
@@ -92,12 +93,14 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
     np.testing.assert_allclose(moved, transform_matrix(r.odom[-1].pose.pose), atol=1e-9)
 
 
-def test_the_map_is_bounded_and_built_only_for_listeners(rig: Callable[..., Rig], drive: Any) -> None:
+def test_the_map_is_bounded_and_built_only_for_listeners(
+    rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     r = rig("ros.map_max_points:=1000", "ros.map_period:=0.1")
     r.send_and_wait(0, 1, 2)
     r.mapped(1)
-    built, make = [], r.node.slam.mapper.cloud
-    r.node.slam.mapper.cloud = lambda *sizes: (built.append(1), make(*sizes))[1]  # type: ignore[method-assign]
+    built, make = [], map_cloud_in_steps
+    monkeypatch.setattr("dpm2_ros.mapping.map_cloud_in_steps", lambda *given: (built.append(1), make(*given))[1])
     time.sleep(0.3)
     assert not built  # there is no subscriber
     maps = r.harness.hear(PointCloud2, "/dpm2/map", LATCHED)
