@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import float32, float64, int64
+from numba import float32, float64, int64, uint64, void
 from numpy.typing import NDArray
 
 from dpm2_core.geometry.compiled import READ_F4, READ_F8, compiled
@@ -20,20 +20,71 @@ def voxel_first(points: NDArray[np.floating], size: float, near: float = 0.0, fa
     Keeping a measured point, not the mean, keeps surfaces sharp; and points put first stay when a map grows.
     Coordinates of those must be within 2^20 cells of the origin; NaN is never in range, and inf only if `far` is.
     """
+    return _first(points, _empty(len(points)), size, near, far)
+
+
+class VoxelCells:
+    """`voxel_first` of clouds that come one after the other: the cells that have a point already get no other one."""
+
+    def __init__(self, size: float) -> None:
+        """`size`: of a cell, m."""
+        self._size, self._table, self._count = size, _empty(0), 0
+
+    def first(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Ascending indices of the (N, 3+) points that are the first in their cells, of all so far."""
+        if len(self._table) < 2 * (self._count + len(points)):
+            before, self._table = self._table, _empty(2 * (self._count + len(points)))
+            _put(before, self._table)
+        found = _first(points, self._table, self._size, 0.0, np.inf)
+        self._count += len(found)
+        return found
+
+
+def _empty(points: int) -> NDArray[np.int64]:
+    """A hash table with room for the cells of so many points: at least half of it stays empty."""
+    return np.full(1 << max(2 * points - 1, 1023).bit_length(), -1, np.int64)
+
+
+def _first(
+    points: NDArray[np.floating], table: NDArray[np.int64], size: float, near: float, far: float
+) -> NDArray[np.int64]:
     dtype = points.dtype.type
-    return _first_in_cells(np.ascontiguousarray(points), dtype(1 / size), dtype(near * near), dtype(far * far))
+    return _first_in_cells(np.ascontiguousarray(points), table, dtype(1 / size), dtype(near * near), dtype(far * far))
 
 
-@compiled([int64[::1](READ_F4, *[float32] * 3), int64[::1](READ_F8, *[float64] * 3)])
+@compiled(uint64(int64[::1]))
+def _shift(table: NDArray[np.int64]) -> np.uint64:
+    """By so many bits a hash is shifted to a place in the table: the upper ones are the best mixed."""
+    shift = 64
+    while (1 << 64 - shift) < len(table):
+        shift -= 1
+    return np.uint64(shift)
+
+
+@compiled(int64(int64[::1], uint64, int64))
+def _slot(table: NDArray[np.int64], shift: np.uint64, key: np.int64) -> np.int64:
+    """Where a hash table has a key, or has room for it."""
+    slot = np.int64(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> shift)
+    while table[slot] >= 0 and table[slot] != key:
+        slot = (slot + 1) & (len(table) - 1)
+    return slot
+
+
+@compiled(void(int64[::1], int64[::1]))
+def _put(keys: NDArray[np.int64], table: NDArray[np.int64]) -> None:
+    """Keys that are not negative into a table that has none of them."""
+    shift = _shift(table)
+    for key in keys:
+        if key >= 0:
+            table[_slot(table, shift, key)] = key
+
+
+@compiled([int64[::1](READ_F4, int64[::1], *[float32] * 3), int64[::1](READ_F8, int64[::1], *[float64] * 3)])
 def _first_in_cells(
-    points: NDArray[np.floating], scale: np.floating, least: np.floating, most: np.floating
+    points: NDArray[np.floating], table: NDArray[np.int64], scale: np.floating, least: np.floating, most: np.floating
 ) -> NDArray[np.int64]:
     """`voxel_first` by a hash table of the cells seen so far; `least` and `most` are squared distances."""
-    bits = 10
-    while (1 << bits) < 2 * len(points):
-        bits += 1
-    table = np.full(1 << bits, -1, np.int64)
-    mask, shift = (1 << bits) - 1, np.uint64(64 - bits)
+    shift = _shift(table)
     first, count, before = np.empty(len(points), np.int64), 0, np.int64(-1)
     for i in range(len(points)):
         squared = points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1] + points[i, 2] * points[i, 2]
@@ -44,9 +95,7 @@ def _first_in_cells(
         if key == before:  # as its neighbor on the beam's ring
             continue
         before = key
-        slot = np.int64(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> shift)
-        while table[slot] >= 0 and table[slot] != key:
-            slot = (slot + 1) & mask
+        slot = _slot(table, shift, key)
         if table[slot] < 0:
             table[slot] = key
             first[count] = i

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dpm2_core.geometry.voxel import voxel_first
+from dpm2_core.geometry.voxel import VoxelCells, voxel_first
 
 
 @given(st.integers(0, 10_000), st.integers(0, 3000), st.floats(0.05, 5), st.sampled_from([np.float32, np.float64]))
@@ -19,6 +19,16 @@ def test_first_of_every_cell(seed: int, count: int, size: float, dtype: type) ->
         seen.setdefault(cell, i)
     points.flags.writeable = False  # as those of messages
     assert voxel_first(points, size).tolist() == sorted(seen.values())
+
+
+@given(st.integers(0, 10_000), st.lists(st.integers(0, 1500), max_size=6), st.floats(0.3, 50))
+def test_clouds_one_after_the_other_give_what_all_at_once_do(seed: int, counts: list[int], size: float) -> None:
+    """Also where the table has to grow, and where a later cloud is in the cells of those before."""
+    noise, cells = np.random.default_rng(seed), VoxelCells(size)
+    clouds = [(noise.normal(size=(count, 4)) * 40).astype(np.float32) for count in counts]
+    joined = np.concatenate([np.zeros((0, 4), np.float32), *(cloud[cells.first(cloud)] for cloud in clouds)])
+    whole = np.concatenate([np.zeros((0, 4), np.float32), *clouds])
+    np.testing.assert_array_equal(joined, whole[voxel_first(whole, size)])
 
 
 def test_many_cells_that_share_slots() -> None:
