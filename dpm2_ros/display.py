@@ -129,7 +129,7 @@ class Display:
 
     def __init__(self, publisher: Any, period: Callable[[], float], make: Callable[[], Any]) -> None:
         """`make`: called in the map's thread; returns the message, or a generator that does, with pauses between the
-        parts of its work; None if there is none after all."""
+        parts of its work."""
         self._publisher, self._period, self._make = publisher, period, make
         self._shown = 0
         self._last, self._worked = -np.inf, 0.0
@@ -141,7 +141,8 @@ class Display:
         if self._working:
             return False
         if not self._publisher.get_subscription_count():
-            self._steps = None  # who comes next gets the map of then
+            if self._steps is not None:  # who comes next gets the map of then
+                self.again()
             return False
         if self._steps is None:
             rest = _REST * self._worked if self._shown != _AGAIN else 0.0
@@ -153,8 +154,8 @@ class Display:
         return True
 
     def again(self) -> None:
-        """It is not complete yet: due once more."""
-        self._shown = _AGAIN
+        """What was made is not complete, or what is being made is of no use any more: due once more, from its begin."""
+        self._steps, self._shown = None, _AGAIN
 
     def publish(self) -> None:
         """Build and send it, or a part of the work for it."""
@@ -162,14 +163,12 @@ class Display:
         try:
             made = steps or self._make()
             if isinstance(made, Generator):
-                try:
-                    next(made)
-                except StopIteration as done:
-                    made = done.value
-                else:
-                    self._steps, made = made, None
-            if made is not None:
+                next(made)
+                self._steps = made
+            else:
                 self._publisher.publish(made)
+        except StopIteration as done:
+            self._publisher.publish(done.value)
         finally:
             self._worked += time.monotonic() - begin
             self._working = False

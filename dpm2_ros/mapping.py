@@ -212,7 +212,9 @@ class MapperThread:
             self._node.fail("mapper", error)
 
     def _change(self, work: Callable[[], Any]) -> Any:
-        """Work after which there is another map to show."""
+        """Work after which there is another map to show, and none of what is being built of the one before."""
+        for display in self._displays:
+            display.again()
         result = work()
         self._changes += 1
         return result
@@ -293,16 +295,10 @@ class MapperThread:
             self._node.get_logger().warning(f"dpm2/grid: {self._of_no_use}")
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
-    def _map(self) -> Generator[None, None, PointCloud2 | None]:
-        """In steps, so that keyframes come to their turn; None where the map is another one by now."""
+    def _map(self) -> Generator[None, None, PointCloud2]:
+        """In steps, so that keyframes come to their turn."""
         mapper, ros = self.active.mapper, self._config.ros
         nodes, voxel = np.flatnonzero(mapper.placed).tolist(), self._config.slam.map.voxel
-        steps = map_cloud_in_steps(mapper.clouds, mapper.poses, voxel, nodes)
-        while self.active.mapper is mapper:
-            try:
-                next(steps)
-            except StopIteration as done:
-                shown = done.value[evenly(len(done.value), ros.map_max_points)]
-                return cloud_to_msg(shown, self._stamp, ros.map_frame)
-            yield
-        return None
+        points = yield from map_cloud_in_steps(mapper.clouds, mapper.poses, voxel, nodes)
+        shown = points[evenly(len(points), ros.map_max_points)]
+        return cloud_to_msg(shown, self._stamp, ros.map_frame)
