@@ -154,7 +154,8 @@ class Fixes:
         T = self.georeference.T_enu_map @ data.poses[at]  # with the rotations of now: theirs is not measured
         R = T[:, :3, :3]
         arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
-        arms -= self._lag * self._antennas(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
+        if self._lag:
+            arms -= self._lag * self._antennas(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
         local = _local(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
         measured = np.array([fix.covariance for fix in fixes])
         # A residual is the logarithm of a pose: where heights are free to go far, they take up those of east and north.
