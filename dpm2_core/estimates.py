@@ -18,6 +18,10 @@ def isotropic(rad: float, m: float) -> Array:
     return np.diag(np.repeat([rad, m], 3) ** 2)
 
 
+BETWEEN = "between"
+"""Method of a pose that is only predicted because the frame is a part of a sweep that is not complete yet."""
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """The result of every registration, geometric or neural.
@@ -201,7 +205,7 @@ class OdometryResult:
         T_odom_lidar: (4, 4), always finite; the prediction where `registration.ok` is False.
         covariance: (6, 6) as in `Registration`, of T_odom_lidar relative to the last frame before that was registered.
         twist: (6,) [rad/s, m/s] in the LiDAR frame.
-        registration: how it was found.
+        registration: how it was found; `BETWEEN` is not a failure.
         keyframe: set when this frame became one.
         breaks: pauses and lifts so far across which the way is not known; since the last one the pose is a guess,
             `covariance` of the frame in which it was given up says how good.
@@ -226,6 +230,11 @@ class OdometryResult:
     imu: str | None = None
     repeated: frozenset[str] = frozenset()
     times: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the frame could not be registered, though it was to be."""
+        return not self.registration.ok and self.registration.method != BETWEEN
 
     @property
     def camera(self) -> str:

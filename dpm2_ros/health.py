@@ -31,7 +31,7 @@ class Health:
         now = time.monotonic()
         with self._lock:
             self.processed += 1
-            self.failed += not tracked.registration.ok
+            self.failed += tracked.failed
             self.last = tracked
             self._latency.append(latency)
             self._done.append(now)

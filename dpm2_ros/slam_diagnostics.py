@@ -264,7 +264,7 @@ class Diagnostics:
 def _tracked(last: OdometryResult) -> tuple[bytes, str]:
     """The state and its reason, and how bad it is."""
     level, registration = _LEVEL[last.state], last.registration
-    if not registration.ok:
+    if last.failed:
         level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
     return level, f"{last.state}: {registration.reason}" if registration.reason else str(last.state)
 

@@ -133,7 +133,7 @@ class SlamNode(ManagedNode):
 
     def _begin(self) -> None:
         """The state of a drive at its start."""
-        self._slam.odometry.reset()
+        self._slam.begin_drive()
         self._base.restart()
         self._sweep = Sweep()
         self._held: list[OdometryResult] = []  # until the base frame is known

@@ -146,7 +146,7 @@ def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
             if (now := drive.slam.mapper.store_problem) and not problem:
                 bar.console.print(f"map file: {now}", style="red", soft_wrap=True)
             problem = now
-            if not tracked.registration.ok:
+            if tracked.failed:
                 bar.console.print(
                     f"frame {tracked.index}: {tracked.registration.reason}", style="yellow", soft_wrap=True
                 )

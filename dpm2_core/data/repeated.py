@@ -18,7 +18,7 @@ from dpm2_core.frame import Array, Frame, Guess, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import compiled
 
-PROBLEM = "the same cloud as before: the LiDAR or its driver repeats itself"
+REPEATED = "the same cloud as before: the LiDAR or its driver repeats itself"
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
 _STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees

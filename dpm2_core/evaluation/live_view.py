@@ -120,9 +120,9 @@ class LiveView:
         self._stream.log("times", self._rr.Scalars([1e3 * seconds for seconds in tracked.seconds.values()]))
         sigma = np.sqrt(max(float(np.linalg.eigvalsh(tracked.covariance[3:, 3:])[-1]), 0.0))
         self._stream.log("quality", self._rr.Scalars([tracked.registration.confidence, sigma]))
-        if not tracked.registration.ok or tracked.state is not State.TRACKING:
+        if tracked.failed or tracked.state is not State.TRACKING:
             text = f"{tracked.state}: {tracked.registration.reason or tracked.registration.method}"
-            level = self._rr.TextLogLevel.WARN if tracked.registration.ok else self._rr.TextLogLevel.ERROR
+            level = self._rr.TextLogLevel.ERROR if tracked.failed else self._rr.TextLogLevel.WARN
             self._stream.log("log", self._rr.TextLog(text, level=level))
 
     def _show_map(self, mapper: Mapper, loops: Sequence[Edge]) -> None:

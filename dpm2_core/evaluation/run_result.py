@@ -16,7 +16,7 @@ from dpm2_core.data.ply import write_ply
 from dpm2_core.data.source import Source
 from dpm2_core.data.trajectory import Keys, Trajectory, matched, write_kitti, write_tum
 from dpm2_core.errors import UsageError
-from dpm2_core.estimates import OdometryResult
+from dpm2_core.estimates import BETWEEN, OdometryResult
 from dpm2_core.evaluation.figures import trajectory_png
 from dpm2_core.evaluation.ground_truth import camera_poses, truth_by_stamp
 from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS, known
@@ -84,7 +84,7 @@ class Result:
     def add(self, tracked: OdometryResult) -> None:
         """Take in the next frame."""
         self.recorder.add(tracked)
-        self.frame_methods.append(tracked.registration.method if tracked.registration.ok else "failed")
+        self.frame_methods.append("failed" if tracked.failed else tracked.registration.method)
         self.frame_states.append(str(tracked.state))
         if tracked.imu is not None:
             self.imu[tracked.imu or "used"] += 1
@@ -95,7 +95,7 @@ class Result:
     @property
     def registered(self) -> list[bool]:
         """Of each frame, whether its registration succeeded."""
-        return [method != "failed" for method in self.frame_methods]
+        return [method not in ("failed", BETWEEN) for method in self.frame_methods]
 
     @property
     def methods(self) -> Counter[str]:

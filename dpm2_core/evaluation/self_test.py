@@ -81,7 +81,7 @@ def self_test(seconds: float = 8.0) -> SelfTest:
         if number < _WARM:
             start = perf_counter() - began
             continue
-        failed += not result.registration.ok
+        failed += result.failed
         mapped = result.seconds["map"]
         odometry.append(sum(result.seconds.values()) - mapped)
         if result.keyframe is not None:

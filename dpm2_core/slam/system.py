@@ -12,6 +12,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from time import perf_counter
 
+from dpm2_core.data.sweep_parts import SweepParts
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.estimates import Edge, Keyframe, OdometryResult, State
 from dpm2_core.frame import Array, Frame
@@ -86,6 +87,8 @@ class Slam:
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
         self._thumbnail_width = thumbnail_width
         self._pictured = pictured
+        self._parts = SweepParts()
+        self._last: OdometryResult | None = None  # of a whole sweep
         self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
         self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
         # Ids of keyframes of the odometry that loops have tied since its last step; a mapper without one takes none.
@@ -109,8 +112,17 @@ class Slam:
     def odometry_step(self, frame: Frame) -> OdometryResult:
         """The frame's pose in the odometry frame, and a keyframe when it shows enough that is new, or if one is lost.
 
+        Frames that are parts of a sweep are joined: the pose of the last one is registered, those before are predicted.
         May run in another thread than the other steps.
         """
+        sweep = self._parts.join(frame)
+        if sweep is None and self._last is not None:
+            return self.odometry.between(self._last, frame)
+        self._last = self._registered(sweep or frame)
+        return self._last
+
+    def _registered(self, frame: Frame) -> OdometryResult:
+        """Of a frame that shows a whole sweep."""
         localizer, underway = self.localizer, self._underway
         arriving = underway is not None and abs(frame.stamp - underway) < _LOST_ON_THE_WAY
         if localizer is not None and not arriving and localizer.wants(frame.stamp):
@@ -131,6 +143,11 @@ class Slam:
             return result
         picture = thumbnail(placed(image, image.time_offset, result.twist), width)
         return replace(result, keyframe=replace(result.keyframe, thumbnail=picture))
+
+    def begin_drive(self) -> None:
+        """Begin the odometry anew: the next frame is the first of another drive."""
+        self.odometry.reset()
+        self._parts, self._last = SweepParts(), None
 
     def _asks_pictures(self, result: OdometryResult) -> bool:
         """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import BETWEEN, OdometryResult, Registration
 from dpm2_core.frame import Array, Frame, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import OPEN, along_open, combined, covariance, predicted, spread, turned_open
@@ -287,3 +287,19 @@ class MotionState:
             self.T, self.covariance = self.T_registered @ step.T, step.covariance
         elif self.twist is not None:
             self.T = predicted(self.T_registered, self.ahead, self.seconds, self.turning)
+
+    def between(self, last: OdometryResult, frame: Frame) -> OdometryResult:
+        """The pose of a frame that is a part of a sweep, predicted from `last`, the result of the last sweep."""
+        dt = max((frame.stamp - last.stamp) * 1e-9, 0.0)
+        T = last.T_odom_lidar @ se3.exp(dt * last.twist)
+        return replace(
+            last,
+            stamp=frame.stamp,
+            index=frame.index,
+            T_odom_lidar=T,
+            covariance=self.unknown(dt),
+            registration=replace(last.registration, T_target_source=T, method=BETWEEN, ok=False),
+            keyframe=None,
+            seconds={},
+            comparison=None,
+        )

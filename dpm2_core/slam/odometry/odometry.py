@@ -9,8 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from dpm2_core.data.repeated import PART_PROBLEM, RepeatedCloud, RepeatedImages, RepeatedPart
-from dpm2_core.data.repeated import PROBLEM as REPEATED
+from dpm2_core.data.repeated import PART_PROBLEM, REPEATED, RepeatedCloud, RepeatedImages, RepeatedPart
 from dpm2_core.data.stream_clock import DOUBTED, NOMINAL, SLOWEST, StreamClock
 from dpm2_core.estimates import OdometryResult, Registration, State
 from dpm2_core.frame import Array, Frame
@@ -79,9 +78,7 @@ class Odometry:
     def reset(self) -> None:
         """Forget everything; the next scan is the first."""
         self._motion = MotionState(self._settings)
-        self._clock = StreamClock()
-        self._sweep = Sweep()
-        self._failures = 0
+        self._clock, self._sweep, self._failures = StreamClock(), Sweep(), 0
         self._repeated, self._part, self._images = RepeatedCloud(), RepeatedPart(), RepeatedImages()
         self._first: Frame | None = None  # until the second one is registered
         self._first_sweep = Sweep()
@@ -108,6 +105,10 @@ class Odometry:
     def next_keyframe(self) -> int:
         """Id that the next keyframe will have."""
         return self._keyframes.next_id
+
+    def between(self, last: OdometryResult, frame: Frame) -> OdometryResult:
+        """See `MotionState.between`."""
+        return self._motion.between(last, frame)
 
     def cross_breaks(self, found: int, since: int | None = None) -> None:
         """A map has shown where the keyframe of that id is: the way across the breaks before it is known; or a loop,
@@ -252,8 +253,7 @@ class Odometry:
         motion = self._motion
         result, certain = bridge.register(scan, motion.T, motion.twist, own)
         if certain:
-            self._bridge, self._registration = None, bridge.registration
-            self._failures = 0
+            self._bridge, self._registration, self._failures = None, bridge.registration, 0
             motion.register(result, self._clock.stamp, moved=False)
             self._registration.update(scan, motion.T)
             return result

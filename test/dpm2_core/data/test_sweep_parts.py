@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds that are parts of a sweep are joined to whole sweeps, and only those."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dpm2_core.data.sweep_parts import SweepParts
+from dpm2_core.estimates import BETWEEN, State
+from dpm2_core.frame import NO_POINTS, Camera, Frame, Image, Inertial
+from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.settings import SlamSettings
+from test.helpers.drives import make_drive, off
+
+PERIOD = 10_000_000  # ns from one part to the next
+
+
+def part(i: int, *, span: float = 0.01, period: int = PERIOD, points: int = 50) -> Frame:
+    """A part of which each point has x = i and y = its time, s after the first part's stamp."""
+    offset = np.linspace(0, span, points, dtype=np.float32)
+    data = np.zeros((points, 4), np.float32)
+    data[:, 0], data[:, 1] = i, i * period * 1e-9 + offset
+    return Frame(i * period, data, offset, index=i)
+
+
+def numbers(sweep: Frame | None) -> list[int]:
+    """Which parts it consists of."""
+    return [] if sweep is None else np.unique(sweep.points[:, 0]).tolist()
+
+
+def joined(frames: Sequence[Frame]) -> list[Frame | None]:
+    parts = SweepParts()
+    return [parts.join(frame) for frame in frames]
+
+
+def test_ten_parts_make_a_sweep_at_the_stamp_of_the_last() -> None:
+    """The first part is handed on at once, as nothing tells yet that it is one, and is in the first sweep too."""
+    first, *between, sweep = joined([part(i) for i in range(10)])
+    assert numbers(first) == [0]
+    assert between == [None] * 8
+    assert numbers(sweep) == list(range(10))
+    assert sweep is not None
+    assert (sweep.stamp, sweep.index) == (9 * PERIOD, 9)
+    assert sweep.time_offset is not None
+    # float32 of 0.1 s
+    np.testing.assert_allclose(sweep.time_offset + 9 * PERIOD * 1e-9, sweep.points[:, 1], atol=1e-7)
+
+
+def test_each_part_is_in_one_sweep() -> None:
+    sweeps = [sweep for sweep in joined([part(i) for i in range(40)])[1:] if sweep is not None]
+    assert [sweep.index for sweep in sweeps] == [9, 19, 29, 39]
+    assert [number for sweep in sweeps for number in numbers(sweep)] == list(range(40))
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [part(i, span=0.1, period=100_000_000) for i in range(8)],  # a spinning LiDAR
+        [part(i, span=0.001, period=100_000_000) for i in range(8)],  # a flash LiDAR
+        [part(i, span=0.1, period=2_000_000) for i in range(8)],  # whole sweeps that arrived together, stamped then
+        [replace(part(i), time_offset=None) for i in range(8)],  # nothing shows whether these are parts
+    ],
+    ids=["spinning", "flash", "burst", "untimed"],
+)
+def test_whole_clouds_are_handed_on_as_they_are(frames: list[Frame]) -> None:
+    assert all(out is frame for out, frame in zip(joined(frames), frames, strict=True))
+
+
+def test_what_a_pause_interrupts_is_not_joined_across_it() -> None:
+    *_, sweep = joined([part(i) for i in (*range(5), *range(200, 210))])
+    assert numbers(sweep) == list(range(200, 210))
+
+
+def test_lost_parts_leave_a_hole() -> None:
+    """A node that is too slow drops clouds: the sweep ends where it would have ended."""
+    *_, sweep = joined([part(i) for i in (0, 1, 2, 6, 9)])
+    assert numbers(sweep) == [0, 1, 2, 6, 9]
+
+
+def test_a_part_without_a_return_is_waited_through_and_an_unreadable_one_is_handed_on() -> None:
+    empty = replace(part(4), points=NO_POINTS, time_offset=None)
+    bad = replace(part(5), points=NO_POINTS, time_offset=None, problem="cut off")
+    out = joined([*(part(i) for i in range(4)), empty, bad, *(part(i) for i in range(6, 10))])
+    assert out[4] is None
+    assert out[5] is bad
+    assert numbers(out[9]) == [0, 1, 2, 3, 6, 7, 8, 9]
+
+
+def test_a_sweep_has_what_the_other_sensors_measured_during_it() -> None:
+    """All samples of the IMU, the nearest image of each camera timed from the new stamp, and what was dropped."""
+    camera = Camera(np.array([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]]), np.eye(4), (8, 8))
+    frames = []
+    for i in range(10):
+        imu = Inertial(np.array([i * PERIOD]), np.zeros((1, 3)), np.zeros((1, 3)))
+        pixels = np.full((8, 8, 3), i, np.uint8)
+        images = (Image(pixels, camera, 0.002),) if i in (2, 7) else ()
+        frames.append(replace(part(i), imu=imu, images=images, dropped=int(i == 3), stepped=i == 4))
+    sweep = joined(frames)[-1]
+    assert sweep is not None
+    assert sweep.imu is not None
+    assert sweep.imu.stamps.tolist() == [i * PERIOD for i in range(10)]
+    assert [image.pixels[0, 0, 0] for image in sweep.images] == [7]
+    assert sweep.images[0].time_offset == pytest.approx(-0.018)
+    assert (sweep.dropped, sweep.stepped) == (1, True)
+
+
+def test_the_arrays_of_a_part_may_be_used_again() -> None:
+    parts, buffer = SweepParts(), part(0)
+    for i in range(10):
+        buffer.points[:, 0] = i
+        sweep = parts.join(replace(buffer, stamp=i * PERIOD, index=i))
+    assert numbers(sweep) == list(range(10))
+
+
+def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
+    """Each sweep of a simulated drive sent in ten parts: a pose for each part, those between two sweeps predicted."""
+    frames, poses = make_drive("city", 20, deskewed=False)
+    slam, tracked = make_slam(SlamSettings()), []
+    for frame in frames:
+        assert frame.time_offset is not None
+        edges = np.linspace(frame.time_offset.min(), frame.time_offset.max() + 1e-6, 11)
+        for k in range(10):
+            inside = (frame.time_offset >= edges[k]) & (frame.time_offset < edges[k + 1])
+            cloud = replace(frame, points=frame.points[inside], time_offset=frame.time_offset[inside])
+            tracked.append(slam.process(replace(cloud.later(edges[k]), index=len(tracked))).odometry)
+    assert [t.index for t in tracked] == list(range(200))
+    assert [t.registration.method == BETWEEN for t in tracked[10:]] == ([True] * 9 + [False]) * 19
+    assert not any(t.failed for t in tracked)
+    assert tracked[-1].state is State.TRACKING
+    # of sweeps; those of whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
+    assert off(tracked[9::10], poses).max() < 0.06
