@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the SLAM on recordings that dpm2 cannot read, by a loader of one's own:
+"""Runs the SLAM on recordings in a format that dpm2 cannot read, with your own loader:
 
 python examples/custom_loader.py FOLDER OUT
 
-FOLDER has a cloud in each STAMP.npy (ns; (N, 4) float32: x, y, z in m, intensity 0..1) and, if there is ground truth,
-poses.csv with a line "stamp,x,y,z,qx,qy,qz,qw" for each cloud it is known of.
+FOLDER contains one cloud per file STAMP.npy (stamp in ns; (N, 4) float32: x, y, z in m, intensity 0..1). If there is
+ground truth, it also contains poses.csv with a line "stamp,x,y,z,qx,qy,qz,qw" for each cloud with a known pose.
 """
 
 import sys
@@ -18,7 +18,7 @@ from dpm2_core import Frame, OfflineRun, UsageError
 
 
 class NumpyFolder:
-    """A `dpm2_core.Source`: what the SLAM asks of a drive."""
+    """A `dpm2_core.Source`: the interface through which the SLAM reads a drive."""
 
     T_cam_lidar = None  # there is no camera
 
@@ -37,7 +37,7 @@ class NumpyFolder:
         return len(self._files)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames by position; one that cannot be read says why, and the drive goes on."""
+        """Frames from `start` to `stop`. For an unreadable frame, `problem` is the reason; the drive continues."""
         for index in range(*slice(start, stop).indices(len(self))):
             path, problem = self._files[index], None
             points = np.zeros((0, 4), np.float32)
@@ -51,7 +51,7 @@ class NumpyFolder:
 
     def _read_poses(self, path: Path) -> np.ndarray:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
-        poses = np.full((len(self), 4, 4), np.nan)  # NaN where it is not known
+        poses = np.full((len(self), 4, 4), np.nan)  # NaN: unknown pose
         place = {int(file.stem): number for number, file in enumerate(self._files)}
         for row in rows:
             if (number := place.get(int(row[0]))) is not None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes a map of one recording, then localizes another one in it:
+"""Builds a map from one recording, then localizes another recording in it:
 
 python examples/map_then_localize.py RECORDING OTHER MAP.dpm2map
 
-Prints stamp (ns) and position in the map (m) of each frame of OTHER whose place is known. The map file must not exist
-yet; localization leaves it as it is.
+Prints the stamp (ns) and the position in the map (m) of each frame of OTHER whose place is known. The map file must not
+exist yet; localization does not change it.
 """
 
 import sys

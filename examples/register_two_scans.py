@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network registers one scan of a recording to another, without a guess, and draws which descriptors it matched:
+"""Registers one scan of a recording to another by the network, without an initial guess, and plots the matches:
 
 python examples/register_two_scans.py RECORDING TARGET SOURCE OUT.png
 
-TARGET and SOURCE are positions of scans in the recording, from 0. Needs the extra `plot`.
+TARGET and SOURCE are indices of scans in the recording, from 0. Needs the extra `plot`.
 """
 
 import sys

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An action for a behavior tree that makes a lost robot find itself in its map (py_trees, ROS 2).
+"""A behavior tree action that relocalizes a lost robot in its map (py_trees, ROS 2).
 
 python examples/relocalise_action.py [TIMEOUT]
 
-Beside a slam_node with ros.localization_mode: a tree that is content while the robot knows where it is, and calls
-`Relocalise` when it does not. Ends when the place is known (exit code 0), or could not be found within TIMEOUT s (1).
+Run it next to a slam_node with ros.localization_mode. The tree succeeds while the place of the robot is known, and
+calls `Relocalise` if it is not. It ends when the place is known (exit code 0), or was not found within TIMEOUT s
+(exit code 1).
 """
 
 import sys
@@ -20,11 +21,11 @@ from std_srvs.srv import Trigger
 
 LOCATED = ("tracking", "degraded", "relocalised")
 PATIENCE = 3.0
-"""Seconds until /diagnostics, which come once a second, must have said something."""
+"""Seconds until a message on /diagnostics, published once per second, must have been received."""
 
 
 class Localization:
-    """What slam_node says of the robot's place, from /diagnostics."""
+    """The localization state that slam_node publishes on /diagnostics."""
 
     def __init__(self, node: Node) -> None:
         self.node, self.state = node, "unknown"
@@ -44,14 +45,14 @@ class IsLocated(py_trees.behaviour.Behaviour):
         self._localization, self._began = localization, time.monotonic()
 
     def update(self) -> Status:
-        """As py_trees calls it."""
+        """One tick, called by py_trees."""
         if self._localization.state == "unknown" and time.monotonic() - self._began < PATIENCE:
             return Status.RUNNING
         return Status.SUCCESS if self._localization.state in LOCATED else Status.FAILURE
 
 
 class Relocalise(py_trees.behaviour.Behaviour):
-    """Lets slam_node search the whole map anew; RUNNING until it is found, FAILURE after `timeout` s."""
+    """Starts a new search of the whole map in slam_node: RUNNING until it is found, FAILURE after `timeout` s."""
 
     def __init__(self, localization: Localization, timeout: float = 20.0) -> None:
         super().__init__("relocalise")
@@ -60,12 +61,12 @@ class Relocalise(py_trees.behaviour.Behaviour):
         self._reply: Any = None
 
     def initialise(self) -> None:
-        """The search begins."""
+        """Starts the search."""
         self._began, self._reply, self._searching = time.monotonic(), None, False
         self.feedback_message = "searching"
 
     def update(self) -> Status:
-        """One tick."""
+        """One tick, called by py_trees."""
         if time.monotonic() - self._began > self._timeout:
             self.feedback_message = f"not found within {self._timeout:g} s"
             return Status.FAILURE
@@ -78,14 +79,14 @@ class Relocalise(py_trees.behaviour.Behaviour):
         if not self._reply.result().success:
             self.feedback_message = self._reply.result().message
             return Status.FAILURE
-        if not self._searching:  # what was said before does not count
+        if not self._searching:  # discard the state from before the search
             self._searching, self._localization.state = True, "searching"
             return Status.RUNNING
         return Status.SUCCESS if self._localization.state in LOCATED else Status.RUNNING
 
 
 def main() -> int:
-    """Tick the tree ten times a second until it knows."""
+    """Tick the tree ten times per second until it succeeds or fails."""
     timeout = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     rclpy.init()
     node = rclpy.create_node("behavior")

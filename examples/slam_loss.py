@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM as a training signal for a model of one's own: python examples/slam_loss.py RECORDING STEPS
+"""SLAM as a training signal for your own model: python examples/slam_loss.py RECORDING STEPS
 
-The model here is small: it is to undo a distortion of the clouds (each is scaled and shifted along x). Its own loss is
-the distance to the clean cloud; the SLAM loss asks that the trajectory through its output be that through clean clouds.
-Prints both before and after. In 20 steps the first falls to about a sixtieth, the second to a twentieth or less,
-also on KITTI. Few POINTS do not determine a registration: with 400 of them the SLAM loss on KITTI 04 was 14 times as
+The model here is small: it learns to undo a distortion of the clouds (each is scaled and shifted along x). Its task
+loss is the distance to the clean cloud. The SLAM loss compares the trajectory of its output with that of clean clouds.
+Prints both losses before and after. In 20 steps the first falls to about a sixtieth, the second to a twentieth or less,
+also on KITTI. Too few POINTS do not determine a registration: with 400 points the SLAM loss on KITTI 04 was 14 times as
 large after 20 steps, although the clouds were nearly right.
 """
 
@@ -21,14 +21,14 @@ WINDOW, POINTS, GAMMA = 3, 1000, 0.1
 
 
 class Undistort(nn.Module):
-    """(T, N, 3) to (T, N, 3): a scale and a shift for all clouds."""
+    """(T, N, 3) to (T, N, 3): one scale and one shift for all clouds."""
 
     def __init__(self) -> None:
         super().__init__()
         self.scale, self.shift = nn.Parameter(torch.ones(3)), nn.Parameter(torch.zeros(3))
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """The clouds, mended."""
+        """The corrected clouds."""
         return clouds * self.scale + self.shift
 
 

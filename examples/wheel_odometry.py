@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Beside wheel odometry: where the wheels say the robot is, the search for the pose begins.
+"""LiDAR odometry that starts its search for the pose at the pose of the wheel odometry.
 
 python examples/wheel_odometry.py RECORDING STEP
 
-Takes every STEP-th scan of a recording with ground truth, makes noisy wheel odometry from that (2 % of the way), and
-prints the error of the odometry by points alone, without and with the wheels. Between scans that are 10 m apart the
-points know nothing of the way; with the wheels they need not.
+Takes every STEP-th scan of a recording with ground truth, simulates noisy wheel odometry from it (2 % of the distance),
+and prints the error of odometry by point-to-plane registration alone, without and with the wheels. If scans are 10 m
+apart, the points do not determine the motion; the wheels provide it.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from dpm2_core.geometry import se3
 
 
 def wheels_of(poses: np.ndarray, noise: np.random.Generator) -> np.ndarray:
-    """(N, 4, 4) true poses as wheels measure them: each step is 2 % off, and each turn 0.05 degrees."""
+    """Simulated wheel odometry (N, 4, 4) from true poses (N, 4, 4): errors of 2 % and 0.05 degrees per step."""
     measured = [poses[0]]
     for before, now in itertools.pairwise(poses):
         step = se3.way(before, now)
@@ -31,7 +31,7 @@ def wheels_of(poses: np.ndarray, noise: np.random.Generator) -> np.ndarray:
 
 
 def main() -> None:
-    """Compare without and with the wheels."""
+    """Compare the odometry without and with the wheels."""
     source, step = open_source(sys.argv[1]), int(sys.argv[2])
     if source.poses is None:
         sys.exit(f"{sys.argv[1]}: no ground truth to make wheel odometry from")
