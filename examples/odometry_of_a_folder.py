@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Odometry of a recording: python examples/odometry_of_a_folder.py RECORDING POSES.txt
 
-The poses are those of the LiDAR. `dpm2 eval --gt RECORDING --est POSES.txt` needs `--calib CALIB.txt` if the ground truth
-is that of KITTI's left camera.
+The poses are those of the LiDAR. `dpm2 eval --gt RECORDING --est POSES.txt` needs `--calib CALIB.txt` if the ground
+truth is that of KITTI's left camera.
 """
 
 import sys
