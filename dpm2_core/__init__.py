@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """dpm2: LiDAR-visual SLAM with neural descriptors. No ROS import anywhere in this package.
 
-The names below are the public API; `examples/` shows them at work. Each is imported when it is first used, so that
+The names below are the public API; `examples/` shows how they are used. Each is imported when it is first used, so that
 `import dpm2_core` is quick, and geometric odometry imports neither torch nor matplotlib.
 
-* Data: `open_source(path)` gives a `Source` of `Frame`s, each with its `Image`s and their `Camera`s, from a recording
-  of any known format. `write_kitti` and `write_tum` write trajectories.
-* Settings: `Config` holds those of `dpm2 run`, `SlamSettings` those of the SLAM alone, `InputSettings` those of a
+* Data: `open_source(path)` opens a recording of any known format as a `Source` of `Frame`s, each with its `Image`s and
+  their `Camera`s. `write_kitti` and `write_tum` write trajectories.
+* Settings: `Config` has the settings of `dpm2 run`, `SlamSettings` those of the SLAM, `InputSettings` those of a
   recording. `load_settings(Config, file, ["slam.threads=4"])` reads them from YAML, `dump_settings` writes them.
-* SLAM: `make_slam(settings)` puts a `Slam` together, whose `process(frame)` gives a `SlamResult`: the `OdometryResult`
-  with its `Registration` and `State`, and, of a frame that became a `Keyframe`, the loops (`Edge`s) that were tried.
-  `make_odometry` does without the map. `open_session` makes or extends a map file; with one from
-  `open_for_localization` the map stays as it is, and keyframes are found in it (`LocalizationResult`).
+* SLAM: `make_slam(settings)` creates a `Slam`, whose `process(frame)` returns a `SlamResult`: the `OdometryResult` with
+  its `Registration` and `State` and, for a frame that became a `Keyframe`, the loops (`Edge`s) that were tried.
+  `make_odometry` creates the odometry without a map. `open_session` creates or extends a map file; with a map from
+  `open_for_localization` the map is not changed, and keyframes are localized in it (`LocalizationResult`).
   `OfflineRun(recording, config).run()` is `dpm2 run`.
-* Network: `load_network(name, threads)` gives a network whose `describe` makes `Descriptors` of a frame, and whose
-  `register` finds the `Registration` of two.
+* Network: `load_network(name, threads)` loads a network, whose `describe` computes the `Descriptors` of a frame, and
+  whose `register` returns the `Registration` of two.
 * Figures: `trajectory_png` draws a trajectory on its map, `matches_png` a registration; both need the extra `plot`.
-* Errors: `Dpm2Error` is what can go wrong, `UsageError` (one of them) what the caller can put right.
+* Errors: `Dpm2Error` is any failure, `UsageError` (a subclass) one that the caller can correct.
 
-A program that runs the SLAM beside others should call `dpm2_core.openmp.wait_passively()` before it imports numpy, as
-`dpm2` and the ROS nodes do: an import sets no environment variable.
+A program that runs other work next to the SLAM should call `dpm2_core.openmp.wait_passively()` before it imports numpy,
+as `dpm2` and the ROS nodes do: an import sets no environment variable.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 
 from dpm2_core._version import __version__ as __version__
 
-if TYPE_CHECKING:  # `as`: names that are to be exported
+if TYPE_CHECKING:  # `as` exports the names
     from dpm2_core.config import dump_settings as dump_settings
     from dpm2_core.config import load_settings as load_settings
     from dpm2_core.data.open import open_source as open_source
@@ -82,18 +82,18 @@ _MODULES = {
     "slam.settings": "Config SlamSettings",
     "slam.system": "Slam SlamResult",
 }
-"""The public names by the module that has them, as under TYPE_CHECKING above."""
+"""The public names by the module that defines them, as under TYPE_CHECKING above."""
 _PLACES = {name: module for module, names in _MODULES.items() for name in names.split()}
 __all__ = ["__version__", *_PLACES]
 
 
-if not TYPE_CHECKING:  # type checkers would take it for a module that has every name
+if not TYPE_CHECKING:  # with __getattr__, type checkers would accept any name of this module
 
     def __getattr__(name: str) -> object:
         if name not in _PLACES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
-        globals()[name] = value  # found without this function from now on
+        globals()[name] = value  # next time it is found without this function
         return value
 
 

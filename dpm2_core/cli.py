@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `dpm2` command. Errors of use exit with 2 and one line on stderr, failures of the work with 1.
+"""The `dpm2` command. Usage errors exit with 2 and one line on stderr, failures of the work with 1.
 
-A command's module is imported when it is called, not to list it: numpy, gtsam and the rest take a second.
+The module of a command is imported when the command is called, not to list it: numpy, gtsam and the rest take a second.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ GROUPS = {
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 _LAST = "This machine"
 _UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EPIPE)
-"""Of a file that is open, such as stdout, whose errors name no file."""
+"""Errors of a file that is already open, such as stdout; they name no file."""
 
 
 class Commands(TyperGroup):
-    """The commands of `COMMANDS`; each is imported once it is called."""
+    """The commands of `COMMANDS`; each is imported when it is called."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -101,7 +101,7 @@ class Commands(TyperGroup):
 
 
 def load_command(name: str) -> TyperCommand | TyperGroup:
-    """Import a command of `COMMANDS`; it and its subcommands take `--quiet`."""
+    """Import a command of `COMMANDS`; add the option `--quiet` to it and its subcommands."""
     with importing():
         found = resolve_name(f"dpm2_core.commands.{COMMANDS[name][0]}")
     command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _command(name, found)
@@ -125,7 +125,7 @@ def _quiet(
         ),
     ] = False,
 ) -> None:  # fmt: skip
-    """What has the option that all commands have."""
+    """A function with the option that all commands have."""
 
 
 app = typer.Typer(
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         sys.exit(_status(arguments))
     finally:
-        if arguments is None:  # the process ends: Python need not look through all that was imported once more
+        if arguments is None:  # the process ends: Python need not search all imported objects for garbage once more
             gc.freeze()
 
 
@@ -164,17 +164,17 @@ def _status(arguments: Sequence[str] | None) -> int:
     args = None if arguments is None else list(arguments)
     try:
         code = exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
-        if sys.stdout is not None:  # it is where a service has closed it
+        if sys.stdout is not None:  # None in a service that closed it
             sys.stdout.flush()
         return code
-    except typer.Abort:  # Ctrl-C where the command itself makes nothing of it
+    except typer.Abort:  # Ctrl-C that the command itself does not handle
         return 130
     except OSError as error:
         if error.errno not in _UNWRITTEN:
             raise
-        if error.errno != errno.EPIPE:  # a reader that has what it wanted
+        if error.errno != errno.EPIPE:  # on EPIPE the reader, such as `head`, has what it wanted
             print(f"dpm2: not written: {error.strerror}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left for stdout would be one more error at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the text still buffered for stdout fails again at exit
         return 1
 
 

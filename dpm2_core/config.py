@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files and `key=value` settings into one typed configuration; every error names file, key and what is allowed.
+"""Reads YAML files and `key=value` settings into one typed configuration. Each error names the file, the key and the
+allowed values.
 
-Each part of the package keeps its own `Settings` type beside the code it configures; `slam.settings.Config` joins them.
+Each part of the package has its own `Settings` class next to the code it configures; `slam.settings.Config` joins them.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from dpm2_core.errors import UsageError, one_line
 
 T = TypeVar("T", bound="Settings")
 
-# PyYAML lets the errors of int() and datetime() through, and recurses.
+# PyYAML passes on the errors of int() and datetime(), and it is recursive.
 _NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe one, for which a key that is there twice is a mistake: else the first is dropped without a word."""
+    """The safe loader, which also rejects duplicate keys: PyYAML would drop the first one without a warning."""
 
     def compose_mapping_node(self, anchor: dict[Any, yaml.Node]) -> yaml.MappingNode:
-        node = super().compose_mapping_node(anchor)  # as it is written: `<<` is not carried out yet
+        node = super().compose_mapping_node(anchor)  # the keys as written: `<<` is not merged yet
         seen = set[tuple[str, str]]()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -39,7 +40,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class Settings(BaseModel):
-    """Base of every configuration type: unknown keys are errors, values immutable, docstrings describe fields."""
+    """Base of all configuration classes: unknown keys are errors, values immutable, docstrings describe the fields."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True, allow_inf_nan=False,
@@ -48,13 +49,13 @@ class Settings(BaseModel):
 
     @classmethod
     def implied(cls, tree: Mapping[str, Any]) -> dict[str, Any]:
-        """What a file with this tree need not say, such as the values of the preset that it names."""
+        """Values that a file with this tree may omit, such as those of the preset that it names."""
         return {}
 
     @field_validator("*", mode="before")
     @classmethod
     def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """`true`, `yes` and `on` are no 1: pydantic takes them for one where a number is wanted."""
+        """Reject `true`, `yes` and `on` where a number is expected: pydantic accepts them as 1."""
         if isinstance(value, bool):
             kinds = set(_kinds(cls.model_fields[info.field_name or ""].annotation))
             if bool not in kinds and kinds & {int, float}:
@@ -64,7 +65,7 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _over_the_default(cls, value: Any, info: ValidationInfo) -> Any:
-        """A part of which some keys are given has for the others what the default of its field sets."""
+        """A part of which only some keys are given takes the others from the default of its field."""
         default = cls.model_fields[info.field_name or ""].default
         if isinstance(value, Mapping) and isinstance(default, Settings):
             return merged(default.model_dump(exclude_unset=True), value)
@@ -79,12 +80,13 @@ def _kinds(annotation: Any) -> Iterator[Any]:
 
 
 def load_settings(kind: type[T], path: Path | str | None = None, overrides: Sequence[str] = ()) -> T:
-    """Defaults, then the YAML file, then `dotted.key=value` settings, each overriding the one before.
+    """Defaults, then the YAML file, then `dotted.key=value` settings; each overrides the previous ones.
 
-    A mapping as the value of a part changes the keys that it has; where keys are free, it replaces the one before.
+    A mapping as the value of a part changes only the keys that it contains; where keys are free, it replaces the old
+    mapping.
 
     Raises:
-        UsageError: the file is missing or no YAML mapping, or a key or value is not allowed.
+        UsageError: the file is missing or not a YAML mapping, or a key or value is not allowed.
     """
     tree = {} if path is None else read_settings(kind, Path(path))
     origin: dict[str, str] = {}
@@ -94,13 +96,13 @@ def load_settings(kind: type[T], path: Path | str | None = None, overrides: Sequ
         if not equals or not key:
             raise UsageError(f"--set {setting}: want KEY=VALUE, such as slam.registration=geometric")
         put(kind, tree, key.split("."), value_of(text))
-        origin.pop(key, None)  # the last one is to blame
+        origin.pop(key, None)  # an error is reported for the last setting of a key
         origin[key] = f"--set {setting}"
     return settings_from(kind, tree, origin, str(path) if path else "configuration")
 
 
 def settings_from(kind: type[T], tree: dict[str, Any], origin: dict[str, str] | None = None, default: str = "") -> T:
-    """Validate a nested dictionary; `origin` maps dotted keys to where they were set, for the message."""
+    """Validate a nested dictionary; `origin` maps dotted keys to the place where they were set, for the message."""
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
@@ -108,12 +110,12 @@ def settings_from(kind: type[T], tree: dict[str, Any], origin: dict[str, str] | 
 
 
 def dump_settings(settings: Settings) -> str:
-    """YAML of every value, each key preceded by its description."""
+    """YAML of all values, each key preceded by its description."""
     return "\n".join(_dump(settings, 0)) + "\n"
 
 
 def merged(tree: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    """A nested dictionary with the keys of another one put in."""
+    """A nested dictionary, updated with the keys of another one."""
     out = dict(tree)
     for key, value in more.items():
         inner = out.get(key)
@@ -125,11 +127,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; {} for an empty one.
 
     Raises:
-        UsageError: the file is missing, or holds something else.
+        UsageError: the file is missing, or does not contain a mapping.
     """
     try:
         tree = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
-        json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that holds itself through an alias
+        json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that contains itself through an alias
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except _NOT_YAML as error:
@@ -142,10 +144,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def read_settings(kind: type[Settings], path: Path) -> dict[str, Any]:
-    """What a YAML file sets, without what is `implied`: another preset than the file's can then be put in.
+    """The settings in a YAML file without those that are `implied`, so that another preset can replace the file's.
 
     Raises:
-        UsageError: the file is missing or no YAML mapping.
+        UsageError: the file is missing or not a YAML mapping.
     """
     return _said(kind, read_yaml(path))
 
@@ -160,7 +162,7 @@ def _said(kind: type[Settings], tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _without(tree: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy without the keys whose values are the same, at any depth."""
+    """A copy without the keys that have the same value in `values`, at any depth."""
     out: dict[str, Any] = {}
     for key, value in tree.items():
         other = values.get(key)
@@ -172,7 +174,7 @@ def _without(tree: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted name and field of every leaf: the names that `--set` and the ROS parameters share."""
+    """Dotted name and field of every leaf; `--set` and the ROS parameters use the same names."""
     for name, info in kind.model_fields.items():
         if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
             yield from flat_fields(info.annotation, f"{prefix}{name}.")
@@ -181,7 +183,7 @@ def flat_fields(kind: type[Settings], prefix: str = "") -> Iterator[tuple[str, F
 
 
 def value_of(text: str) -> Any:
-    """The value of a setting, YAML; invalid YAML is taken as a string; so is 04, a KITTI sequence, not octal 4."""
+    """The value of a setting, read as YAML; invalid YAML and numbers like 04 (a KITTI sequence) are strings."""
     try:
         return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
     except _NOT_YAML:
@@ -189,21 +191,21 @@ def value_of(text: str) -> Any:
 
 
 def put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    """Set what lies at a path of keys in a tree of that kind; None below a field whose keys are free."""
+    """Set the value at a path of keys in a tree of that kind; `kind` is None below a field with free keys."""
     key, *rest = path
     found = kind.model_fields[key].annotation if kind is not None and key in kind.model_fields else None
     part = None if get_origin(found) is dict else next(_settings_in(found), None)
     if not rest and not (part and isinstance(value, dict)):
         tree[key] = value
         return
-    # A copy: two keys may share one mapping through a YAML anchor, and each is its own.
+        # A copy: through a YAML anchor two keys may share one mapping, but each may change independently.
     branch = tree[key] = dict(tree[key]) if isinstance(tree.get(key), dict) else {}
     for keys, more in [(rest, value)] if rest else [([name], inner) for name, inner in value.items()]:
         put(part, branch, keys, more)
 
 
 def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:
-    """One message a key, saying where it was set; the branches of a union become `this or that`."""
+    """One message per key that names where the key was set; the branches of a union become `this or that`."""
     messages: dict[str, list[str]] = {}
     for e in error.errors():
         unknown = e["type"] == "extra_forbidden"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The terminal: text, whatever it looks like, since names and notes come from files; and how far a work has come."""
+"""Output to the terminal: text without control characters, since names and notes come from files; and progress."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from dpm2_core.errors import printable
 
 _T = TypeVar("_T")
 QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-"""Whether notes and progress, all that goes to stderr but errors, are left out: `--quiet` of every command."""
+"""Whether notes and progress (all stderr output except errors) are left out: `--quiet` of every command."""
 Advance = Callable[[int, int], None]
-"""Told how much is done, of how much."""
+"""Called with the amount done and the total."""
 
 
 def untold(done: int, total: int) -> None:
-    """An `Advance` that says nothing."""
+    """An `Advance` that does nothing."""
 
 
 class Console(rich.console.Console):
-    """rich's, without its markup, and without control characters in what is printed."""
+    """rich's console without markup, and without control characters in the printed text."""
 
     def __init__(self, *, stderr: bool = False, **options: Any) -> None:
         """As rich's."""
         super().__init__(stderr=stderr, markup=False, emoji=False, quiet=stderr and QUIET.get(), **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As rich's; in text, every line for itself."""
+        """As rich's; each line of a text is made printable by itself."""
         super().print(*(lines(item) if isinstance(item, str) else item for item in objects), **options)
 
 
 def lines(text: str) -> str:
-    """Text from elsewhere for a terminal, of several lines or one."""
+    """Text from files or messages, of one or several lines, made printable for a terminal."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 class Lines(Progress):
-    """Progress where no terminal is: a line each tenth of the way, so that a log shows it."""
+    """Progress without a terminal: a line after each tenth of the work, for a log."""
 
     def update(self, task_id: TaskID, **fields: Any) -> None:
         """As rich's."""
@@ -60,7 +60,7 @@ class Lines(Progress):
 
 
 def progress_bar(console: Console | None = None) -> Progress:
-    """A bar with a description, the count and the time left; on stderr by default. Lines where that is no terminal."""
+    """A bar with description, count and remaining time, by default on stderr; lines if that is no terminal."""
     console = console or Console(stderr=True)
     if not console.is_terminal:
         return Lines(console=console, disable=True)
@@ -70,13 +70,13 @@ def progress_bar(console: Console | None = None) -> Progress:
 
 @contextmanager
 def counted(description: str) -> Iterator[Advance]:
-    """A bar that is told how much is done, and how much there is to do."""
+    """A progress bar as a context; yields the function that sets the amount done and the total."""
     with progress_bar() as bar:
         task = bar.add_task(description, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def tracked(items: Iterable[_T], description: str, total: int | None = None) -> Iterator[_T]:
-    """The items, with a bar that says how many are done; `total`: how many there are, where they do not say it."""
+    """The items, with a bar that shows how many are done; `total`: their number, if `items` has no length."""
     with progress_bar() as bar:
         yield from bar.track(items, total=total, description=description)

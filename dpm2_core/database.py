@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An SQLite file of unknown origin: nothing in it is executed, and nothing in it keeps a query busy without end.
+"""Opens SQLite files of unknown origin: nothing in them is executed, and no query can run without end.
 
-What sqlite.org/security.html asks of whoever opens such files. A map is tables and nothing else, so the text of its
-schema is compared with ours, and a view, a trigger or an expression in it is an error before any row is read; of a bag,
-which others wrote, only that it is plain tables.
+It follows sqlite.org/security.html for untrusted files. A map file has only tables: the text of its schema is compared
+with ours, and a view, a trigger or an expression in it is an error before any row is read. Bags are written by other
+programs, so only the absence of anything but plain tables is checked.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from typing import Any
 from urllib.parse import quote
 
 MAX_VALUE = 64 << 20
-"""Bytes of one value or row: the largest cloud is a quarter of it."""
+"""Bytes of one value or row: the largest cloud takes a quarter of it."""
 _EVERY = 100_000  # steps of SQLite's virtual machine between two calls of the handler
-_STEPS = 30_000_000  # of one statement, besides one a byte of the file: a second or two
+_STEPS = 30_000_000  # per statement, plus one per byte of the file: a second or two
 
 _COMPUTED = re.compile(r"\b(AS|VIRTUAL|CHECK|WHERE)\b", re.IGNORECASE)
 
 
 class Connection(sqlite3.Connection):
-    """Ends every statement that takes more steps than a map of the file's size can need."""
+    """A connection that aborts any statement that takes more steps than a map file of this size can need."""
 
     def __init__(self, database: str | Path, *arguments: Any, size: int = 0, **options: Any) -> None:
-        """As `sqlite3.connect`; `size`: of the file, bytes."""
+        """As `sqlite3.connect`; `size`: file size, bytes."""
         super().__init__(database, *arguments, **options)
         self._steps = _Steps((_STEPS + size) // _EVERY)
         self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE)
@@ -51,7 +51,7 @@ class Connection(sqlite3.Connection):
 
 
 class _Steps:
-    """Counts calls; the one beyond `most` makes SQLite stop."""
+    """Counts its calls; SQLite stops at the first call beyond `most`."""
 
     def __init__(self, most: int) -> None:
         self.taken, self._most = 0, most
@@ -62,7 +62,7 @@ class _Steps:
 
 
 def size_with_log(path: Path) -> int:
-    """Bytes of a database file and of its FILE-wal, which lies beside the file that a link leads to."""
+    """Bytes of a database file and of its FILE-wal, which lies next to the target of a symbolic link."""
     source = path.resolve()
     return sum(file.stat().st_size for suffix in ("", "-wal") if (file := Path(f"{source}{suffix}")).exists())
 
@@ -71,9 +71,9 @@ def connect(path: Path, mode: str, timeout: float = 5.0) -> Connection:
     """Open a database file.
 
     Args:
-        mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file without a writer.
+        mode: of SQLite's file URIs: ro, rw, rwc; `ro&immutable=1` for a file that no process writes.
     """
-    # The mapper of a ROS node is made in one thread and used in another, never in two at once.
+    # The mapper of a ROS node is created in one thread and used in another, but never in both at once.
     return Connection(
         f"file:{quote(os.fsencode(path))}?mode={mode}", timeout, isolation_level=None, check_same_thread=False,
         uri=True, size=size_with_log(path),
@@ -81,10 +81,10 @@ def connect(path: Path, mode: str, timeout: float = 5.0) -> Connection:
 
 
 def check_schema(connection: sqlite3.Connection, tables: Mapping[str, str]) -> None:
-    """Compare what is in a database with the tables that belong there, CREATE statement by name.
+    """Compare the schema of a database with the expected tables, their CREATE statements by name.
 
     Raises:
-        sqlite3.DatabaseError: one is missing, is there besides, or is not as it should be; or nothing can be read.
+        sqlite3.DatabaseError: a table is missing, unexpected or different, or the schema cannot be read.
     """
     left = dict(tables)
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
@@ -97,10 +97,10 @@ def check_schema(connection: sqlite3.Connection, tables: Mapping[str, str]) -> N
 
 
 def check_plain(path: Path) -> None:
-    """Whether a database has tables of values and ordinary indices only: nothing that is computed when it is read.
+    """Check that a database has only tables of values and ordinary indices: nothing is computed when it is read.
 
     Raises:
-        sqlite3.DatabaseError: it has not, or cannot be read.
+        sqlite3.DatabaseError: it has something else, or cannot be read.
     """
     connection = connect(path, "ro")
     try:
@@ -118,5 +118,5 @@ def statements(script: str) -> dict[str, str]:
 
 
 def _bare(sql: str) -> str:
-    """Without comments and needless spaces. What equals a text without quotes has none: all its `--` are comments."""
+    """Without comments and needless spaces. The expected text has no quotes: each `--` in an equal one is a comment."""
     return re.sub(r" ?([(),]) ?", r"\1", re.sub(r"\s+", " ", re.sub(r"--[^\n]*", " ", sql))).strip()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noun of the network, free of torch: a set of neural descriptors, of one frame or merged from several."""
+"""A set of neural descriptors, of one frame or merged from several; independent of torch."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 
-_LEVEL = np.cos(np.radians(5))  # a tilt that is smaller is that of the road
+_LEVEL = np.cos(np.radians(5))  # smaller tilts are those of the road
 
 
 @dataclass(frozen=True, eq=False)
 class Descriptors:
-    """What is kept of a frame: 46 kB for 320 descriptors.
+    """The descriptors that are stored for a frame: 46 kB for 320 descriptors.
 
     Attributes:
         xyz: (N, 3) float32 m, in the frame of the set.
-        features: (N, 128) int8, in units of `step`: with more bits no pose differs by more than chance.
+        features: (N, 128) int8, in units of `step`; with more bits no pose differs by more than chance.
         step: (N,) float32, of each descriptor.
         axis: (N, 2) float32, horizontal unit vectors from the sensor to each descriptor, in level axes; None for a
             single frame, where they follow from `xyz`.
-        up: (3,) float32 unit vector, in the frame of the set, where the sensor was tilted and the features are those
-            of its scan in level axes; None: the frame of the set counts as level.
+        up: (3,) float32 up vector in the frame of the set, if the sensor was tilted: the features are then those of
+            its scan in level axes. None: the frame of the set counts as level.
         scale: the features are those of the scan enlarged by this factor: see `geometry.scale.scale_of`. Sets of
             different scales cannot be compared.
     """
@@ -45,7 +45,7 @@ class Descriptors:
 
     @classmethod
     def of(cls, xyz: NDArray[np.float32], values: NDArray[np.floating]) -> Descriptors:
-        """Those of a single frame with positions (N, 3) and features (N, C)."""
+        """The descriptors of a single frame with positions (N, 3) and features (N, C)."""
         return cls(xyz, *quantized(values))
 
     def __len__(self) -> int:
@@ -59,7 +59,7 @@ class Descriptors:
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """(N, C) the features."""
+        """(N, C) features as float32."""
         return self.features * self.step[:, None]
 
     @property
@@ -84,11 +84,11 @@ class Descriptors:
 
     @property
     def R_level_set(self) -> NDArray[np.float32]:
-        """(3, 3) turns the frame of the set into the level axes nearest to it."""
+        """(3, 3) rotates the frame of the set into the nearest level axes."""
         return levelling(self.up)
 
     def as_encoded(self) -> Descriptors:
-        """The same as the network saw it: in level axes, `R_level_set`, and enlarged by `scale`."""
+        """The same descriptors as the network saw them: in level axes, `R_level_set`, and enlarged by `scale`."""
         if self.up is None and self.scale == 1:
             return self
         xyz = self.xyz @ self.R_level_set.T * np.float32(self.scale)
@@ -96,9 +96,9 @@ class Descriptors:
 
 
 def quantized(values: NDArray[np.floating]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """Features (N, C) as int8 in units of a step (N,), of which the largest of each descriptor has 127.
+    """Features (N, C) as int8 in units of a step (N,), so that the largest of each descriptor is 127.
 
-    A step is not finite where a feature is not.
+    A step is not finite if a feature is not.
     """
     step = np.abs(values).max(1).astype(np.float32) / np.float32(127)
     with np.errstate(invalid="ignore"):
@@ -106,13 +106,16 @@ def quantized(values: NDArray[np.floating]) -> tuple[NDArray[np.int8], NDArray[n
 
 
 def is_level(up: NDArray[np.floating]) -> bool:
-    """Whether a unit vector (3,) is so near to the z axis that its frame counts as level."""
+    """Whether a unit vector (3,) is so close to the z axis that its frame counts as level."""
     return bool(up[2] >= _LEVEL)
 
 
 def levelling(up: NDArray[np.floating] | None) -> NDArray[np.float32]:
-    """(3, 3) the smallest rotation that turns a unit vector (3,) into the z axis; if it points down, after half a turn
-    about x: straight down that leaves no choice, on which rounding would decide. None, of what is level: no turn."""
+    """(3, 3) smallest rotation of a unit vector (3,) to the z axis; identity for None, which is level.
+
+    A vector that points down is first rotated by half a turn about x: for straight down there is no single smallest
+    rotation, and rounding would decide.
+    """
     if up is None:
         return np.eye(3, dtype=np.float32)
     x, y, z = (float(value) for value in up)
@@ -124,43 +127,43 @@ def levelling(up: NDArray[np.floating] | None) -> NDArray[np.float32]:
 
 
 def _turned(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Horizontal unit vectors (N, 2) turned by the heading of R (3, 3)."""
+    """Horizontal unit vectors (N, 2) rotated by the heading of R (3, 3)."""
     turned = axis @ R[:2, :2].T
     turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
     return turned
 
 
 class LazyDescriptors:
-    """Descriptors of a scan, made when they are first needed: that takes the network as long as all else together.
+    """Descriptors of a scan, computed when they are first needed: the network takes as long as all else together.
 
     Attributes:
         problem: why there are none; empty if there are some, or if they were not needed yet.
     """
 
     def __init__(self, make: Callable[[], Descriptors]) -> None:
-        """`make`: raises Dpm2Error for a scan that has none, such as one of too few points."""
+        """`make` raises Dpm2Error for a scan that has no descriptors, such as one of too few points."""
         self._make: Callable[[], Descriptors] | None = make
         self._value: Descriptors | None = None
         self.problem = ""
 
     @property
     def made(self) -> bool:
-        """Whether they were needed."""
+        """Whether they were computed, or tried."""
         return self._make is None
 
     def get(self) -> Descriptors | None:
-        """The descriptors; None of a scan that has none, for the reason that `problem` gives."""
+        """The descriptors; None if the scan has none, for the reason in `problem`."""
         if self._make is not None:
             try:
                 self._value = self._make()
             except Dpm2Error as error:
                 self.problem = str(error)
-            self._make = None  # which held the scan's points
+            self._make = None  # it refers to the scan's points
         return self._value
 
 
 def merge(sets: Sequence[Descriptors]) -> Descriptors:
-    """One set of several that are already in the same frame; those of another scale than the first are left out.
+    """Merge sets that are already in the same frame; sets of another scale than the first are left out.
 
     Raises:
         ValueError: no set given.
@@ -170,7 +173,7 @@ def merge(sets: Sequence[Descriptors]) -> Descriptors:
     sets = [s for s in sets if s.scale == sets[0].scale]
     up = next((s.up for s in sets if s.up is not None), None)
     axes = [s.axes for s in sets]
-    if up is not None:  # each estimated its own
+    if up is not None:  # each set estimated its own
         axes = [_turned(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
     xyz, features, step = (np.concatenate([getattr(s, name) for s in sets]) for name in ("xyz", "features", "step"))
     return Descriptors(xyz, features, step, np.concatenate(axes), up, sets[0].scale)

@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two ways a call can fail that are not a bug, and what a process makes of them."""
+"""The two kinds of failure that are not bugs, and the exit codes they cause."""
 
 import errno
 import os
 import sys
 from collections.abc import Callable
 
-_OF_PATHS = (errno.EACCES, errno.ENAMETOOLONG)  # asking whether such a file is there fails already
+_OF_PATHS = (errno.EACCES, errno.ENAMETOOLONG)  # already the check whether such a file exists raises these
 
 
 class Dpm2Error(Exception):
-    """The work failed: a full disk, a damaged file found half-way. One line, naming what and where."""
+    """The work failed, such as by a full disk or a damaged file. One line that names what and where."""
 
     exit_code = 1
 
 
 class UsageError(Dpm2Error):
-    """The request cannot be carried out as given: no such file, an unknown key, a missing extrinsic."""
+    """The request cannot be carried out as given: a missing file, an unknown key, a missing extrinsic calibration."""
 
     exit_code = 2
 
 
 def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
-    """Run `work` and return its exit code; where it fails, that of the error, which is one line on stderr after `name`.
+    """Run `work` and return its exit code; on an error, print it as one line on stderr after `name`, return its code.
 
-    An error that is a bug is raised. A path that may not be entered, or with a name that is too long, is none.
+    An error that is a bug is raised. A path without access permission or with a name that is too long is not a bug.
     """
     try:
         return work() or 0
@@ -34,18 +34,18 @@ def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
             code, text = Dpm2Error.exit_code, f"{os.fsdecode(error.filename)}: {error.strerror}"
         if code is None:
             raise
-        if hasattr(error, "format_message"):  # click's own errors of use: an unknown option, a missing argument
+        if hasattr(error, "format_message"):  # click's own usage errors: an unknown option, a missing argument
             text = " ".join(error.format_message().split())
-        if text:  # a group of commands that is called without one has shown its help
+        if text:  # empty for a group of commands that is called without one: it has shown its help
             print(f"{name}: {printable(text)}", file=sys.stderr)
         return int(code)
 
 
 def printable(text: str) -> str:
-    """Text from a file or a message as one line for a terminal: what would steer it is shown, not sent."""
+    """Text from a file or a message as one line for a terminal: control characters are escaped."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def one_line(error: Exception) -> str:
-    """What an error of a library says, or its type where it says nothing."""
+    """The message of a library's error on one line, or its type if the message is empty."""
     return " ".join(str(error).split()) or type(error).__name__

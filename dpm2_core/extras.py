@@ -13,12 +13,12 @@ _X86_64_ONLY = ("embreex",)  # neither wheels nor sources for other Linux machin
 
 
 class MissingPackageError(UsageError):
-    """An extra that is not installed; the message says which."""
+    """An extra that is not installed; the message names it."""
 
 
 @contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Around the import of a package of an extra.
+    """A context around the import of a package of an extra.
 
     Args:
         extra: its name in setup.py. purpose: what needs the package, the subject of the message.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results reach the disk whole or not at all: a full disk or a kill leaves the file that was there before. And what
-tells files apart."""
+"""Writes results whole or not at all: after a full disk or a kill the previous file is still there. Also digests and
+file names."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from dpm2_core.errors import Dpm2Error, UsageError
 
 @contextmanager
 def explaining(path: Path | str, what: str = "not written") -> Iterator[None]:
-    """What the system refuses within is an error that names `path`, and says `what` became of it and why.
+    """Replace an OSError within the block by an error with `path`, `what` became of it, and the reason.
 
     Raises:
-        Dpm2Error: in the place of an OSError.
+        Dpm2Error: instead of an OSError.
     """
     try:
         yield
@@ -34,15 +34,15 @@ def explaining(path: Path | str, what: str = "not written") -> Iterator[None]:
 
 @contextmanager
 def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """A file that takes the name `path` when the block ends well, and vanishes when it does not.
+    """A file that gets the name `path` when the block ends without an error, and is removed otherwise.
 
-    Folders on the way are made. A pipe or device (`/dev/stdout`) is written to directly: it cannot be replaced.
+    Missing parent folders are made. A pipe or device (`/dev/stdout`) is written directly: it cannot be replaced.
 
     Raises:
-        Dpm2Error: the file could not be written; it names `path`, and what was there is untouched.
+        Dpm2Error: the file could not be written; it names `path`, and the previous file is unchanged.
     """
     path = Path(path)
-    target = path.resolve()  # a symbolic link stays one
+    target = path.resolve()  # a symbolic link stays a link
     encoding = None if "b" in mode else "utf-8"
     with explaining(path):
         if path.exists() and not path.is_file() and not path.is_dir():
@@ -50,7 +50,7 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
                 yield file
             return
         target.parent.mkdir(parents=True, exist_ok=True)
-        part = part_beside(target)  # same folder: replacing is then atomic
+        part = part_beside(target)  # in the same folder, so that replacing is atomic
         try:
             with part.open(mode, encoding=encoding) as file:
                 yield file
@@ -63,14 +63,14 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
 
 
 def part_beside(path: Path) -> Path:
-    """The hidden file or folder beside `path` in which this process writes what takes that name once it is whole; where
-    `path` is a symbolic link, beside what it leads to, which may be on another disk.
+    """The hidden file or folder next to `path` where this process writes the content until it is complete. If `path` is
+    a symbolic link, it is next to the link's target, which may be on another disk.
 
-    Those of processes that were killed are removed, with what SQLite keeps beside them.
+    Those of killed processes are removed, with the files that SQLite keeps next to them.
     """
     own, path = os.getpid(), path.resolve()
     for left in path.parent.glob(".*.part*"):
-        # a map that was to take that name began as another part, of this one
+        # a map under construction is written through a part of its own, whose name is then that of a part of a part
         part = re.fullmatch(rf"\.+{re.escape(path.name)}(?:\.\d+\.part)?\.(\d+)\.part(-\w+)?", left.name)
         if part and (int(part[1]) == own or not _alive(int(part[1]))):
             with suppress(OSError):
@@ -80,7 +80,7 @@ def part_beside(path: Path) -> Path:
 
 @contextmanager
 def named(path: Path, part: Path) -> Iterator[None]:
-    """What fails while `part` is written names the file or folder at `path` that was asked for."""
+    """Errors while `part` is written name the file or folder at `path` that was requested."""
     try:
         yield
     except Dpm2Error as error:
@@ -90,10 +90,10 @@ def named(path: Path, part: Path) -> Iterator[None]:
 
 @contextmanager
 def new_folder(path: Path, replace: bool = False) -> Iterator[Path]:
-    """A folder that is named `path` when the block ends well, and is gone when it does not.
+    """A folder that gets the name `path` when the block ends without an error, and is removed otherwise.
 
-    An empty one that is there is filled in the order of the names: it stays, since a shell may be in it. With `replace`
-    another one is there until then.
+    If `path` is an empty folder, it is filled in the order of the names and not replaced, since a shell may be in it.
+    With `replace`, a folder with content stays until the new one is complete.
 
     Raises:
         Dpm2Error: it could not be written.
@@ -129,7 +129,7 @@ def _alive(pid: int) -> bool:
 
 
 def write_json(path: Path | str, content: object) -> None:
-    """JSON for people, too: indented, as one file.
+    """Write indented JSON, which people can read too, as one file.
 
     Raises:
         Dpm2Error: as `atomic_write`.
@@ -139,7 +139,7 @@ def write_json(path: Path | str, content: object) -> None:
 
 
 def json_text(content: object, indent: int = 2) -> str:
-    """Content as JSON; a number that is not finite becomes null, since JSON has no NaN, and a path text."""
+    """Content as JSON: numbers that are not finite become null, since JSON has no NaN, and paths become text."""
     return json.dumps(_known(content), indent=indent, allow_nan=False, default=str) + "\n"
 
 
@@ -152,10 +152,10 @@ def _known(content: object) -> object:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it; one that is there stays.
+    """Make a folder for results and its parents; an existing folder is kept.
 
     Raises:
-        UsageError: there can be none; it names `path` and says why.
+        UsageError: the folder cannot be made; the message has `path` and the reason.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -164,15 +164,15 @@ def make_folder(path: Path) -> None:
 
 
 def numbered(path: Path, suffix: str = "") -> Iterator[Path]:
-    """The path, and without end the same with -2, -3, ... before that suffix; a folder has none, though its name may
-    have a dot."""
+    """The path, then without end the same with -2, -3, ... before `suffix`; a folder has no suffix, though its name may
+    contain a dot."""
     yield path
     stem = path.name.removesuffix(suffix)
     yield from (path.with_name(f"{stem}-{n}{suffix}") for n in count(2))
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of what a file holds.
+    """SHA-256 of the content of a file.
 
     Raises:
         OSError: it cannot be read.

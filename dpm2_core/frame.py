@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sensors deliver. A transform is `T_target_source`: p_target = T_target_source @ p_source."""
+"""Data that the sensors deliver. A transform is `T_target_source`: p_target = T_target_source @ p_source."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Points = NDArray[np.float32]
 Up = tuple[float, float, float]
 NO_POINTS: Points = np.zeros((0, 4), np.float32)
 R_AHEAD: Array = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-"""(3, 3) R_lidar_cam of a camera that looks along x of the LiDAR; its own axes: x right, y down, z ahead."""
+"""(3, 3) R_lidar_cam of a camera that looks along the LiDAR's x axis; the camera's axes: x right, y down, z ahead."""
 
 
 def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
-    """Whether (4, 4) is a finite rigid transform; what is off by more than `tolerance` is damage, not rounding."""
+    """Whether (4, 4) is a finite rigid transform; deviations above `tolerance` are damage, not rounding."""
     if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
         return False
     R = T[:3, :3]
@@ -34,7 +34,7 @@ class Camera:
         T_lidar_cam: (4, 4) float64, camera (x right, y down, z forward) to LiDAR frame, m.
         size: (width, height) of the image, pixels.
         distortion: plumb-bob coefficients k1, k2, p1, p2[, k3]; empty for a rectified image.
-        name: what messages call it; of topics, that of its images. It tells the cameras of a drive apart.
+        name: used in messages, and to distinguish the cameras of a drive; with topics, the name of the image topic.
     """
 
     K: Array
@@ -54,7 +54,7 @@ class Camera:
             raise ValueError(f"{self.name}: K is no matrix of intrinsics, whose last row is 0 0 1: {self.K.tolist()}")
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of its image at another size, pixels; the center of the first pixel is (0, 0) in both."""
+        """The camera for its image at another size, pixels; the center of the first pixel is (0, 0) in both."""
         scale = np.array([width / self.size[0], height / self.size[1]])
         K = self.K.copy()
         K[:2] *= scale[:, None]
@@ -67,8 +67,8 @@ class Image:
     """One image.
 
     Attributes:
-        pixels: (H, W, 3) uint8 RGB. camera: that took it.
-        time_offset: s, when it was taken relative to the stamp of its frame.
+        pixels: (H, W, 3) uint8 RGB. camera: the camera that took it.
+        time_offset: s, capture time relative to the stamp of its frame.
     """
 
     pixels: NDArray[np.uint8]
@@ -87,11 +87,11 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Where another odometry has the LiDAR. Only the way between two of them counts.
+    """Pose of the LiDAR by another odometry. Only the relative motion between two such poses is used.
 
     Attributes:
-        T_other_lidar: (4, 4) in a frame of its own, which may drift away from everything.
-        covariance: (6, 6) as in `Registration`, of that pose, as the odometry states it; None where it states none.
+        T_other_lidar: (4, 4) in the other odometry's own frame, which may drift without limit.
+        covariance: (6, 6) as in `Registration`, of that pose, as the odometry reports it; None if it reports none.
     """
 
     T_other_lidar: Array
@@ -107,13 +107,13 @@ class Guess:
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """What an IMU measured around a scan, along the axes of the LiDAR.
+    """IMU measurements around a scan, in the LiDAR's axes.
 
     Attributes:
         stamps: (K,) int64 ns, increasing.
-        rates: (K, 3) rad/s. forces: (K, 3) m/s2, what an accelerometer shows: 9.8 upwards at rest; NaN where unknown.
-        up: (3,) unit vector along the LiDAR's axes at the start that is to be upwards in the odometry's frame where the
-            drive starts at rest; None: the LiDAR's first pose is the frame, however it is tilted.
+        rates: (K, 3) rad/s. forces: (K, 3) m/s2, accelerometer readings: 9.8 upwards at rest; NaN where unknown.
+        up: (3,) unit vector in the LiDAR's axes at the start; this direction becomes upwards in the odometry frame if
+            the drive starts at rest. None: the odometry frame is the LiDAR's first pose, however it is tilted.
     """
 
     stamps: NDArray[np.int64]
@@ -130,11 +130,11 @@ class Inertial:
         return len(self.stamps)
 
     def __getitem__(self, which: NDArray[np.bool_]) -> Inertial:
-        """Those of its samples for which (K,) is true."""
+        """The samples for which `which` (K,) is true."""
         return replace(self, stamps=self.stamps[which], rates=self.rates[which], forces=self.forces[which])
 
     def then(self, later: Inertial) -> Inertial:
-        """Its samples, and those of a later one."""
+        """These samples, followed by those of `later`."""
         stamps = np.concatenate([self.stamps, later.stamps])
         rates, forces = np.concatenate([self.rates, later.rates]), np.concatenate([self.forces, later.forces])
         return Inertial(stamps, rates, forces, later.up)
@@ -142,13 +142,13 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """A position by satellites (GNSS).
+    """A position measured by satellites (GNSS).
 
     Attributes:
         stamp: ns.
         geodetic: (3,) WGS84: latitude and longitude, degrees, and altitude above the ellipsoid, m.
         covariance: (3, 3) of the position, east, north, up, m^2.
-        antenna: (3,) m, where the antenna was at that time: in the LiDAR's frame, of a keyframe in the keyframe's.
+        antenna: (3,) m, position of the antenna at that time in the LiDAR frame; of a keyframe: in the keyframe's.
     """
 
     stamp: int
@@ -168,13 +168,13 @@ class Fix:
         object.__setattr__(self, "stamp", int(self.stamp))  # see `Frame`
 
     def moved(self, T_new_old: Array) -> Fix:
-        """The same with its antenna in another frame, by (4, 4) T_new_old."""
+        """The same fix with the antenna in another frame, by (4, 4) T_new_old."""
         return replace(self, antenna=T_new_old[:3, :3] @ self.antenna + T_new_old[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Where on Earth a map is.
+    """Pose of a map on Earth.
 
     Attributes:
         origin: (3,) WGS84 of the local frame east, north, up: latitude and longitude, degrees, and altitude, m.
@@ -196,7 +196,7 @@ def _on_earth(geodetic: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What the sensors saw at one time.
+    """Data of all sensors at one time.
 
     Attributes:
         stamp: ns since the epoch of the source.
@@ -204,15 +204,15 @@ class Frame:
         time_offset: (N,) float32 s, capture time of each point relative to `stamp`; None where the source has none.
         images: zero, one or several images.
         index: position in its source (KITTI frame number, message count of a bag).
-        problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not lost.
-        guess: where another odometry has the LiDAR in the middle of the sweep; the search for the pose begins there.
-        imu: samples since those of the frame before, up to the last point; None where there is no IMU.
-        fix: the last one before the stamp that no frame before had; None where there is none.
-        dropped: scans since the frame before that came, but were left out for want of time.
-        stepped: whether less time may have passed since the frame before than the stamps say: a clock was set.
-        up: (3,) unit vector along the LiDAR's axes, by its mounting upwards: so is the odometry's frame level where a
-            drive begins with this frame, and what the network sees; None: both have the LiDAR's axes, as where the
-            mounting is not known.
+        problem: why the scan could not be read; `points` is then empty and the frame counts as failed, not as lost.
+        guess: pose of the LiDAR in the middle of the sweep by another odometry; the search for the pose starts there.
+        imu: samples after those of the previous frame, up to the last point; None if there is no IMU.
+        fix: the latest fix before the stamp that no earlier frame had; None if there is none.
+        dropped: number of scans since the previous frame that arrived, but were dropped for lack of time.
+        stepped: whether less time may have passed since the previous frame than the stamps show: a clock was set.
+        up: (3,) unit vector in the LiDAR's axes that points up by the LiDAR's mounting. It levels the odometry frame
+            if a drive begins with this frame, and the input of the network; None: both have the LiDAR's axes, as when
+            the mounting is not known.
     """
 
     stamp: int
@@ -240,12 +240,12 @@ class Frame:
             raise ValueError(f"frame {self.index}: its stamp is {self.stamp!r}, want ns, an integer")
         if not isinstance(self.index, int | np.integer):
             raise ValueError(f"frame {self.index!r}: its index is no integer")
-        # A map file would keep those of NumPy as bytes, and unsigned ones have no negative differences.
+        # A map file would store NumPy integers as bytes, and unsigned ones have no negative differences.
         object.__setattr__(self, "stamp", int(self.stamp))
         object.__setattr__(self, "index", int(self.index))
 
     def later(self, seconds: float) -> Frame:
-        """The same, its points and images timed from a moment so much after the stamp; not moved there."""
+        """The same frame with a stamp `seconds` later; times of points and images are adapted, the points not moved."""
         if not seconds:
             return self
         offset = None if self.time_offset is None else self.time_offset - np.float32(seconds)

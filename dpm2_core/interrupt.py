@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C where work must not stop in the middle; SIGTERM, where that is as Ctrl-C; and a terminal that is closed, which
-is the same or, where nobody tells, no reason to stop."""
+"""Handling of Ctrl-C while work must not stop half-way, of SIGTERM, which acts like Ctrl-C, and of a closed terminal.
+
+A closed terminal acts like SIGTERM or, if the process is not notified, does not stop it.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,22 @@ _Handler = Callable[[int, FrameType | None], None]
 
 
 def terminate_as_interrupt() -> None:
-    """From here on SIGTERM is as Ctrl-C: by itself it would leave temporary files, and of a drive nothing. So is a
-    terminal that is closed."""
+    """From now on SIGTERM and a closed terminal act like Ctrl-C. The default action of SIGTERM would leave temporary
+    files, and lose the results of a drive."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     hang_up_as_terminated()
 
 
 def hang_up_as_terminated() -> None:
-    """From here on a terminal that is closed, or whose connection breaks, is as one SIGTERM; what would then be written
-    there is lost. A process that ignores it, or is not told, as a shell's `command &` at `exit`, goes on."""
-    terminals = [stream for stream in range(3) if os.isatty(stream)]  # afterwards they no longer are
+    """From now on a terminal that is closed, or whose connection breaks, acts like one SIGTERM; output written to it
+    afterwards is lost. A process that ignores SIGHUP, or does not receive it (`command &`, then `exit`), continues."""
+    terminals = [stream for stream in range(3) if os.isatty(stream)]  # after the hang-up isatty is False
     _outlive_terminal()
     if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
         return
 
     def hung_up(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the system sends it, and then the shell: two would not wait
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # system and shell both send it: the second would end it at once
         _lead_nowhere(*terminals)
         signal.raise_signal(signal.SIGTERM)
 
@@ -42,7 +44,7 @@ def hang_up_as_terminated() -> None:
 
 
 class _Terminal(io.FileIO):
-    """A terminal to write to; when it is gone, what is written is lost, and no error that would end the work."""
+    """A terminal as output; when it is gone, the output is lost without an error that would end the work."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -71,17 +73,17 @@ def _lead_nowhere(*streams: int) -> None:
     os.close(nowhere)
 
 
-_taken: list[int] = []  # Ctrl-C since each `interrupt_deferred` began that is under way, the innermost last
+_taken: list[int] = []  # Ctrl-C counts of the `interrupt_deferred` blocks that are active, the innermost last
 
 
 @contextmanager
 def interrupt_deferred() -> Iterator[Callable[[], bool]]:
-    """Inside, the first Ctrl-C raises nothing: the function that this yields returns True from then on.
+    """Within this block the first Ctrl-C raises nothing: the function that it yields returns True from then on.
 
-    KeyboardInterrupt at any other place would leave a frame half processed, and out of compiled code it comes as
-    SystemError. The second Ctrl-C raises it, for work that hangs. A handler other than Python's own stays as it is,
-    and so does that of a process that ignores Ctrl-C; outside of the main thread none is ever called.
-    With SIGTERM and a terminal that is closed it is the same. Within another one, each takes its own first Ctrl-C.
+    KeyboardInterrupt at any other place would leave a frame half processed, and compiled code turns it into a
+    SystemError. The second Ctrl-C raises it, for work that hangs. A handler other than Python's own is not replaced,
+    nor is that of a process that ignores Ctrl-C; outside of the main thread signals are never handled.
+    SIGTERM and a closed terminal are treated the same way. If blocks are nested, each counts its own first Ctrl-C.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False

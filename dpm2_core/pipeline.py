@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording through the SLAM at full speed, without ROS."""
+"""Runs a recording through the SLAM at full speed, without ROS."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from dpm2_core.slam.store.map_file import remove_map
 from dpm2_core.slam.system import SlamResult
 
 Watch = Callable[[Frame, SlamResult, Mapper], None]
-"""Looks at a frame, what became of it, and the map as it is then."""
+"""Receives a frame, the result of the SLAM for it, and the map at that time."""
 
 
 class OfflineRun:
-    """One drive through the SLAM. A context manager: leaving it closes the map file, if there is one.
+    """One drive through the SLAM. A context manager: on exit it closes the map file, if there is one.
 
     Attributes:
-        source: the recording. slam: what it goes through.
+        source: the recording. slam: the SLAM that processes it.
     """
 
     def __init__(
@@ -46,23 +46,23 @@ class OfflineRun:
         map_file: Path | str | None = None,
         map_mode: MapMode = "create",
     ) -> None:
-        """Open everything that the run needs; nothing is written yet but the beginning of the map file.
+        """Open everything that the run needs; only the beginning of the map file is written yet.
 
         Args:
             source: a recording, or the path of one, which is then opened with `config.input`.
-            ground_truth: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
-            map_file: written as the drive goes on; with "localize" read, and left as it is.
+            ground_truth: file of poses (KITTI: left camera; TUM: LiDAR); default: the ground truth of the source.
+            map_file: written during the drive; with "localize" it is only read.
 
         Raises:
             UsageError: no such recording, no frames in that span, ground truth of another drive, no such weights, or a
-                map file that is there already, is missing or does not fit. Dpm2Error: it cannot be read or written.
+                map file that exists already, is missing or does not fit. Dpm2Error: it cannot be read or written.
         """
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
         self._ran = False
         map_file = None if map_file is None else Path(map_file)
-        self._begun = None if map_file is None or map_file.exists() else map_file  # a map file without a frame yet
+        self._begun = None if map_file is None or map_file.exists() else map_file  # a new map file without a frame yet
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:
             self._resources.push(store)
@@ -77,7 +77,7 @@ class OfflineRun:
                 if self._start >= self._stop:
                     ends = self.slam.mapper.keyframes[-1].index
                     raise UsageError(f"--frames {frames[0]}:{frames[1]}: the map goes on to frame {ends} already")
-            if map_mode != "localize":  # the frame of the map is its own
+            if map_mode != "localize":  # a map has its own frame
                 self._truth = read_ground_truth(self.source, ground_truth, self._start, self._stop)
         except BaseException as error:
             self.__exit__(type(error))
@@ -90,14 +90,14 @@ class OfflineRun:
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         self.close()
         if error is not None and self._begun is not None:
-            remove_map(self._begun)  # or the same command, with its mistake corrected, would find a map there
+            remove_map(self._begun)  # else the corrected command would fail, since the map file exists
 
     def __len__(self) -> int:
         """Number of frames to be processed."""
         return self._stop - self._start
 
     def close(self) -> None:
-        """Close the map file; a `Result` must be saved before."""
+        """Close the map file; save the `Result` before."""
         self._resources.close()
 
     def run(
@@ -105,13 +105,13 @@ class OfflineRun:
         progress: Callable[[SlamResult], None] = lambda result: None,
         watch: Watch | None = None,
     ) -> Result:
-        """All frames through the SLAM, once; Ctrl-C ends it after a frame, and the result is of the frames until then.
+        """Process all frames, once. Ctrl-C ends the run after a frame; the result has the frames up to then.
 
         Args:
-            progress: called after each frame. watch: the same, with the frame and the map as they are then.
+            progress: called after each frame. watch: the same, with the frame and the map at that time.
 
         Raises:
-            Dpm2Error: none of the scans could be read. UsageError: it has run before.
+            Dpm2Error: none of the scans could be read. UsageError: this object was run before.
         """
         if self._ran:
             raise UsageError(f"{self.source.name}: it was run already; a second run needs another OfflineRun")
@@ -143,20 +143,20 @@ class OfflineRun:
 
 
 def open_recording(path: Path | str, config: Config, images: bool) -> Source:
-    """The recording, opened with `config.input`; `images` False leaves those out.
+    """The recording, opened with `config.input`; with `images` False without its images.
 
     Raises:
-        UsageError: there is none that can be read.
+        UsageError: no readable recording is there.
     """
     # Decoding images that are not used would only cost time.
     return open_source(path, config.input.model_copy(update={"images": images and config.input.images}))
 
 
 def span_of(source: Source, frames: Span) -> tuple[int, int]:
-    """Positions of the first frame and of the one after the last, within the source.
+    """Positions in the source of the first frame and of the frame after the last one.
 
     Raises:
-        UsageError: it has no frames there.
+        UsageError: the source has no frames in that span.
     """
     start, stop = frames[0], len(source) if frames[1] is None else min(frames[1], len(source))
     if start >= stop:

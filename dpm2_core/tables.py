@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables for people that lose nothing on a narrow terminal."""
+"""Tables for people, which lose nothing on a narrow terminal."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from rich.text import Text
 from dpm2_core.console import lines
 
 _PROSE = 24
-"""Characters a line that text needs to be read with ease."""
+"""Characters per line that text needs to be read with ease."""
 
 
 class FigureTable:
-    """Names, figures and text in columns, in this order. What is too wide for the terminal is turned.
+    """Columns of names, figures and text, in this order. A table that is too wide for the terminal is transposed.
 
-    Text is wrapped, names and figures are not, and nothing is cut. In a turned table a row is a column, and as many
-    rows of a section as fit are beside each other. Cells are printed as they are: what looks like rich's markup comes
-    from a file or a topic.
+    Text is wrapped, names and figures are not, and nothing is cut. In a transposed table a row is a column, with as
+    many rows of a section next to each other as fit. Cells are printed as they are: text that looks like rich's markup
+    comes from a file or a topic.
 
     Attributes:
-        title, caption: what stands above and below. headings: of the columns. rows: of cells.
+        title, caption: texts above and below. headings: of the columns. rows: of cells.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class FigureTable:
         caption: str = "",
         header: bool = True,
     ) -> None:
-        """Headings of the columns of each kind; `header` False leaves them out."""
+        """Headings of the columns of each kind; with `header` False they are not shown."""
         self.title, self.caption, self._header = lines(title), caption, header
         self.headings = [*names, *figures, *text]
         self._text = len(names) + len(figures)  # the first column of text
@@ -49,7 +49,7 @@ class FigureTable:
         self._sections: set[int] = set()
 
     def add_row(self, *cells: str) -> None:
-        """A cell for each column.
+        """Add a row with a cell for each column.
 
         Raises:
             ValueError: more or fewer cells than columns.
@@ -59,7 +59,7 @@ class FigureTable:
         self.rows.append([lines(cell) for cell in cells])
 
     def add_section(self) -> None:
-        """A gap after the last row."""
+        """Add a gap after the last row."""
         self._sections.add(len(self.rows))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -117,17 +117,17 @@ class _Figures(Formatter):
 
 def cells_of(record: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
     """Figures of a nested record as text, by columns such as "{loops[accepted]} of {loops[tried]}" or "{ape_m:.3f}";
-    "-" for one that is missing or null."""
+    "-" for a missing or null value."""
     return [_Figures().vformat(column, (), record) for column in columns]
 
 
 def record_table(
     title: str, names: Sequence[str], columns: Mapping[str, str], record: Mapping[str, Any], sections: bool = False
 ) -> FigureTable:
-    """A table of a nested record, whose keys, from the outermost on, are the `names`.
+    """A table of a nested record; `names` are the headings of its keys, from the outermost on.
 
     Args:
-        columns: headings of the figures, and how they are written, see `cells_of`. sections: a gap after each of the
+        columns: headings of the figures, and their formats, see `cells_of`. sections: a gap after each of the
             outermost keys.
     """
     table = FigureTable(title, names=names, figures=list(columns))
@@ -140,7 +140,7 @@ def record_table(
 
 
 def _leaves(record: Any, depth: int) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Keys and value of all that is so deep in a nested record."""
+    """Keys and value of every entry at this depth of a nested record."""
     if not depth:
         yield (), record
         return
@@ -149,5 +149,5 @@ def _leaves(record: Any, depth: int) -> Iterator[tuple[tuple[str, ...], Any]]:
 
 
 def _total(widths: Sequence[int]) -> int:
-    """Width of a table of such columns: a blank on either side of each, and one between, before and after them."""
+    """Width of a table with such columns: a blank on either side of each, and one between, before and after them."""
     return sum(widths) + 3 * len(widths) + 1
