@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The only factory: settings in, the SLAM or one of its parts out."""
+"""The only factory: creates the SLAM or one of its parts from settings."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ def make_slam(
     """The SLAM with all its parts.
 
     Args:
-        robot: namespace of its keyframes, "" for the only one.
-        store: the map file: to write, or to go on with, its session begun (`open_session`); or, open for reading only
-            (`open_for_localization`), a folder of tiles, too, to find oneself in. None: the map is in memory, its
-            clouds in a temporary file.
-        background: a large pose graph is optimized in another process while the drive goes on, as for a robot that
-            drives; the result then depends on its timing.
+        robot: namespace of its keyframes, "" for a single robot.
+        store: the map file. Either one to write or continue, with its session begun (`open_session`); or one that is
+            open for reading only (`open_for_localization`), which may be a folder of tiles, for localization. None: the
+            map is in memory, its clouds in a temporary file.
+        background: a large pose graph is optimized in another process during the drive, as on a real robot; the result
+            then depends on timing.
 
     Raises:
-        UsageError: a network has no weights to run with, or the settings are others.
+        UsageError: a network has no weights, or the settings are of another type.
     """
     s = settings or SlamSettings()
     odometry = make_odometry(s, robot)
@@ -66,9 +66,9 @@ def make_slam(
 def make_map(
     s: SlamSettings, store: MapStore | TiledMap | None = None, background: bool = False
 ) -> tuple[Mapper, Localizer | None]:
-    """The mapper, and in a map that stays as it is what finds keyframes there; arguments as for `make_slam`.
+    """The mapper and, for a map that must not change, its localizer; arguments as for `make_slam`.
 
-    The mapper of a folder of tiles is empty: they are never all in memory.
+    The mapper of a folder of tiles is empty: the tiles are never all in memory.
     """
     if isinstance(store, TiledMap):
         return make_mapper(s), make_tiled_localizer(s, store)
@@ -77,10 +77,10 @@ def make_map(
 
 
 def make_odometry(s: SlamSettings, robot: str = "") -> Odometry:
-    """The odometry with its tools; with `preset: auto` those for streets and those for rooms.
+    """The odometry with its tools; with `preset: auto` the tools for streets and those for rooms.
 
     Raises:
-        UsageError: as of `make_slam`.
+        UsageError: as `make_slam`.
     """
     if not isinstance(s, SlamSettings):
         raise UsageError(f"want SlamSettings, which a Config has as its slam, not {type(s).__name__}")
@@ -94,10 +94,10 @@ def _tools(s: SlamSettings) -> Tools:
 
 
 def make_registration(s: SlamSettings) -> ScanRegistration:
-    """What `registration` names.
+    """The registration that the setting `registration` names.
 
     Raises:
-        UsageError: the network, or that of the filter, has no weights to run with.
+        UsageError: the network, or that of the filter, has no weights.
     """
     preprocessor = Preprocessor(s.preprocess, make_filter(s.filter, s.threads))
     local_map = LocalMap(s.local_map, s.preprocess.map_voxel)
@@ -114,18 +114,18 @@ def make_registration(s: SlamSettings) -> ScanRegistration:
 
 
 def make_mapper(s: SlamSettings, store: MapStore | None = None, background: bool = False) -> Mapper:
-    """The mapper with its collaborators; with a map file, if there is one."""
+    """The mapper with its collaborators, and the map file if there is one."""
     return Mapper(s.map, PoseGraph(s.pose_graph, background), make_loops(s), store)
 
 
 def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
-    """Finds keyframes in the map that a mapper has loaded.
+    """Localizes keyframes in the map that a mapper has loaded.
 
     Raises:
-        UsageError: the network has no weights to run with.
+        UsageError: the network has no weights.
     """
-    placed, loan = mapper.placed, mapper.clouds.loan  # where the others are in the map is not known
-    # Of a place that was passed again and again there is one: else all candidates, and the map around, would be of it.
+    placed, loan = mapper.placed, mapper.clouds.loan  # the pose in the map is known only for placed keyframes
+    # One keyframe per place that was passed several times: else all candidates, and the map around, would be of it.
     lenders = ((node, lent.lender if (lent := loan(node)) else None) for node in np.flatnonzero(placed).tolist())
     nodes = [node for node, lender in lenders if lender is None or not placed[lender]]
     known = KnownMap(
@@ -139,10 +139,10 @@ def make_localizer(s: SlamSettings, mapper: Mapper) -> Localizer:
 
 
 def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
-    """Finds keyframes in a map of which only the surroundings are in memory.
+    """Localizes keyframes in a map of which only the surroundings are in memory.
 
     Raises:
-        UsageError: the network has no weights to run with.
+        UsageError: the network has no weights.
     """
     verifiers, network = _verifiers(s), _network(s)
 
@@ -159,15 +159,15 @@ def _verifiers(s: SlamSettings) -> ByScale[Verifier]:
 
 
 def make_verifier(s: SlamSettings) -> Verifier:
-    """Checks a proposed pose by the points."""
+    """Checks a proposed pose with the points."""
     return Verifier(s.verification, s.geometric, s.preprocess)
 
 
 def make_loops(s: SlamSettings) -> LoopCloser:
-    """The loop closer, with a network if it is to use descriptors.
+    """The loop closer, with a network if it uses descriptors.
 
     Raises:
-        UsageError: the network has no weights to run with.
+        UsageError: the network has no weights.
     """
     described = s.loops.enabled and s.loops.descriptors
     ways = ByScale(*((one.loops, make_verifier(one)) for one in (s, s.indoors())))
@@ -175,7 +175,7 @@ def make_loops(s: SlamSettings) -> LoopCloser:
 
 
 def _network(s: SlamSettings) -> DeepPointMap2:
-    """The same one for registration, loops and relocalization."""
+    """One network for registration, loops and relocalization."""
     network = load_network(s.neural.weights, s.threads)
     network.solver = s.neural.solver
     return network

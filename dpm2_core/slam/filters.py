@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trained network leaves of a scan before the SLAM looks at it: no dynamic objects, no ground, or no traffic.
+"""Filters that remove dynamic objects, the ground, or traffic from a scan by a trained network, before the SLAM.
 
-All that follows works on what is left: the choice of reference points and their descriptors, the registration of the
-points, and the map.
+All later stages use only the remaining points: the choice of reference points and their descriptors, the registration
+of the points, and the map.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
     from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet
     from dpm2_core.network.perception.gndnet import GroundNet
 
-_MOST = 0.7  # of a scan, that is left out as moving: the most likely points
+_MOST = 0.7  # fraction of a scan that is removed as moving at most: the most likely points
 FilterKind = Literal["none", "movers", "ground", "static"]
 
 
 class FilterSettings(Settings):
-    """What is left of a scan, before anything else looks at it."""
+    """Which points of a scan are removed before all other stages."""
 
     kind: FilterKind = "none"
-    """movers: without things that move or could move. ground: without the ground, by GndNet. static: without what is
-    in front of DSLR's translation of the scan into one without traffic."""
+    """movers: removes things that move or could move. ground: removes the ground, by GndNet. static: removes what is in
+    front of the scan that DSLR predicts without traffic."""
     weights: Path | None = None
-    """Path of a .safetensors file; unset: those that come with dpm2."""
+    """Path of a .safetensors file; unset: the weights that come with dpm2."""
 
 
 PointFilter = Callable[[Points], NDArray[np.bool_]]
-"""Which (N,) of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR stay; may be none."""
+"""Mask (N,) of the points (N, 4) float32 [x, y, z m, intensity 0..1] in the LiDAR frame to keep; may be all False."""
 
 
 def without_dynamic_objects(net: DynamicObjectNet, points: Points) -> NDArray[np.bool_]:
-    """Without what moves or could, but for a part of the scan; see `network.perception.dynamic_objects`."""
+    """Removes things that move or could move, up to a part of the scan; see `network.perception.dynamic_objects`."""
     if not len(points):
         return np.zeros(0, bool)
     probability = net.probability(points)
-    # A network that finds hardly anything else is wrong, or has nothing to go by: half a scan is still a scan.
+    # If hardly anything else is left, the network is wrong or has nothing to go by: part of a scan is still a scan.
     bound = max(DYNAMIC, float(np.quantile(probability, 1 - _MOST)))
     return np.asarray(probability <= bound)
 
 
 def without_ground(net: GroundNet, points: Points) -> NDArray[np.bool_]:
-    """Without the ground, and what lies off the grid of GndNet."""
+    """Removes the ground, and the points outside the grid of GndNet."""
     import torch
 
     from dpm2_core.network.perception.gndnet import obstacle_weight
@@ -69,14 +69,14 @@ def without_ground(net: GroundNet, points: Points) -> NDArray[np.bool_]:
 
 
 def without_traffic(net: Dslr, points: Points) -> NDArray[np.bool_]:
-    """Without what stands in front of the scan as DSLR thinks that it would be without traffic."""
+    """Removes the points in front of the scan that DSLR predicts without traffic."""
     import torch
 
     return np.asarray(net.still(torch.from_numpy(points)).numpy())
 
 
 def in_level_axes(point_filter: PointFilter, points: Points) -> NDArray[np.bool_]:
-    """What a filter that learned from level sensors leaves of one that may be tilted: in the axes of the ground."""
+    """Apply a filter trained on level sensors to one that may be tilted, in the axes of the ground."""
     up = tilt_of(points)
     if up is None:
         return point_filter(points)
@@ -84,10 +84,10 @@ def in_level_axes(point_filter: PointFilter, points: Points) -> NDArray[np.bool_
 
 
 def filter_weights(settings: FilterSettings) -> Path:
-    """The file with the weights of a filter.
+    """The weights file of a filter.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no such file.
     """
     shipped = PRETRAINED_DIR / f"{PERCEPTION_WEIGHTS[settings.kind]}.safetensors"
     path = Path(os.path.expanduser(str(settings.weights or shipped)))
@@ -100,10 +100,10 @@ def filter_weights(settings: FilterSettings) -> Path:
 
 
 def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
-    """What the settings name; None for `none`. `threads` are torch's, of which there is one number for a process.
+    """The filter of the settings; None for `none`. `threads` is torch's number of threads, one for the whole process.
 
     Raises:
-        UsageError: no weights, or of another task.
+        UsageError: no weights, or weights of another task.
     """
     if settings.kind == "none":
         return None

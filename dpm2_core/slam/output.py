@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves behind: the pose of every frame after all corrections, and the map as files."""
+"""Results of a run: the pose of every frame after all corrections, and the map as files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dpm2_core.slam.mapping.mapper import Mapper
 
 
 class TrajectoryRecorder:
-    """Remembers odometry poses and gives them back in the map frame, corrected as the keyframes around them were."""
+    """Stores odometry poses and returns them in the map frame, corrected like the keyframes around them."""
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
@@ -26,10 +26,10 @@ class TrajectoryRecorder:
         self.breaks = 0  # of the odometry, see `OdometryResult`
         self._T_odom_lidar: list[Array] = []
         self._keyframe: list[int] = []  # position of each keyframe among the frames
-        self._known = 0  # position of the last frame that was registered
-        self._begun: int | None = None  # of the first one after it that was at least held against a map
-        self._ended: list[int] = []  # the last frame before each break from which the way is known
-        self._began: list[int] = []  # the first one after each
+        self._known = 0  # position of the last registered frame
+        self._begun: int | None = None  # of the first frame after it that was at least compared with a map
+        self._ended: list[int] = []  # the last frame before each break, the end of a known trajectory
+        self._began: list[int] = []  # the first frame after each break
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -40,7 +40,7 @@ class TrajectoryRecorder:
         return len(self._keyframe)
 
     def add(self, tracked: OdometryResult) -> None:
-        """Take in the result of the next frame."""
+        """Add the result of the next frame."""
         position, registered = len(self), tracked.registration
         if self._begun is None and (registered.ok or registered.method != "none"):
             self._begun = position
@@ -58,7 +58,7 @@ class TrajectoryRecorder:
 
     @property
     def stretches(self) -> NDArray[np.intp]:
-        """(N,) breaks before each frame: those of two numbers are related by loops alone, if at all."""
+        """(N,) number of breaks before each frame; different numbers: related by loops only, if at all."""
         return np.searchsorted(self._began, np.arange(len(self)), side="right")
 
     def poses(self, T_map_kf: Array) -> Array:
@@ -71,10 +71,10 @@ class TrajectoryRecorder:
         return corrected(T_odom_lidar, at, corrections[keyframe])
 
     def _known_corrections(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Positions of frames, ascending, and for each the keyframe as which it is corrected.
+        """Positions of frames, ascending, and for each the keyframe whose correction it takes.
 
-        Across a break the odometry is a guess: a loop may move what comes after it by far more than what was before. So
-        the frames at both sides are corrected as the keyframe on theirs, if there is one.
+        Across a break the odometry is a guess: a loop may move the part after it by far more than the part before. So
+        the frames at both sides are corrected like the nearest keyframe on their own side, if there is one.
         """
         positions, known = np.array(self._keyframe, np.intp), {(at, kf) for kf, at in enumerate(self._keyframe)}
         for first, last in zip([None, *self._began], [*self._ended, None], strict=True):
@@ -88,15 +88,15 @@ class TrajectoryRecorder:
 
 
 def corrected(T_odom_lidar: Array, at: NDArray[np.intp], corrections: Array) -> Array:
-    """Odometry poses in the map frame, corrected as frames around them were.
+    """Odometry poses in the map frame, corrected like the frames around them.
 
-    The correction of a frame is interpolated between those before and after it: rigidly following one would put steps
-    into the trajectory where a loop was closed.
+    The correction of a frame is interpolated between the known corrections before and after it: to take one of them
+    rigidly would cause steps in the trajectory where a loop was closed.
 
     Args:
         T_odom_lidar: (N, 4, 4).
         at: (K,) ascending positions of frames whose corrections are known, at least one.
-        corrections: (K, 4, 4) T_map_odom of these.
+        corrections: (K, 4, 4) T_map_odom of these frames.
 
     Returns:
         (N, 4, 4) T_map_lidar.
@@ -112,11 +112,11 @@ def corrected(T_odom_lidar: Array, at: NDArray[np.intp], corrections: Array) -> 
 def save_map(mapper: Mapper, directory: Path) -> None:
     """Write map.ply, trajectory.tum (one pose per keyframe) and pose_graph.g2o, each whole or not at all.
 
-    The graph has all keyframes, the others those whose place in the map is known, the trajectory one robot after the
-    other.
+    The graph has all keyframes, the other files only keyframes with a known pose in the map. The trajectory has one
+    robot after the other.
 
     Raises:
-        UsageError: the folder cannot be made. Dpm2Error: a file could not be written; the old one survives.
+        UsageError: the folder cannot be made. Dpm2Error: a file could not be written; the old one is kept.
     """
     make_folder(directory)
     write_ply(directory / "map.ply", mapper.cloud())

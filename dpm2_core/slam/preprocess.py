@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A raw scan into what the odometry works with: its valid points, some of them for the map, fewer to register."""
+"""Prepares a raw scan for the odometry: its valid points, a subset of them for the map, and fewer for registration."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class PreprocessSettings(Settings):
     """Which points are used, and how densely."""
 
     min_range: float = 2.0
-    """Nearer returns are dropped (the vehicle itself), m."""
+    """Closer returns are dropped (the vehicle itself), m."""
     max_range: float = 90.0
     """Farther returns are dropped, m."""
     scatter: float = Field(MANY, ge=0, le=1)
-    """What floats in the air (fog, dust, smoke, spray, snow) is dropped where it is this fraction of the returns within
-    8 m, or more. Denser maps need less of it to be misled."""
+    """Floating particles (fog, dust, smoke, spray, snow) are removed if they are at least this fraction of the returns
+    within 8 m. Denser maps are misled by fewer of them."""
     map_voxel: float = 0.5
-    """Spacing of the points that are registered to, of the last scans or of the keyframes around a place, m."""
+    """Spacing of the points to register against, of the last scans or of the keyframes around a place, m."""
     source_voxel: float = 0.8
     """Spacing of the points that are registered, m; at least `map_voxel`."""
     deskew: bool = True
-    """Undo the motion during a sweep, as its points or, where there is one, an IMU (the rotation) show it. Only for
-    scans with a time per point; false for those that are de-skewed already. Times that the motion contradicts are not
-    used."""
+    """Undo the motion during a sweep, as estimated from the points or, if available, from an IMU (the rotation). Only
+    for scans with a time per point; false for scans that are de-skewed already. Times that contradict the motion are
+    not used."""
 
     @model_validator(mode="after")
     def _ordered(self) -> PreprocessSettings:
@@ -50,18 +50,18 @@ class PreprocessSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A prepared scan in the LiDAR frame at the time that its frame counts from.
+    """A prepared scan in the LiDAR frame at the reference time of its frame.
 
     Attributes:
-        points: (P, 4) float32, all that were measured within range and that the filter, if any, left.
-        cloud: (M, 4) float32, those for the local map. source: (N, 3) float64, those to register. Both are empty where
-            the registration works on descriptors alone.
-        seen: (N, 3) float64, those to register as the LiDAR saw them, each when it was taken: times (N,), s from the
-            moment that the frame counts from. Both are empty where there is no motion to undo.
-        description: neural descriptors, made when they are needed; None where the registration uses none.
-        images: those that were taken with it, where the registration asks for them.
-        up: see `Frame`, where the registration makes descriptors.
-        twist: (6,) [rad/s, m/s] at which it was taken, as far as it was known, where the registration asks for images.
+        points: (P, 4) float32, all measured points within range that the filter, if any, kept.
+        cloud: (M, 4) float32, points for the local map. source: (N, 3) float64, points to register. Both are empty if
+            the registration uses descriptors only.
+        seen: (N, 3) float64, the points to register as the LiDAR saw them, each at its own time: times (N,), s
+            relative to the reference time of the frame. Both are empty if there is no motion to undo.
+        description: neural descriptors, computed when they are needed; None if the registration uses none.
+        images: images of the scan, if the registration uses images.
+        up: see `Frame`, if the registration makes descriptors.
+        twist: (6,) [rad/s, m/s] during the scan, as far as it was known, if the registration uses images.
     """
 
     points: Points
@@ -76,24 +76,24 @@ class Scan:
 
     @property
     def descriptors(self) -> Descriptors | None:
-        """Made now, if they were not before; None where there are none."""
+        """The descriptors, computed now if they were not before; None if there are none."""
         return None if self.description is None else self.description.get()
 
 
 class Preprocessor:
-    """Removes what is not a measurement, undoes the motion, filters, thins out."""
+    """Removes invalid points, undoes the motion, filters and downsamples."""
 
     def __init__(self, settings: PreprocessSettings, point_filter: PointFilter | None = None) -> None:
         self._settings = settings
         self._filter = point_filter
 
     def measured(self, frame: Frame, motion: Array) -> tuple[Points, NDArray[np.int64]]:
-        """The valid points (P, 4), and which of the frame's they are (P,).
+        """The valid points (P, 4), and their indices in the frame (P,).
 
-        `motion`, (6,) twist [rad/s, m/s] or (K, 6), see `curve.poses`, is what deskewing undoes.
+        `motion`, (6,) twist [rad/s, m/s] or (K, 6), see `curve.poses`, is the motion that deskewing undoes.
 
-        NaN, inf and zero points are dropped, those out of range, what floats in the air where that is much, and what
-        the filter leaves out.
+        Removed are NaN, inf and zero points, points out of range, floating particles if there are many, and the points
+        that the filter rejects.
         """
         s = self._settings
         points, used = _in_range(np.ascontiguousarray(frame.points), s.min_range**2, s.max_range**2)
@@ -108,7 +108,7 @@ class Preprocessor:
         return points, used
 
     def prepare(self, frame: Frame, motion: Array) -> Scan:
-        """`measured`, downsampled for local map and registration."""
+        """The scan of `measured`, downsampled for local map and registration."""
         points, used = self.measured(frame, motion)
         first = voxel_first(points, self._settings.map_voxel)
         cloud = points[first]
@@ -123,14 +123,14 @@ class Preprocessor:
 
 @compiled(types.Tuple((float32[:, ::1], int64[::1]))(READ_F4, float64, float64))
 def _in_range(points: Points, least: float, most: float) -> tuple[Points, NDArray[np.int64]]:
-    """The (P, 4) of (N, 4) points at a squared distance from `least` to `most`, m2, and which they are; none at 0."""
+    """Points (P, 4) of (N, 4) with a squared distance from `least` to `most`, m2, and their indices; none at 0."""
     used, index, count = np.empty_like(points), np.empty(len(points), np.int64), 0
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         squared = x * x + y * y + z * z
         used[count] = points[i]
         if not np.isfinite(points[i, 3]):
-            used[count, 3] = 0  # an intensity that is not known
+            used[count, 3] = 0  # an unknown intensity
         index[count] = i
         count += squared >= least and squared <= most and squared > 0  # False for NaN
     return used[:count], index[:count]

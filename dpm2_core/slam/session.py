@@ -25,18 +25,18 @@ from dpm2_core.slam.store.map_file import remove_map
 from dpm2_core.slam.store.map_store import MapStore
 
 MapMode = Literal["create", "resume", "extend", "localize"]
-"""What to do with a map file: make it, go on with the drive that was cut off, add another drive, or only read it."""
+"""What to do with a map file: create it, continue an interrupted drive, add another drive, or only read it."""
 _COMPARED = 500  # points of a cloud
 _APART = 0.75
-"""m, of three in four of them: its own frame is at 0.01, or as far as it was de-skewed; another one from 1.1 on."""
-_SAME_FRAME = isotropic(1e-4, 1e-3)  # the rounding of what is the same frame
+"""m, distance of three in four points: of the same frame 0.01, or the de-skewing; of another frame at least 1.1."""
+_SAME_FRAME = isotropic(1e-4, 1e-3)  # rounding errors between two readings of the same frame
 
 
 def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:
-    """The map file, for what `mode` says; see `open_session` and `open_for_localization`.
+    """The map file, opened as `mode` requires; see `open_session` and `open_for_localization`.
 
     Raises:
-        UsageError: there is none to extend.
+        UsageError: there is no map to extend.
     """
     if mode == "localize":
         return open_for_localization(path, config.slam)
@@ -46,21 +46,21 @@ def open_map(path: Path, config: Config, mode: MapMode) -> MapStore | TiledMap:
 
 
 def open_session(path: Path | str, settings: SlamSettings, config: str, resume: bool) -> MapStore:
-    """The map file to write to, with a new session begun.
+    """Open the map file for writing, with a new session.
 
     Args:
-        config: YAML, kept with the session.
-        resume: go on with the file, if there is one; else it must not exist.
+        config: YAML, stored with the session.
+        resume: continue the file, if there is one; else it must not exist.
 
     Raises:
-        UsageError: the file is there, or holds descriptors of other weights. Dpm2Error: it cannot be written.
+        UsageError: the file exists, or has descriptors of other weights. Dpm2Error: it cannot be written.
     """
     path, weights = Path(path), settings.weights_id()
     if path.exists() and not resume:
         raise UsageError(
             f"--map {path}: there is a file already; --resume goes on with its drive, --extend adds another"
         )
-    # Not whether it exists now: another node may have made one of that name since.
+    # Remembered here: by the time of an error another node may have made a file with that name.
     there = resume and path.exists()
     store = MapStore.open(path, read_only=False) if there else MapStore.create(path)
     try:
@@ -75,10 +75,10 @@ def open_session(path: Path | str, settings: SlamSettings, config: str, resume: 
 
 
 def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore | TiledMap:
-    """The map file, or folder of tiles, to find oneself in, open for reading only.
+    """The map file, or folder of tiles, for localization, open for reading only.
 
     Raises:
-        UsageError: no map, one without descriptors, or with those of other weights. Dpm2Error: it cannot be read.
+        UsageError: no map, no descriptors in it, or descriptors of other weights. Dpm2Error: it cannot be read.
     """
     path = Path(path)
     store = TiledMap(path) if path.is_dir() else MapStore.open(path)
@@ -91,7 +91,7 @@ def open_for_localization(path: Path | str, settings: SlamSettings) -> MapStore 
 
 
 def check_for_localization(store: MapStore | TiledMap, settings: SlamSettings) -> None:
-    """Whether one could find oneself in a map, which may be one that still grows.
+    """Check that a map, which may still grow, can be used for localization.
 
     Raises:
         UsageError: it has no descriptors, or those of other weights. Dpm2Error: it cannot be read.
@@ -102,17 +102,17 @@ def check_for_localization(store: MapStore | TiledMap, settings: SlamSettings) -
 
 
 def _check_weights(store: MapStore | TiledMap, weights: str) -> None:
-    """Descriptors of different weights have nothing in common; `weights` "": none are made."""
+    """Reject descriptors of different weights: they cannot be compared; `weights` "": none are made."""
     for before in store.weights if weights else ():
         if before and before != weights:
             raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
 
 
 def resume_at(mapper: Mapper, source: Source, start: int) -> int:
-    """Position in the source of the map's last keyframe, from where the mapper goes on; `start` for an empty map.
+    """Position of the map's last keyframe in the source, where the mapper continues; `start` for an empty map.
 
     Raises:
-        UsageError: the frame of that keyframe is not in the source, or is another one of the same stamp.
+        UsageError: the frame of that keyframe is not in the source, or is a different frame with the same stamp.
     """
     if not mapper.keyframes:
         return start
@@ -135,7 +135,7 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
 
 
 def _shows(frame: Frame, cloud: Points) -> bool:
-    """Whether a keyframe's cloud (M, 4) is of that frame. Stamps alone say little: all synthetic drives begin at 0."""
+    """Whether a keyframe's cloud (M, 4) is of that frame. Stamps are not enough: all synthetic drives begin at 0."""
     points = frame.points[returned(frame.points)][:, :3]
     if not len(points) or not len(cloud):
         return True

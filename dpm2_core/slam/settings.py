@@ -31,15 +31,16 @@ class SlamSettings(Settings):
     """The SLAM, stage by stage."""
 
     preset: Literal["auto", "outdoor", "indoor", "highway", "paper"] = "auto"
-    """Changes to the other defaults of `slam`. What is set besides has precedence; but where a preset is set over a
-    file, values that are those of the file's own preset give way. indoor: rooms and corridors at a walk. highway: far
-    and fast. outdoor: no change. auto: indoor where the scans show rooms, else outdoor. paper: the SLAM of
-    DeepPointMap2 as published, by the network alone (docs/experiments.md)."""
+    """A set of changes to the other defaults of `slam`. A value that is set explicitly has precedence over the preset.
+    If another preset is set than the one in a file, values of the file that are those of its own preset are replaced.
+    indoor: rooms and corridors at walking speed. highway: long ranges and high speed. outdoor: no change. auto: indoor
+    where the scans show rooms, else outdoor. paper: the SLAM of DeepPointMap2 as published, by the network alone
+    (docs/experiments.md)."""
     registration: Literal["geometric", "neural", "refined", "adaptive"] = "adaptive"
-    """How a scan finds its pose: by points, by neural descriptors, by both (refined), or by points that ask the network
-    where they do not know (adaptive): where few of them fit, as at few frames per second, and along a tunnel."""
+    """How the pose of a scan is found: by points, by neural descriptors, by both (refined), or by points with the
+    network as a fallback (adaptive): where few points fit, as at low frame rates, and along a tunnel."""
     threads: int = Field(1, ge=1)
-    """Threads of the network. More are faster where processors are idle; on busy ones they wait for each other."""
+    """Threads of the network. More threads are faster on idle processors; on busy ones they wait for each other."""
     filter: FilterSettings = FilterSettings()
     preprocess: PreprocessSettings = PreprocessSettings()
     geometric: GeometricSettings = GeometricSettings()
@@ -57,7 +58,7 @@ class SlamSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _with_preset(cls, given: Any) -> Any:
-        """What the preset changes, under what is given."""
+        """The changes of the preset, overridden by the given values."""
         changes = _changes(given.get("preset")) if isinstance(given, Mapping) else {}
         if not changes:
             return given
@@ -69,13 +70,14 @@ class SlamSettings(Settings):
         """The values of the preset that a tree names; see `Settings.implied`."""
         preset = tree.get("preset", "auto")
         if preset not in get_args(cls.model_fields["preset"].annotation):
-            return {}  # which is an error, or another one takes its place
+            return {}  # an invalid name is reported elsewhere, or another preset replaces it
         return cls(preset=preset).model_dump(mode="json", exclude={"preset"})
 
     def indoors(self) -> SlamSettings:
-        """What is used in rooms: with `preset: auto` the preset for rooms under what differs from the defaults.
+        """The settings for rooms: with `preset: auto`, the indoor preset overridden by all values that differ from the
+        defaults.
 
-        An upper bound of the preset gives way to a lower one that is set.
+        An upper bound of the preset is raised if a lower bound that is set is above it.
         """
         if self.preset != "auto":
             return self
@@ -88,16 +90,16 @@ class SlamSettings(Settings):
 
     @property
     def uses_descriptors(self) -> bool:
-        """Whether keyframes may have descriptors, which only those of the same weights can be compared with."""
+        """Whether keyframes may have descriptors; these can only be compared with descriptors of the same weights."""
         return self.registration != "geometric" or (self.loops.enabled and self.loops.descriptors)
 
     def weights_id(self) -> str:
-        """Of the weights that make descriptors, see `network.pretrained.weights_id`; empty where none are made."""
+        """Id of the weights that make descriptors, see `network.pretrained.weights_id`; empty if none are made."""
         return weights_id(self.neural.weights) if self.uses_descriptors else ""
 
 
 def _changes(preset: Any) -> dict[str, Any]:
-    """What a preset changes; nothing for what is no name of one."""
+    """The changes of a preset; empty if there is no preset with that name."""
     named = preset in get_args(SlamSettings.model_fields["preset"].annotation)[1:]
     return read_yaml(Path(__file__).with_name("presets") / f"{preset}.yaml") if named else {}
 

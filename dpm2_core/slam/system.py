@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole SLAM: a frame in, its pose and what became of the map out. Synchronous and deterministic.
+"""The complete SLAM: each frame gives its pose and what changes in the map. Synchronous and deterministic.
 
-`Slam.process` is the algorithm: every frame through the odometry, every keyframe into the map, which closes loops, or,
-where the map is to stay as it is, to its place there. The ROS node runs the same object, its two steps in two threads.
-`slam/build.py` puts the parts together.
+`Slam.process` is the algorithm. Every frame goes through the odometry. Every keyframe is added to the map, which closes
+loops, or, if the map must not change, is localized in it. The ROS node runs the same object, with its two steps in two
+threads. `slam/build.py` creates the parts.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
 
-_TIES = 100  # more loops are not found during a frame
-_LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not come to the map will not come any more
+_TIES = 100  # no more loops are found during a frame
+_LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not reached the map is taken as lost
 
 
 @dataclass(frozen=True, eq=False)
 class MapResult:
-    """What became of a keyframe.
+    """The result of the map for a keyframe.
 
     Attributes:
-        loops: those that were tried, accepted or rejected, in a map that grows.
-        located: its place in a map that stays as it is; None in one that grows.
+        loops: loops that were tried, accepted or rejected, in a map that grows.
+        located: its pose in a map that does not change; None in a map that grows.
     """
 
     loops: list[Edge]
@@ -45,8 +45,8 @@ class SlamResult:
     Attributes:
         odometry: of every frame.
         map: of a frame that became a keyframe; else None.
-        T_map_odom: (4, 4), which carries every correction; None while the place in the map is not known.
-        state: of the odometry, or, where that is well, of the place in a map that stays as it is.
+        T_map_odom: (4, 4), includes all corrections; None while the pose in the map is not known.
+        state: of the odometry; if that is healthy and the map does not change, of the localization.
     """
 
     odometry: OdometryResult
@@ -56,7 +56,7 @@ class SlamResult:
 
     @property
     def T_map_lidar(self) -> Array | None:
-        """(4, 4); None while the place in the map is not known."""
+        """(4, 4); None while the pose in the map is not known."""
         return None if self.T_map_odom is None else self.T_map_odom @ self.odometry.T_odom_lidar
 
 
@@ -64,9 +64,9 @@ class Slam:
     """One robot in one map.
 
     Attributes:
-        odometry: takes every frame.
-        mapper: the map. It takes every keyframe, unless there is a localizer.
-        localizer: finds every keyframe in the map, which then stays as it is; None: the map grows.
+        odometry: processes every frame.
+        mapper: the map. It receives every keyframe, unless there is a localizer.
+        localizer: localizes every keyframe in the map, which is then not changed; None: the map grows.
     """
 
     def __init__(
@@ -77,30 +77,30 @@ class Slam:
         thumbnail_width: int = 0,
         pictured: float | None = None,
     ) -> None:
-        """Put the parts together.
+        """Create the SLAM from its parts.
 
         Args:
-            thumbnail_width: of the image that every keyframe carries into a map file, pixels; 0: none.
-            pictured: standard deviation of the position in its worst direction, m, above which keyframes carry one by
-                which their place is found again; None: none does.
+            thumbnail_width: width of the image that is stored with every keyframe in a map file, pixels; 0: none.
+            pictured: standard deviation of the position in its worst direction, m, above which keyframes have an image
+                for relocalization; None: never.
         """
         self.odometry, self.mapper, self.localizer = odometry, mapper, localizer
         self._thumbnail_width = thumbnail_width
         self._pictured = pictured
         self._parts = SweepParts()
         self._last: OdometryResult | None = None  # of a whole sweep
-        self._T_map_odom: Array | None = None  # of the map that grows, until the next keyframe
-        self._underway: int | None = None  # stamp of the keyframe that has not come to the map yet
-        # Ids of keyframes of the odometry that loops have tied since its last step; a mapper without one takes none.
+        self._T_map_odom: Array | None = None  # of the map that grows, valid until the next keyframe
+        self._underway: int | None = None  # stamp of the keyframe that has not reached the map yet
+        # Pairs of odometry keyframe ids that loops connected since its last step; with a localizer there are none.
         self._tied: deque[tuple[int, int]] = deque(maxlen=_TIES)
 
     @property
     def uses_images(self) -> bool:
-        """Whether frames should come with their images."""
+        """Whether frames should have their images."""
         return self.odometry.uses_images or self._thumbnail_width > 0
 
     def process(self, frame: Frame) -> SlamResult:
-        """Take one frame in. Never raises for what a sensor may deliver."""
+        """Process one frame. Never raises for data that a sensor may deliver."""
         odometry = self.odometry_step(frame)
         began = perf_counter()
         result = None
@@ -110,10 +110,10 @@ class Slam:
         return SlamResult(odometry, result, self.T_map_odom, self.state(odometry.state))
 
     def odometry_step(self, frame: Frame) -> OdometryResult:
-        """The frame's pose in the odometry frame, and a keyframe when it shows enough that is new, or if one is lost.
+        """The frame's pose in the odometry frame, and a keyframe if enough is new or a localizer needs one.
 
-        Frames that are parts of a sweep are joined: the pose of the last one is registered, those before are predicted.
-        May run in another thread than the other steps.
+        Frames that are parts of a sweep are joined: the pose of the last part is registered, the earlier ones are predicted.
+        May run in another thread than `map_step`.
         """
         sweep = self._parts.join(frame)
         if sweep is None and self._last is not None:
@@ -150,7 +150,7 @@ class Slam:
         self._parts, self._last = SweepParts(), None
 
     def _asks_pictures(self, result: OdometryResult) -> bool:
-        """Whether the place of a keyframe is looked for by its picture, now or later: its points leave it open."""
+        """Whether a keyframe is searched by its image, now or later, since its points do not determine its pose."""
         registration = result.registration
         return self._pictured is not None and (
             self.localizer is not None
@@ -159,10 +159,10 @@ class Slam:
         )
 
     def map_step(self, keyframe: Keyframe) -> MapResult:
-        """Take a keyframe into the map, or find it there.
+        """Add a keyframe to the map, or localize it there.
 
         Raises:
-            RejectedError: it is not sound; see `Mapper.add`.
+            RejectedError: the keyframe is invalid; see `Mapper.add`.
         """
         self._T_map_odom = None
         if keyframe.stamp == self._underway:
@@ -174,7 +174,7 @@ class Slam:
         return MapResult(loops)
 
     def _note_ties(self, keyframe: Keyframe, loops: list[Edge]) -> None:
-        """Loops of the last keyframe that the graph keeps, by ids as the odometry counts: below 0 before it began."""
+        """Note the loops of the last keyframe that the graph keeps, by the odometry's ids: below 0 before its start."""
         offset = self.mapper.keyframes[-1].id - keyframe.id
         for loop in self.mapper.kept(loops):
             one, other = (self.mapper.keyframes[node] for node in (loop.from_node, loop.to_node))
@@ -182,7 +182,7 @@ class Slam:
                 self._tied.append((other.id - offset, one.id - offset))
 
     def use(self, mapper: Mapper, localizer: Localizer | None) -> None:
-        """Go on in another map."""
+        """Continue in another map."""
         self.mapper, self.localizer, self._T_map_odom = mapper, localizer, None
         self._tied.clear()
 
@@ -193,7 +193,7 @@ class Slam:
 
     @property
     def T_map_odom(self) -> Array | None:
-        """(4, 4); None while the place in the map is not known."""
+        """(4, 4); None while the pose in the map is not known."""
         if self.localizer is not None:
             return self.localizer.T_map_odom if self.localizer.state.located else None
         if self._T_map_odom is None:
@@ -201,7 +201,7 @@ class Slam:
         return self._T_map_odom
 
     def state(self, odometry: State) -> State:
-        """That of the robot, given that of its odometry."""
+        """State of the robot, given the state of its odometry."""
         localizer = self.localizer
         if localizer is None or odometry in (State.LOST, State.INITIALIZING) or localizer.state is State.TRACKING:
             return odometry
