@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Across a pause: where the scans after it lie in the map before it, and when that is accepted.
+"""Registration across a pause: the pose of the scans after it in the map before it, and when that is accepted.
 
-After a pause the motion so far says little, and one scan can fit a map at many places: road to road, wall to wall. So
-the scans after a pause make a map of their own, a new stretch, whose motion is known whatever happened in the pause.
-Each of them is registered to the map before, too. The results are accepted when several of them, found independently
-of each other, move as the stretch does, when no direction is left open, and when a vehicle can have come there.
+After a pause the previous motion predicts little, and one scan can fit a map at many poses: road to road, wall to wall.
+So the scans after a pause make a map of their own, a new stretch; its motion is known, whatever happened in the pause.
+Each of them is also registered to the map before the pause. The results are accepted when several of them, found
+independently of each other, move as the stretch does, when they leave no direction unconstrained, and when a vehicle
+can have reached that pose.
 """
 
 from __future__ import annotations
@@ -24,47 +25,47 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
 
 _TIES = 3
-"""So many results must agree, and most of all that there are: two meet by chance."""
+"""This many results must agree, and they must be a majority: two may agree by chance."""
 _MOVED = 0.5
-"""Results count apart only where the robot has moved this far between them, m."""
+"""Results count as separate only if the robot has moved this far between them, m."""
 _AS_WELL = 0.85
-"""A scan that fits the map before this well, relative to its own stretch, counts at a halt, too."""
-_NEAR = 1.0  # m, added to what a vehicle can do
-_DRIVES = 1.0  # m/s: no slower
-_BRAKES = 0.35  # m/s2: the way is searched so far around that of an even change of the motion, times seconds squared
+"""A scan that fits the map before the pause this well, relative to its own stretch, also counts at a halt."""
+_NEAR = 1.0  # m, added to the distance that a vehicle can cover
+_DRIVES = 1.0  # m/s: the slowest speed that counts as driving
+_BRAKES = 0.35  # m/s2: times seconds squared, range of the search around a constant change of the motion
 _STEERS = 0.06  # rad/s2: the same for the heading
-_PARTS = (0.75, 0.5, 0.25, 0.0)  # of that way, that are searched too if the robot, braking by
+_PARTS = (0.75, 0.5, 0.25, 0.0)  # fractions of that motion that are searched too if the robot, braking by
 _STOPS = 4.0  # m/s2, may have stood for a while
-_RIVALS = 4.0  # m: at least so far, for other places that may fit as well
-_FARTHEST, _WIDEST = 12.0, 0.6  # m and rad: no farther
-_STEP, _TURN = 1.0, 0.07  # m and rad between two starts: the points find their place from within
+_RIVALS = 4.0  # m: the search covers at least this, to find other poses that may fit as well
+_FARTHEST, _WIDEST = 12.0, 0.6  # m and rad: limits of the search
+_STEP, _TURN = 1.0, 0.07  # m and rad between two starts: the registration converges from within
 _SWAY = 0.05  # rad/s
-_EXCLUDED = 16.0  # squared sigmas of the way that an IMU knows
+_EXCLUDED = 16.0  # squared sigmas from the motion by an IMU
 
 
 @dataclass(frozen=True, eq=False)
 class _Tie:
-    """One scan twice: registered to the map before, and its pose T_odom_lidar (4, 4) in the new stretch."""
+    """One scan twice: registered to the map before the pause, and its pose T_odom_lidar (4, 4) in the new stretch."""
 
     before: Registration
     T_stretch: Array
 
 
 class Bridge:
-    """From the last pose before a pause to the stretch after it.
+    """The connection from the last pose before a pause to the stretch after it.
 
     Attributes:
         registration: the map before the pause.
-        twist: (6,) [rad/s, m/s] the motion there; None where it was not known.
-        agreed: whether most scans of the stretch agree on where it is, and only a motion would confirm it.
-        tries: scans that were registered to the map before, without those after which it had `agreed`: a robot that
-            has halted shows no motion.
-        held: whether they were held back on their way: the pause may have been as short as a period.
-        endless: time has gone back: it may have been as short, or the stretch is another drive, from anywhere.
+        twist: (6,) [rad/s, m/s] the motion before the pause; None if it was not known.
+        agreed: whether most scans of the stretch agree on its pose, and only motion is missing to confirm it.
+        tries: scans that were registered to the map before the pause, without those after which `agreed` was true: a
+            robot that has halted shows no motion.
+        held: whether the scans were delayed in transport: the pause may have been as short as a period.
+        endless: time has gone back: the pause may be as short, or the stretch is another drive, from anywhere.
     """
 
     def __init__(self, registration: ScanRegistration, motion: MotionState, left: float) -> None:
-        """The last pose before the pause is the registered one of `motion`, at `left` s by the clock of the stream."""
+        """`motion` has the last registered pose before the pause, at `left` s by the clock of the stream."""
         self.registration = registration
         self.twist, self._motion = motion.twist, motion.known_twist
         self._speed = float(np.linalg.norm(self._motion[3:]))
@@ -82,12 +83,12 @@ class Bridge:
         reckoned: Reckoned | None,
         stepped: bool,
     ) -> Array:
-        """A new stretch, at `now` s by the clock of the stream: where it begins (4, 4).
+        """Begin a new stretch, at `now` s by the clock of the stream; returns its first pose (4, 4).
 
         Args:
-            T_other: there, if another odometry knows the way. imu, reckoned: it may know the turn since that pose, and
-                the way.
-            stepped: it is so long by a clock that was set meanwhile.
+            T_other: that pose by another odometry, if known. imu, reckoned: rotation and motion since the last pose, if
+                known.
+            stepped: the length of the pause is uncertain, since a clock was set meanwhile.
         """
         self._seconds = seconds = now - self._left
         self._stepped |= stepped
@@ -108,24 +109,25 @@ class Bridge:
         return self._T_begin
 
     def expected(self, T: Array, dt: float) -> Prediction:
-        """Of the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before, less certain."""
+        """Prediction for the second scan of the stretch, `dt` s after the first at T (4, 4): the motion before the
+        pause, with a larger covariance."""
         sigma = dt * velocity_change(self._speed, self._seconds, self._settings.steadiness)
         information = np.linalg.inv(spread(sigma, dt, self._of_velocity)).astype(np.float64)
         return Prediction([predicted(T, self._motion, dt)], 2.0, information)
 
     def covariance(self, T_stretch: Array) -> Array:
-        """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last one before the pause."""
+        """(6, 6) [rad, m] of a pose (4, 4) of the stretch relative to the last pose before the pause."""
         A = se3.adjoint(se3.inverse(T_stretch) @ self._T_begin)
         return np.asarray(A @ self._of_begin @ A.T)
 
     def register(
         self, scan: Scan, T_stretch: Array, twist: Array | None, own: Registration
     ) -> tuple[Registration, bool]:
-        """Where a scan of the stretch lies in the map before: `ok` says that it may, the second value that it does.
+        """Register a scan of the stretch to the map before; `ok`: the pose is possible, second value: it is confirmed.
 
         Args:
-            scan: its pose in the stretch is T_stretch (4, 4), its motion `twist` (6,), None where that is unknown, and
-                `own` is how it was registered there.
+            scan: its pose in the stretch is T_stretch (4, 4), its motion `twist` (6,), None if unknown, and `own` is
+                its registration there.
         """
         self.tries, self.agreed = self.tries + 1, False
         if self._after is None and twist is not None:
@@ -137,7 +139,7 @@ class Bridge:
         result = self.registration.register(scan, search)
         fits = result.confidence >= _AS_WELL * own.confidence
         problem = self._problem(result)
-        if not problem and not fits:  # else it stands where it stood, whatever the clock says
+        if not problem and not fits:  # a scan that fits well is at its old pose, whatever the clock shows
             problem = self._impossible(result.T_target_source @ T_this_begin)
         if problem:
             return result.rejected(problem), False
@@ -149,7 +151,7 @@ class Bridge:
         return result, certain
 
     def _beginnings(self) -> Array:
-        """Where the stretch may begin (P, 4, 4), the most likely first."""
+        """Poses where the stretch may begin (P, 4, 4), the most likely first."""
         before, after = (_steered(twist) for twist in self._motions)
         seconds = self._seconds
         far = min(max(_BRAKES * seconds**2, _RIVALS), _FARTHEST)
@@ -170,12 +172,12 @@ class Bridge:
 
     @property
     def _motions(self) -> tuple[Array, Array]:
-        """Before the pause and after it (6,); each for the other while that is not known."""
+        """Twists (6,) before and after the pause; each replaces the other while that is unknown."""
         known = [twist for twist in (self.twist, self._after) if twist is not None] or [self._motion]
         return known[0], known[-1]
 
     def _problem(self, result: Registration) -> str:
-        """Why a result says nothing."""
+        """Why a result cannot be used; empty if it can."""
         if not result.ok:
             return result.reason
         if (sigma := result.worst_sigma) > self._settings.degraded_sigma:
@@ -183,30 +185,31 @@ class Bridge:
         return ""
 
     def _began(self, tie: _Tie) -> Array:
-        """Where the stretch began (4, 4), by one result."""
+        """Pose where the stretch began (4, 4), by one result."""
         return tie.before.T_target_source @ se3.inverse(tie.T_stretch) @ self._T_begin
 
     def _impossible(self, T_begin: Array) -> str:
-        """Why a vehicle cannot have come to T_begin (4, 4) in the pause; empty if it can."""
+        """Why a vehicle cannot have reached T_begin (4, 4) in the pause; empty if it can."""
         if self._by_imu is not None:
             xi, of_way = se3.way(self._by_imu.T, T_begin)[3:], self._by_imu.covariance[3:, 3:]
             if xi @ np.linalg.solve(of_way, xi) > _EXCLUDED:
                 return f"after a pause: {np.linalg.norm(xi):.0f} m from where the IMU leads"
         if self._after is None or self.twist is None:
             return ""
-        # Between two known velocities, with a bounded acceleration, nothing is farther from their mean times the time.
+        # With a bounded acceleration, the distance differs from the mean of two known velocities times the time by a
+        # bounded amount.
         T_before_begin = se3.inverse(self._T) @ T_begin
         before, after = self.twist[3:], T_before_begin[:3, :3] @ self._after[3:]
         way, mean = T_before_begin[:3, 3], (before + after) / 2
         seconds = self._seconds
-        if self.held:  # the time that fits best
+        if self.held:  # use the time that fits best
             seconds = float(np.clip(way @ mean / (mean @ mean + 1e-9), 0.0, seconds))
         off = float(np.linalg.norm(way - seconds * mean))
         if off > _NEAR + self._settings.steadiness * self._seconds**2 / 4:
             return f"after a pause: {off:.0f} m from where the motion before and after leads"
         speeds, most = np.linalg.norm([before, after], axis=1), self._settings.steadiness
         if not self.held and speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
-            # It did not reverse: it has come at least as far as it needs to stop, and to be as fast again.
+            # It did not reverse: it has moved at least the distance to stop and to reach its speed again.
             ahead = mean / np.linalg.norm(mean)
             least, came = float(speeds @ [before @ ahead, after @ ahead]) / (2 * most), float(way @ ahead)
             if came < least - _NEAR:
@@ -214,7 +217,7 @@ class Bridge:
         return ""
 
     def _agreeing(self) -> list[float]:
-        """How far from the last result those are that move as the stretch does, m; empty unless most do."""
+        """Distances of results that move as the stretch does from the last one, m; empty unless they are a majority."""
         last = self._ties[-1]
         ways = [se3.inverse(tie.T_stretch) @ last.T_stretch for tie in self._ties]
         agreeing = [
@@ -226,7 +229,7 @@ class Bridge:
 
 
 def _apart(distances: Sequence[float]) -> int:
-    """How many of them are far enough from one another to be evidence."""
+    """Number of distances that are far enough from one another to be evidence."""
     count, reached = 0, -np.inf
     for distance in sorted(distances):
         if distance >= reached + _MOVED:
@@ -235,14 +238,14 @@ def _apart(distances: Sequence[float]) -> int:
 
 
 def _direction(before: Array, after: Array) -> Array:
-    """Unit vector (3,) in which the robot moves; ahead if it stands."""
+    """Unit vector (3,) of the robot's motion; ahead if it stands."""
     v = before[3:] + after[3:]
     speed = np.linalg.norm(v)
     return v / speed if speed > 0.1 else np.array([1.0, 0.0, 0.0])
 
 
 def _steered(twist: Array) -> Array:
-    """A twist (6,) without the sway of the body: what turns more slowly would not go on for seconds."""
+    """A twist (6,) without the sway of the body: slower rotations would not continue for seconds."""
     return twist if np.linalg.norm(twist[:3]) > _SWAY else np.concatenate([np.zeros(3), twist[3:]])
 
 

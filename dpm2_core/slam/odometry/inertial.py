@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An IMU beside the scans, loosely coupled: how the LiDAR turned, which way is up, and where no scan fits the way.
+"""Loosely coupled IMU: rotation of the LiDAR, the up direction, and the motion where no scan determines it.
 
-The turn between two scans, and during one, is measured instead of taken to be steady, and so is the change of velocity
-since the last scan, as far as gravity is known; a scan that fits decides on the way. The gyroscope's bias is what the
-scans say differently over a second or more: at rest, where they show no turn at all, as well as on the way, though
-there less surely. A gyroscope whose turns are not those of the scans, as with a wrong orientation in /tf_static, is
-left out until they agree for a while.
+The rotation between two scans and during one is measured instead of assumed to be constant. So is the change of
+velocity since the last scan, as far as gravity is known; a scan that fits determines the motion. The gyroscope's bias
+is the difference to the scans over a second or more: at rest, where they show no rotation at all, and in motion, with a
+larger covariance. A gyroscope whose rotations differ from those of the scans, as with a wrong orientation in
+/tf_static, is ignored until they agree for a while.
 
-Forces, averaged over a minute from which the changes of velocity are taken out, show which way is up. By that the
-odometry's frame is level at a start at rest, and stays so: it follows no faster than the odometry may drift. How far
-the accelerations are off is what the scans say differently, too.
+Forces, averaged over a minute and corrected by the changes of velocity, show the up direction. It levels the odometry
+frame at a start at rest, and keeps it level: the correction is no faster than the odometry may drift. The error of the
+accelerations is also estimated from the difference to the scans.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from dpm2_core.geometry.turning import turned
 from dpm2_core.slam.odometry.other import Doubt, Step
 from dpm2_core.slam.odometry.vertical import Vertical, metric
 
-_MOST = 25_000  # samples, at most
-_PARTS = 10  # of the time since the last registered frame
+_MOST = 25_000  # samples that are kept at most
+_PARTS = 10  # parts of the time since the last registered frame
 
-# Gyroscope, standard deviations: a turn is off by so much, rad, and this fraction of it (scale, axes, time).
+# Gyroscope, standard deviations: error of a rotation, rad, and as a fraction of it (scale, axes, time).
 _TURN, _SHARE = np.radians(0.1), 0.02
-_BIAS, _BIAS_DRIFT = 0.03, 1e-4  # rad/s of an unknown one, and its change in 1 s
-_BIAS_AT_REST = 0.003  # rad/s of one that was measured at rest: "rest" may be a slow turn
+_BIAS, _BIAS_DRIFT = 0.03, 1e-4  # rad/s of an unknown bias, and its change in 1 s
+_BIAS_AT_REST = 0.003  # rad/s of a bias measured at rest: "rest" may be a slow rotation
 _LARGEST_BIAS = 0.2  # rad/s
 _SPAN = 1.0  # s over which scans and gyroscope are compared for the bias
-_MEMORY = 0.15  # fraction of the newest turn in the doubt
-_UNSEEN = 30.0  # squared sigmas: so much a turn counts at whose end the scan fits nowhere
-_TURNING = 0.1  # rad/s: slower turns prove nothing
+_MEMORY = 0.15  # weight of the newest rotation in the doubt
+_UNSEEN = 30.0  # squared sigmas that count for a rotation after which the scan fits nowhere
+_TURNING = 0.1  # rad/s: slower rotations prove nothing
 
 _STEADY = (0.05, 0.1, 0.3)  # noise and mean of the rates, rad/s, and noise of the forces, m/s2, of a sensor at rest
-_SLOPE = np.radians(60.0)  # no vehicle stands on a steeper one
-_SHAKEN = 0.6  # m/s2 that accelerations may be off, to lead anywhere
-_AT_REST, _FEWEST = 1_000_000_000, 5  # ns of samples that show it, and so many at least
-_FOLLOWS = np.radians(0.02)  # rad for each m or s: so fast is the frame turned
+_SLOPE = np.radians(60.0)  # no vehicle stands on a steeper slope
+_SHAKEN = 0.6  # m/s2: with a larger error of the accelerations there is no dead reckoning
+_AT_REST, _FEWEST = 1_000_000_000, 5  # ns of samples that show rest, and their minimum number
+_FOLLOWS = np.radians(0.02)  # rad per m or per s: maximum rotation of the frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class Reckoned(Step):
     """A step by dead reckoning.
 
     Attributes:
-        gained: (2, 3) by how much it is longer, m, and faster in the end, m/s, than at the velocity of the beginning,
-            along the axes there.
-        sigma: standard deviation of its accelerations, m/s2.
+        gained: (2, 3) additional distance, m, and additional final velocity, m/s, relative to constant velocity, in the
+            axes at the beginning.
+        sigma: standard deviation of the accelerations, m/s2.
     """
 
     gained: Array
@@ -60,25 +60,25 @@ class Reckoned(Step):
 
 
 class InertialMotion:
-    """The samples so far, and what they say.
+    """The samples so far, and the motion and vertical that they show.
 
     Attributes:
-        turning: R_before_t (K + 1, 3, 3) from the last registered frame to the middle of each of K even parts of the
-            time since then, and to now; None where it is not known, or not believed.
-        turns: whether that is more than a bias could be; no scan has confirmed it yet.
-        problem: why it is None, or why a start at rest is not level or may be upside down; else empty.
-        T_level_odom: (4, 4), by which poses become level.
+        turning: R_before_t (K + 1, 3, 3) from the last registered frame to the middle of each of K equal parts of the
+            time since then, and to now; None if it is not known or not credible.
+        turns: whether that rotation is more than a bias could cause; no scan has confirmed it yet.
+        problem: why `turning` is None, or why a start at rest is not level or may be upside down; else empty.
+        T_level_odom: (4, 4), transforms poses into the level frame.
     """
 
     def __init__(self, starts: bool = True) -> None:
-        """`starts`: the drive begins with the next frame; else an IMU has come to one that is under way."""
+        """`starts`: the drive begins with the next frame; else the IMU's samples begin during a drive."""
         self._starts = starts
         self.turning: Array | None = None
         self.problem = ""
         self.T_level_odom = np.eye(4)
         self._samples = Inertial(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
         self._bias, self._variance = np.zeros(3), _BIAS**2  # of the bias, (rad/s)^2
-        self._measured: Array | None = None  # the same, believed or not
+        self._measured: Array | None = None  # as `turning`, credible or not
         self._before: int | None = None  # stamp of the last registered frame
         self.turns = False
         self._doubt = Doubt(_MEMORY)
@@ -86,7 +86,7 @@ class InertialMotion:
         self._vertical = Vertical()
 
     def look(self, frame: Frame) -> Frame:
-        """Take in a new frame's samples; returns the frame with those around its sweep, without their bias, or none."""
+        """Add a new frame's samples; returns the frame with the recent samples, without their bias, or with none."""
         if self.turns:  # the last frame was not registered
             self._doubt.add(_UNSEEN)
         self._join(frame)
@@ -109,11 +109,11 @@ class InertialMotion:
 
     @property
     def turn(self) -> Array | None:
-        """R_before_now (3, 3) since the last registered frame; None where it is not known, or not believed."""
+        """R_before_now (3, 3) since the last registered frame; None if it is not known or not credible."""
         return None if self.turning is None else self.turning[-1]
 
     def covariance(self, seconds: float) -> Array | None:
-        """(3, 3) rad2 of `turn` over that time; None where it is."""
+        """(3, 3) rad2 of `turn` over `seconds`; None if `turn` is None."""
         if self.turn is None:
             return None
         angle = _angle(self.turn)
@@ -121,11 +121,11 @@ class InertialMotion:
         return np.asarray((of_turn + self._variance * seconds**2) * np.eye(3))
 
     def step(self, now: int, R: Array, velocity: Array, of_velocity: Array) -> Reckoned | None:
-        """The way since the last registered frame, from its velocity on by turns and forces; None where it is unknown.
+        """The motion since the last registered frame by its velocity, rotations and forces; None if it is unknown.
 
         Args:
-            now: stamp of the new frame, ns. R: (3, 3) of the last one in the odometry's frame. velocity: (3,) m/s
-                there, along its axes, of the covariance `of_velocity` (3, 3).
+            now: stamp of the new frame, ns. R: (3, 3) of the last registered frame in the odometry frame. velocity:
+                (3,) m/s at that frame, in its axes, with the covariance `of_velocity` (3, 3).
         """
         before = self._before
         if before is None or self.turn is None or self._vertical.sigma > _SHAKEN:
@@ -147,11 +147,11 @@ class InertialMotion:
         return Reckoned(se3.make(self.turn, way), covariance, gained, sigma)
 
     def registered(self, T_before: Array, T: Array, stamp: int, twist: Array | None, by_imu: bool = False) -> None:
-        """A frame was registered at T (4, 4), the last one at T_before.
+        """Process the registration of a frame at T (4, 4), the previous one at T_before.
 
         Args:
-            twist: (6,) [rad/s, m/s] the motion between the two; None: nothing is known of it, T begins a map.
-            by_imu: its velocity is that of `step`, in part.
+            twist: (6,) [rad/s, m/s] the motion between the two; None: it is unknown, as T begins a map.
+            by_imu: the velocity is in part that of `step`.
         """
         measured, before, self._before, self.turns = self._measured, self._before, stamp, False
         if self._starts:
@@ -174,7 +174,7 @@ class InertialMotion:
         self._level_frame(T_before, T, seconds)
 
     def _start_at_rest(self, T: Array) -> None:
-        """Where a drive begins at rest, the samples before the first frame show the bias and which way is up."""
+        """If a drive begins at rest, the samples before the first frame show the bias and the up direction."""
         s, self._starts = self._samples, False
         s = s[s.stamps > s.stamps.max(initial=0) - _AT_REST]
         if len(s) < _FEWEST or not _at_rest(s.rates, s.forces):
@@ -187,15 +187,14 @@ class InertialMotion:
             return
         R = self._vertical.turn
         self.T_level_odom = se3.make(R, T[:3, 3] - R @ T[:3, 3])
-        if (angle := _angle(R)) > _SLOPE:  # right for a LiDAR that hangs where /tf_static does not say so
+        if (angle := _angle(R)) > _SLOPE:  # correct only for an upside-down LiDAR that /tf_static does not describe
             self.problem = (
                 f"its forces at rest point {np.degrees(angle):.0f} deg away from up, and odom is turned by that: "
                 f"is its orientation or sign right?"
             )
 
     def _join(self, frame: Frame) -> None:
-        """The samples with those of a frame that it does not share with the one before; from anew where time has gone
-        back."""
+        """Append the samples of a frame that the previous one does not have; start anew if time has gone back."""
         old, new = self._samples, frame.imu
         if new is None or not len(new):
             return
@@ -208,29 +207,29 @@ class InertialMotion:
         self._samples = old[keep].then(new)
 
     def _turned(self, stamp: int, before: int) -> Array | None:
-        """As `turning`."""
+        """`turning` for the frame at `stamp`, since the stamp `before`."""
         s, parts = self._samples, np.append((np.arange(_PARTS) + 0.5) / _PARTS, 1.0)
         return turned((s.stamps - before) * 1e-9, s.rates - self._bias, parts * (stamp - before) * 1e-9)
 
     def denied(self, scans: Array, seconds: float) -> bool:
-        """Whether scans that show a turn (3, 3) in the `seconds` since the last registered frame deny the measured one.
+        """Whether scans with a rotation (3, 3) in the `seconds` since the last registered frame contradict the IMU's.
 
-        A drive's first map is of scans that were straightened by it before any has confirmed it.
+        The scans of a drive's first map are de-skewed by the IMU before any scan has confirmed it.
         """
         return self.turn is not None and self._off(self.turn, scans, seconds) > _UNSEEN
 
     def _judge(self, measured: Array, scans: Array, seconds: float) -> None:
-        """Compare two turns (3, 3)."""
+        """Compare a measured rotation (3, 3) with that of the scans."""
         if max(_angle(measured), _angle(scans)) >= _TURNING * seconds:
             self._doubt.add(self._off(measured, scans, seconds))
 
     def _off(self, measured: Array, scans: Array, seconds: float) -> float:
-        """Squared sigmas between two turns (3, 3)."""
+        """Squared sigmas between two rotations (3, 3)."""
         variance = (3 * _TURN) ** 2 + (0.05 * _angle(measured)) ** 2 + self._variance * seconds**2
         return _angle(measured.T @ scans) ** 2 / variance
 
     def _correct(self, R: Array) -> None:
-        """The bias, by what the scans say of the last second or more; the last of them has the axes R (3, 3)."""
+        """Correct the bias by the scans of the last second or more; the last scan has the axes R (3, 3)."""
         span, self._span = self._span, _Span(R)
         if not self._doubt.is_credible:
             return
@@ -241,7 +240,7 @@ class InertialMotion:
         self._variance *= 1 - gain
 
     def _forces(self, before: int, stamp: int) -> tuple[Array, Array]:
-        """Times (N,) s since the first of two stamps, and forces (N, 3) there along the axes at the first; none where
+        """Times (N,), s since the stamp `before`, and forces (N, 3) up to `stamp` in the axes at `before`; none if
         they are not known."""
         s = self._samples
         s = s[(s.stamps > before) & (s.stamps <= stamp) & np.isfinite(s.forces).all(1)]
@@ -252,7 +251,7 @@ class InertialMotion:
         return at, np.einsum("nij,nj->ni", R, s.forces)
 
     def _level_frame(self, T_before: Array, T: Array, seconds: float) -> None:
-        """Turn the level frame a little about the LiDAR's position, so that no pose jumps."""
+        """Rotate the level frame by a small angle about the LiDAR's position, so that no pose jumps."""
         wanted = self._vertical.turn @ self.T_level_odom[:3, :3].T
         angle = _angle(wanted)
         if angle < 1e-9:
@@ -265,7 +264,7 @@ class InertialMotion:
 
 
 class _Span:
-    """What the gyroscope says since axes R_start (3, 3) of the odometry's frame."""
+    """The gyroscope's rotation since the axes R_start (3, 3) in the odometry frame."""
 
     def __init__(self, R_start: Array) -> None:
         self.R_start, self.R_start_now, self.seconds, self.angle = R_start, np.eye(3), 0.0, 0.0
@@ -285,9 +284,9 @@ def _angle(R: Array) -> float:
 def _at_rest(rates: Array, forces: Array) -> bool:
     noise, mean, shaking = _STEADY
     still = rates.std(0).max() < noise and np.abs(rates.mean(0)).max() < mean
-    return bool(still and metric(forces).std(0).max() < shaking)  # False where they are unknown
+    return bool(still and metric(forces).std(0).max() < shaking)  # False for unknown forces
 
 
 def _integral(values: Array, at: Array) -> Array:
-    """(3,) of (N, 3) values at (N,) s, by trapezoids: `np.trapezoid`, which numpy before 2.0 does not have."""
+    """(3,) integral of (N, 3) values at (N,) s by trapezoids: `np.trapezoid`, which numpy has only since 2.0."""
     return np.asarray((np.diff(at)[:, None] * (values[1:] + values[:-1]) / 2.0).sum(0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the LiDAR moves, by the scans that were registered, an IMU and another odometry; and where it is next."""
+"""Motion of the LiDAR by the registered scans, an IMU and another odometry, and the prediction of its next pose."""
 
 from __future__ import annotations
 
@@ -19,32 +19,34 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.registration.swept import Beginning, Swept, begun_steadily
 
 _GYROSCOPE = np.radians(0.4)
-"""Standard deviation of a measured turn beside the points, rad: where they know the heading they keep it. At 0.1 deg,
-that of sound ones, the map took over a bias, a scale or a delay turn by turn: 7 deg in 5 s by a bias of 3 deg/s."""
+"""Standard deviation of a measured rotation next to the points, rad; points that determine the heading outweigh it. At
+0.1 deg, the accuracy of a good gyroscope, the map took over its bias, scale error or delay with each rotation: 7 deg in
+5 s by a bias of 3 deg/s."""
 ANY_VELOCITY = 15.0**2 * np.eye(3)
 """Covariance (3, 3) of the velocity, m/s, until two scans are registered."""
 
-_ACCELERATION = 40.0  # m/s2 off the predicted motion, beside 0.5 m: more is no vehicle's
-_RIDE = 3.0  # s: no lift comes to another storey sooner, and a crowd or a narrow place is passed
-_UP, _ASIDE = 30.0, 2.0  # m, standard deviations of the way that what encloses the LiDAR may have moved along
+_ACCELERATION = 40.0  # m/s2 off the predicted motion, in addition to 0.5 m: no vehicle accelerates more
+_RIDE = 3.0  # s: no lift reaches another storey sooner, and in less time a crowd or a narrow place is passed
+_UP, _ASIDE = 30.0, 2.0  # m, standard deviations of the distance that an enclosure may have moved the LiDAR
 
 
 class MotionState:
     """Pose and motion; poses are of the LiDAR in the odometry frame, at the middle of a sweep.
 
     Attributes:
-        settings: of what a vehicle can do.
+        settings: limits of a vehicle's motion.
         T, covariance: the last frame's pose (4, 4), registered or predicted, and its covariance (6, 6) [rad, m].
         T_start: (4, 4) the pose of the first frame, level by its `Frame.up`.
-        twist: (6,) [rad/s, m/s] in the middle of the sweep of the last registered frame, or else from the one before to
-            it; None until there are two.
-        sweep: the motion during the sweep of the last registered frame, where its points have shown it.
-        change: (6,) of the twist, from one registered frame to the next.
+        twist: (6,) [rad/s, m/s] in the middle of the sweep of the last registered frame, or else the average from the
+            registered frame before to it; None until there are two.
+        sweep: the motion during the sweep of the last registered frame, if its points have shown it.
+        change: (6,) change of the twist from one registered frame to the next.
         of_velocity: covariance (3, 3) of the twist's velocity, m/s.
-        left_open: covariance (3, 3), m, of the last step along what the scene leaves open; zeros if that is nothing.
-        T_registered, seconds: the last registered pose (4, 4), and the time from then to the last frame.
-        inertial: the IMU, since a frame came with samples. reckoned: the way to the frame that is looked at, if it
-            knows that. other: another odometry, since a frame came with a guess.
+        left_open: covariance (3, 3), m, of the last step in the directions that the scene does not constrain; else
+            zero.
+        T_registered, seconds: the last registered pose (4, 4), and the time from it to the last frame.
+        inertial: the IMU, once a frame had samples. reckoned: the motion to the current frame by the IMU, if it is
+            known. other: another odometry, once a frame had a guess.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
@@ -59,21 +61,21 @@ class MotionState:
         self.inertial: InertialMotion | None = None
         self.reckoned: Reckoned | None = None
         self._open_way: OpenWay | None = None
-        self._speed_shown = True  # along what the scene leaves open, when the IMU began to tell the way there
+        self._speed_shown = True  # in unconstrained directions, when the IMU began to estimate the motion there
         self.other: OtherMotion | None = None
-        self._open = 0.0  # s, for which the scene has left a direction open
+        self._open = 0.0  # s, for which the scene has not constrained a direction
         self._started = False
-        self._enclosed: float | None = None  # s, since when all that is seen is near
+        self._enclosed: float | None = None  # s, time since which all returns are near
 
     def start(self, up: Up | None) -> None:
-        """Of the first frame: its pose has `up` (3,), of `Frame`, upwards. Later ones change nothing."""
+        """Set the pose of the first frame: `up` (3,), of `Frame`, points up. Later calls have no effect."""
         if not self._started and up is not None:
             self.T = self.T_registered = self.T_start = se3.make(leveled(up), np.zeros(3))
         self._started = True
 
     def look(self, frame: Frame, starts: bool) -> Frame:
-        """Take in what an IMU says of a new frame, and return that as `InertialMotion.look`; `starts`: the drive begins
-        with it."""
+        """Process the IMU samples of a new frame, and return it as `InertialMotion.look` does; `starts`: the drive
+        begins with it."""
         if frame.imu is not None and self.inertial is None:
             self.inertial = InertialMotion(starts)
         self.reckoned = None
@@ -86,7 +88,7 @@ class MotionState:
         return frame
 
     def begin(self, T: Array) -> None:
-        """A map begins with a frame at T (4, 4), to which no motion has led, and which is registered next."""
+        """A new map begins with a frame at T (4, 4), reached by an unknown motion and registered next."""
         self.T, self.twist, self.of_velocity, self._speed_shown = T, None, ANY_VELOCITY, False
 
     @property
@@ -96,8 +98,8 @@ class MotionState:
 
     @property
     def ahead(self) -> Array:
-        """The twist (6,) that leads to the next frame; zeros while it is unknown. If the acceleration lasted, it would
-        change twice as much."""
+        """The twist (6,) that predicts the next frame; zeros while it is unknown. At constant acceleration the twist
+        would change twice as much."""
         return self.known_twist if self.sweep is None else self.known_twist + self.sweep.half / 2 * self.sweep.motion[1]
 
     @property
@@ -107,71 +109,72 @@ class MotionState:
 
     @property
     def turn(self) -> Array | None:
-        """R_before_now (3, 3) since the last registered frame, as an IMU has measured it."""
+        """R_before_now (3, 3) since the last registered frame, measured by an IMU."""
         return None if self.inertial is None else self.inertial.turn
 
     @property
     def turning(self) -> Array | None:
-        """The same on the way there: see `InertialMotion`."""
+        """Rotations in the parts of that time: see `InertialMotion`."""
         return None if self.inertial is None else self.inertial.turning
 
     def _of_turn(self, seconds: float) -> Array | None:
-        """Covariance (3, 3) rad2 of `turn` over that time."""
+        """Covariance (3, 3) rad2 of `turn` over `seconds`."""
         return None if self.inertial is None else self.inertial.covariance(seconds)
 
     @property
     def step(self) -> Step | None:
-        """The way since the last registered frame, as another odometry or else an IMU knows it."""
+        """The motion since the last registered frame by another odometry, or else by an IMU."""
         step = None if self.other is None else self.other.step
         return self.reckoned if step is None else step
 
     def turned(self, twist: Array, seconds: float) -> Array:
-        """A twist (6,) with the turn since the last registered frame as it was measured, where it was."""
+        """A twist (6,) with the measured rotation since the last registered frame, if it was measured."""
         if self.turn is None:
             return twist
         return np.concatenate([se3.rotation_vector(self.turn) / seconds, twist[3:]])
 
     def predicted(self, twist: Array, dt: float) -> Array:
-        """Pose (4, 4) of a frame, `dt` s after the one before; where an IMU knows the way, that has led there."""
+        """Pose (4, 4) of a frame, `dt` s after the previous one, by the IMU's dead reckoning if available."""
         return self.steadily(twist, dt) if self.reckoned is None else self.T_registered @ self.reckoned.T
 
     def steadily(self, twist: Array, dt: float) -> Array:
-        """The same at a constant velocity; from the last registered frame where an IMU has measured how the LiDAR
-        turned since then."""
+        """Pose (4, 4) at a constant velocity; from the last registered frame if an IMU has measured the rotation since
+        then."""
         if self.turning is None:
             return predicted(self.T, twist, dt)
         return predicted(self.T_registered, twist, self.seconds + dt, self.turning)
 
     def of_prediction(self, seconds: float) -> Array:
-        """Covariance (6, 6) [rad, m] of a pose that is predicted from one that was registered so long before."""
+        """Covariance (6, 6) [rad, m] of a pose that is predicted from one registered `seconds` before."""
         result = spread(self.settings.steadiness * seconds * seconds, seconds, self.of_velocity)
         if (of_turn := self._of_turn(seconds)) is not None:
             result[:3, :3] = of_turn
         return result
 
     def information(self, seconds: float) -> Array:
-        """Information (6, 6) of a pose that is predicted from one that was registered so long before."""
+        """Information (6, 6) of a pose that is predicted from one registered `seconds` before."""
         covariance = self.of_prediction(seconds)
         if self.turn is not None:
             covariance[:3, :3] += _GYROSCOPE**2 * np.eye(3)
         return np.linalg.inv(covariance).astype(np.float64)
 
     def beginning(self, T: Array, seconds: float, half: float) -> Beginning:
-        """Of the sweep of a frame at T (4, 4), `seconds` after the last registered one; it began `half` s before."""
+        """Start of the sweep of a frame at T (4, 4), `seconds` after the last registered one; it began `half` s
+        before."""
         if self.sweep is not None:
             return self.sweep.next(seconds, half, self.settings.steadiness)
         before, steadiness = self.T_registered, self.settings.steadiness
         return begun_steadily(before, se3.way(before, T) / seconds, seconds, half, steadiness)
 
     def unknown(self, dt: float) -> Array:
-        """Covariance (6, 6) of a frame's pose, `dt` s after the one before, that is only predicted."""
+        """Covariance (6, 6) of a frame's pose, `dt` s after the previous one, that is only predicted."""
         speed, swing = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
         seconds = self.seconds + dt
-        # A turn that has changed may change again.
+        # A rotation rate that has changed may change again.
         return covariance(speed, seconds, self.settings.steadiness, self.of_velocity, swing, self._of_turn(seconds))
 
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
-        """Reject what no vehicle can do; the allowance grows while nothing has been registered."""
+        """Reject a motion that no vehicle can make; the allowance grows while nothing is registered."""
         time = self.seconds + dt
         meters, degrees = se3.apart(T_predicted, result.T_target_source)
         unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
@@ -184,11 +187,11 @@ class MotionState:
     def advance(
         self, registration: Registration, dt: float, stamp: int | None, led: bool, swept: Swept | None = None
     ) -> None:
-        """A frame was registered, `dt` s after the one before: go on from its pose, by the motion that led there.
+        """Continue from the pose of a frame that was registered `dt` s after the previous one, by its motion.
 
         Args:
-            registration: that of a map's first frame tells no motion. led: another odometry led to it.
-            swept: the motion during its sweep, where that is known.
+            registration: for the first frame of a map it shows no motion. led: started from another odometry.
+            swept: the motion during its sweep, if known.
         """
         seconds, moved = self.seconds + dt, registration.method != "first"
         by_imu = False
@@ -204,9 +207,10 @@ class MotionState:
             self.covariance[3:, 3:] += whole
 
     def _left_open(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
-        """Covariances (3, 3), m, of the way along what the scene leaves open, since it does and in the last `seconds`.
+        """Covariances (3, 3), m, of the motion in unconstrained directions: since they are so, and in the last
+        `seconds`.
 
-        What a scan leaves open ends at 1 m; the motion does not, and each pose follows from the one before.
+        The covariance of a scan is limited to 1 m there; that of the motion is not, as each pose follows from the last.
         """
         of_velocity, way = along_open(of_scene, self.of_velocity), self._open_way
         whole, step = of_velocity * self._open**2, of_velocity * seconds**2
@@ -218,11 +222,11 @@ class MotionState:
     def _along_open(
         self, registration: Registration, swept: Swept | None, seconds: float, led: bool
     ) -> tuple[Registration, Swept | None, bool]:
-        """A registration and the motion during its sweep; and whether an IMU has led them, which it does along what the
-        scene leaves open where it contradicts the scan."""
+        """A registration and the motion during its sweep, and whether an IMU has corrected them. It does so in the
+        directions that the scene does not constrain, if it contradicts the scan there."""
         shown = led or registration.worst_sigma < OPEN
         if shown or self.reckoned is None:
-            # Of an IMU that falls silent and speaks again: scans alone, which may be wrong, say how fast it is by then.
+            # If an IMU stops and starts again, only scans, which may be wrong, have shown the speed by then.
             self._open_way, self._speed_shown = None, shown or (self._speed_shown and self.twist is None)
             return registration, swept, False
         if self._open_way is None:
@@ -239,13 +243,13 @@ class MotionState:
         return replace(registration, T_target_source=T), swept, True
 
     def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
-        """The motion from the last registered frame to one `seconds` later."""
+        """Update the motion from the last registered frame to the one `seconds` later."""
         step = self.other.step if led and self.other is not None else None
         of_prediction = self.of_prediction(seconds) if step is None else step.covariance
         of_scene = turned_open(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
         of_motion = combined(of_scene, of_prediction[3:, 3:])
         self.of_velocity = of_motion / seconds**2
-        # Not from the predicted pose of the frame before, of which an error would count as motion in one period.
+        # Not from the predicted pose of the previous frame: its error would count as motion in one period.
         T_step = se3.inverse(self.T_registered) @ registration.T_target_source
         twist = se3.log(T_step) / seconds if swept is None else swept.motion[0]
         self.change = np.zeros(6) if self.twist is None else twist - self.twist
@@ -254,21 +258,21 @@ class MotionState:
             self.other.compare(T_step, registration.of_scene, seconds, led)
 
     def opens(self, enclosed: bool, now: float) -> bool:
-        """Whether a registered frame, at `now` s, is the first outside of what may have moved along: as a lift does."""
+        """Whether a registered frame, at `now` s, is the first outside of an enclosure that may have moved (a lift)."""
         since = self._enclosed
         self._enclosed = None if not enclosed else now if since is None else since
         return not enclosed and since is not None and now - since >= _RIDE
 
     def carry(self) -> None:
-        """It may have moved along with what enclosed it: how far is not known."""
+        """Add the unknown motion with an enclosure, such as a lift, to the covariance."""
         R = self.T[:3, :3]
         along = np.zeros((6, 6))
         along[3:, 3:] = R.T @ np.diag([_ASIDE, _ASIDE, _UP]) ** 2 @ R
         self.covariance = self.covariance + along
 
     def register(self, registration: Registration, stamp: int | None, moved: bool, by_imu: bool = False) -> None:
-        """Go on from a registered pose; `moved`: the twist led there, else nothing is known of the way; `by_imu`: it
-        is that of an IMU along what the scene leaves open."""
+        """Continue from a registered pose. `moved`: the twist led there, else the motion is unknown. `by_imu`: the
+        twist is that of an IMU in the directions that the scene does not constrain."""
         T_before, self.T = self.T_registered, registration.T_target_source
         if not moved:
             self._open_way = None
@@ -280,7 +284,7 @@ class MotionState:
         self.covariance = registration.covariance.copy()
 
     def coast(self, dt: float) -> None:
-        """A frame was not registered, `dt` s after the one before: follow the prediction, ever less certain."""
+        """Follow the prediction for a frame, `dt` s after the previous one, that was not registered; sigma grows."""
         self.covariance = self.unknown(dt)
         self.seconds += dt
         if (step := self.step) is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scan by scan: predict, register, gate, update. The state says how far the result can be trusted."""
+"""Odometry, scan by scan: predict, register, gate, update. The state shows how far the result can be trusted."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, f
 
 _ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
 _CARRIED = "broken by what enclosed the LiDAR: it may have moved along, as a lift does"
-_KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed: where the points find it alone
+_KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed; the points find the pose from within it
 _LOST = 5  # frames without a registration, after which the state is `lost`, `degraded` before
 _TRIES = 10  # frames after a pause that are registered to the map before it, before the odometry counts as broken
-_BURST = 0.6  # of the usual period: while no motion is known, a frame that comes sooner was held back
+_BURST = 0.6  # of the usual period: while no motion is known, a frame that arrives sooner was delayed
 
 
 @dataclass(frozen=True, eq=False)
 class Tools:
-    """What an odometry works with; the registration remembers nothing: each odometry has one like it."""
+    """Parts of an odometry. The registration itself has no state: each odometry makes a fresh one like it."""
 
     settings: OdometrySettings
     registration: ScanRegistration
@@ -44,7 +44,7 @@ class Tools:
 
 
 class Odometry:
-    """The pose of the LiDAR in the odometry frame, which is that of the first usable scan, level by its `Frame.up`."""
+    """Estimates the pose of the LiDAR in the odometry frame: that of the first usable scan, level by its `Frame.up`."""
 
     def __init__(self, tools: Tools, robot: str = "") -> None:
         """`robot`: namespace of its keyframes."""
@@ -54,17 +54,17 @@ class Odometry:
 
     @property
     def scale(self) -> str:
-        """What the tools are for, where that follows the scans: see `ScaledOdometry`."""
+        """Scene type of the tools, if it follows the scans: see `ScaledOdometry`."""
         return ""
 
     @property
     def T_start(self) -> Array:
-        """(4, 4) the pose with which it began, without what an IMU says of the vertical: level by `Frame.up`."""
+        """(4, 4) the initial pose, without the vertical measured by an IMU: level by `Frame.up`."""
         return self._motion.T_start
 
     @property
     def uses_images(self) -> bool:
-        """Whether frames should come with their images."""
+        """Whether frames should have their images."""
         return self._registration.uses_images
 
     @property
@@ -72,28 +72,28 @@ class Odometry:
         return ScanMatcher(self._settings, self._registration, self._motion, self._bridge)
 
     def request_keyframe(self) -> None:
-        """Make a keyframe of the next registered scan, however short the way."""
+        """Make a keyframe of the next registered scan, however short the distance."""
         self._keyframes.request()
 
     def reset(self) -> None:
-        """Forget everything; the next scan is the first."""
+        """Reset the state; the next scan is the first."""
         self._motion = MotionState(self._settings)
         self._clock, self._sweep, self._failures = StreamClock(), Sweep(), 0
         self._repeated, self._part, self._images = RepeatedCloud(), RepeatedPart(), RepeatedImages()
-        self._first: Frame | None = None  # until the second one is registered
+        self._first: Frame | None = None  # kept until the second scan is registered
         self._first_sweep = Sweep()
         self._bridge: Bridge | None = None
-        self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether a loop may cross it
+        self._breaks: list[tuple[int, bool]] = []  # id of the first keyframe after each; whether loops may cross it
         self._registration = self._tools.registration.fresh()
         self._keyframes.reset()
 
     def _use(self, tools: Tools) -> None:
-        """Work with these from now on; registration and motion follow, by `reset` or `_go_on_with`."""
+        """Use these tools from now on; registration and motion follow in `reset` or `_go_on_with`."""
         self._tools, self._settings = tools, tools.settings
         self._keyframes.use(tools.keyframes)
 
     def _go_on_with(self, tools: Tools, frame: Frame) -> None:
-        """After a frame that was registered: with its pose and motion, and a map of that scan alone."""
+        """Continue with other tools after a registered frame: same pose and motion, and a map of that scan only."""
         self._use(tools)
         self._motion.settings = self._settings
         self._failures, self._first, self._bridge = 0, None, None
@@ -103,7 +103,7 @@ class Odometry:
 
     @property
     def next_keyframe(self) -> int:
-        """Id that the next keyframe will have."""
+        """Id of the next keyframe."""
         return self._keyframes.next_id
 
     def between(self, last: OdometryResult, frame: Frame) -> OdometryResult:
@@ -111,13 +111,13 @@ class Odometry:
         return self._motion.between(last, frame)
 
     def cross_breaks(self, found: int, since: int | None = None) -> None:
-        """A map has shown where the keyframe of that id is: the way across the breaks before it is known; or a loop,
-        where it is from the one of id `since`: across those between, but for lifts, as storeys look alike."""
+        """The motion across the breaks before keyframe `found` is known: a map has given its pose. With `since`: a loop
+        to that keyframe has; then it is known across the breaks between them but lifts, as storeys look alike."""
         crossed = [id <= found and (since is None or (since < id and loops)) for id, loops in self._breaks]
         self._breaks = [one for one, known in zip(self._breaks, crossed, strict=True) if not known]
 
     def process(self, frame: Frame) -> OdometryResult:
-        """Pose of one frame; never raises for what a sensor may deliver, and always gives a finite pose."""
+        """Pose of one frame; never raises for data that a sensor may deliver, and always returns a finite pose."""
         clock, motion = [perf_counter()], self._motion
         motion.start(frame.up)
         given = self._part.new(frame)
@@ -173,12 +173,12 @@ class Odometry:
         )
 
     def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:
-        """A frame, prepared by a twist (6,), in the map; it, without an IMU that was of no use; and the period, s."""
+        """Register a frame, prepared by a twist (6,): the frame, without an unusable IMU, its match, the period, s."""
         pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt, frame.stepped) if pauses else self._motion.predicted(twist, dt)
         match, dt = self._register(frame, scan, T_predicted, dt)
         self._clock.correct(dt)
-        if match.scan is not scan:  # the IMU was of no use: nor is it on the way to the stamp
+        if match.scan is not scan:  # the IMU was unusable: do not use it for the motion to the stamp either
             frame, self._motion.reckoned = replace(frame, imu=None), None
         motion, imu = self._motion, self._motion.inertial
         if self._first is not None and imu is not None and match.result.ok:
@@ -194,8 +194,8 @@ class Odometry:
         return frame, match, dt
 
     def _look(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
-        """What an IMU and another odometry say of a frame, `seconds` after the last registered one: the frame with what
-        is of use, and the twist (6,) that leads to it."""
+        """Process IMU and other odometry of a frame, `seconds` after the last registered one: returns the frame with
+        its usable data, and the twist (6,) that predicts its pose."""
         motion = self._motion
         frame = motion.look(frame, starts=not len(self._registration) and self._bridge is None)
         twist = motion.turned(motion.ahead, seconds)
@@ -208,35 +208,35 @@ class Odometry:
         return frame, twist
 
     def _forget_first(self, dt: float) -> None:
-        """The first scan shows a part of the scene, as drivers begin in mid-sweep: the next one is the first."""
+        """The first scan shows only a part of the scene, as drivers start in mid-sweep: the next one is the first."""
         self._first = None
         self._registration = self._registration.fresh()
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
 
     def _without_repetitions(self, frame: Frame, speed: float) -> Frame:
-        """Without what the LiDAR or a camera has sent before; `speed`: m/s, by the motion so far."""
+        """The frame without data that LiDAR or camera repeat; `speed`: m/s, by the motion so far."""
         imu = self._motion.inertial
         turn = imu.turn if imu is not None and imu.turns else None
         if self._repeated.repeats(frame, speed, turn) and frame.problem is None:
             frame = replace(frame, problem=REPEATED)
         if imu is not None and frame.problem is not None:
-            imu.turns = False  # what shows no turn does not speak against it
+            imu.turns = False  # a frame without a valid scan does not contradict the rotation
         images = self._images.new(frame)
         return frame if len(images) == len(frame.images) else replace(frame, images=images)
 
     def _pauses(self, frame: Frame, dt: float) -> bool:
-        """Whether so much time has passed since the last registered scan that this one alone is not accepted.
+        """Whether the last registered scan is so old that a single scan is not accepted.
 
-        Where scans were left out for want of time, the stream is a slow one: what a pause asks for takes more time yet.
+        If scans were dropped for lack of time, the stream is slow, and the work after a pause would slow it further.
         """
         least = SLOWEST if frame.dropped else self._settings.pause
         known = len(self._registration) > 0 and frame.problem is None
         return known and (self._clock.went_back or self._motion.seconds + dt > self._clock.pause(least))
 
     def _begin_stretch(self, dt: float, stepped: bool) -> Array:
-        """After a pause: the scan begins a map of its own, at the predicted pose (4, 4), which it returns; `stepped` if
-        the pause may be of the clock alone."""
+        """After a pause: the scan starts its own map at the predicted pose (4, 4), which is returned; `stepped` if the
+        pause may be only a step of the clock."""
         motion, imu, reckoned, step = self._motion, None, None, self._motion.step
         if self._bridge is None:
             imu, reckoned, step = motion.inertial, motion.reckoned, None if motion.other is None else motion.other.step
@@ -249,7 +249,7 @@ class Odometry:
         return motion.T
 
     def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
-        """A scan of the stretch after a pause, in the map before it if that is certain; after long enough, a break."""
+        """Register a scan after a pause to the map before it; accept if it is confirmed; after enough tries, break."""
         motion = self._motion
         result, certain = bridge.register(scan, motion.T, motion.twist, own)
         if certain:
@@ -267,7 +267,7 @@ class Odometry:
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 
     def _step_out(self, scan: Scan, registration: Registration) -> Registration:
-        """Out of what enclosed the LiDAR: a break, and a map of what is seen there begins."""
+        """The LiDAR leaves what enclosed it: a break, and a new map of what is seen outside."""
         self._motion.carry()
         self._break(loops=False)
         self._keyframes.request()
@@ -276,13 +276,13 @@ class Odometry:
         return registration.because(_CARRIED)
 
     def _break(self, loops: bool) -> None:
-        """The way from the keyframes so far to those that follow is known no better than the pose is now."""
+        """The motion from the keyframes so far to the next ones is known no better than the current pose."""
         self._keyframes.add_uncertainty(self._motion.covariance)
         self._breaks.append((self.next_keyframe, loops))
 
     def _register(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> tuple[Match, float]:
-        """A prepared frame, predicted at T_predicted (4, 4), in the map; and how long the period was, s: as stamped or,
-        where that is in doubt, as the points say."""
+        """Register a prepared frame, predicted at T_predicted (4, 4); returns its match and the period, s: as stamped,
+        or if that is doubtful, as the points show."""
         motion = self._motion
         match = self._matcher.match(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
@@ -304,18 +304,18 @@ class Odometry:
         return match, dt
 
     def _unbent(self, frame: Frame, match: Match, twist: Array, dt: float) -> Match:
-        """Of a scan that was prepared by a motion (6,) other than the one found since, `dt` s after the frame before:
-        prepared and registered anew; the first scan of a map with it."""
+        """Prepare and register a scan anew if its points show another motion than the one (6,) that it was prepared by;
+        `dt`: s since the previous frame. Also prepare the first scan of a map anew."""
         if self._first is None:
             return self._matcher.straightened(frame, match, twist, dt, self._sweep.span / 2)
         return self._begin_again(self._first, frame, match, self._motion.seconds + dt) if match.result.ok else match
 
     def _begin_again(self, first: Frame, frame: Frame, match: Match, seconds: float) -> Match:
-        """The second scan has shown the velocity, `seconds` later: undo the motion in the first too; register anew."""
+        """The second scan shows the velocity, `seconds` later: undo the motion in the first scan too; register anew."""
         self._first, motion = None, self._motion
         T_first_this = se3.inverse(motion.T) @ match.result.T_target_source
         twist = se3.log(T_first_this) / seconds
-        # The first pose was handed out at its stamp.
+        # The first pose was returned for its stamp.
         motion.T = motion.T_registered = motion.T @ se3.exp(self._first_sweep.middle * twist)
         self._registration = self._registration.fresh()
         self._registration.update(self._registration.prepare(first, twist), motion.T)
@@ -324,7 +324,7 @@ class Odometry:
         return match._replace(scan=scan, result=self._registration.register(scan, known))
 
     def _update(self, match: Match, dt: float) -> None:
-        """Move on: to the registered pose, or to the predicted one with the uncertainty that it deserves."""
+        """Advance to the registered pose, or to the predicted one with the uncertainty of the prediction."""
         motion, result = self._motion, match.result
         if not result.ok:
             if len(self._registration):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way along what scans leave open, where an IMU knows it: while the two agree scans are believed, else the IMU.
+"""Motion in directions that scans do not constrain, with an IMU: while both agree the scans are used, else the IMU.
 
-Not all is open that a covariance calls so: the little that stands beside a road shows the way all the same, to some
-centimeters. Along a smooth tunnel a scan fits best where the map is as dense as it is, which is where the robot was:
-within a second that contradicts the accelerations.
+Not every direction with a large covariance is unconstrained: a few objects next to a road determine the motion all the
+same, to some centimeters. Along a smooth tunnel a scan fits best where the map has the same density, at the previous
+position: within a second that contradicts the accelerations.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import numpy as np
 from dpm2_core.frame import Array
 from dpm2_core.slam.odometry.inertial import Reckoned
 
-_SCANS, _SPEED = 0.1, 0.1  # m and m/s, standard deviations of the way by scans, and of the speed that they have shown
+_SCANS, _SPEED = 0.1, 0.1  # m and m/s, standard deviations of the distance by scans, and of the speed that they show
 _SPAN = 1.0  # s over which the two are compared
-_GAIN = 0.5  # of what the speed is corrected then
+_GAIN = 0.5  # fraction of the difference by which the speed is then corrected
 _CONTRADICTS = 3.0  # standard deviations
 
 
 class OpenWay:
-    """From a registered frame on, by an IMU alone, with the velocity that scans show second by second.
+    """Position by an IMU alone from a registered frame on, with the velocity that scans show second by second.
 
     Attributes:
         velocity: (3,) m/s in the odometry's frame.
-        leads: whether scans have contradicted it, from then on.
-        sigma: m, that of the way from where it began. gained: what the last frame added.
+        leads: whether scans have contradicted it; from then on it is used.
+        sigma: m, of the distance from the start. gained: increase by the last frame.
     """
 
     def __init__(self, T: Array, velocity: Array) -> None:
-        """At T (4, 4), at a `velocity` (3,) m/s along its axes."""
+        """Start at T (4, 4), with a `velocity` (3,) m/s in its axes."""
         self.velocity, self.leads = T[:3, :3] @ velocity, False
         self.sigma = self.gained = self._sigma_before = 0.0
         self._position, self._seconds = T[:3, 3], 0.0
 
     def follow(self, T_before: Array, T: Array, along: Array, step: Reckoned, seconds: float) -> Array:
-        """How far (3,) m a registered frame is from here, along what it leaves open and the axes of the odometry.
+        """Offset (3,) m from a registered frame to this position in unconstrained directions, in the odometry's axes.
 
         Args:
-            T: (4, 4) of the frame; T_before: of the last one, `seconds` before it. step: the way between by the IMU.
-            along: (3, 3) onto what is open, along the axes of T.
+            T: (4, 4) of the frame; T_before: of the last one, `seconds` before it. step: the motion between by the IMU.
+            along: (3, 3) projection onto the unconstrained directions, in the axes of T.
         """
         R, left = T_before[:3, :3], T[:3, :3] @ along @ T[:3, :3].T
         self._position = self._position + self.velocity * seconds + R @ step.gained[0]
@@ -51,7 +51,7 @@ class OpenWay:
         t = self._seconds
         allowed = _CONTRADICTS * float(np.linalg.norm([_SCANS, _SPEED * t, 0.5 * step.sigma * t**2]))
         self.leads |= float(np.linalg.norm(off)) > allowed
-        # So far off it may be before the two contradict each other, each time to the same side.
+        # Before the two contradict each other the error may be this large, each time in the same direction.
         self.gained = max(0.0, self._sigma_before + allowed - self.sigma)
         self.sigma += self.gained
         if not self.leads and t >= _SPAN:

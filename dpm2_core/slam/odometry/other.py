@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Another odometry, such as that of wheels, beside ours: what it says of the way, and how far it is believed.
+"""Another odometry, such as wheel odometry, as a prior for ours: its motion, and how far that is trusted.
 
-Only its steps count, from the last registered frame to this one, so that its drift does no harm. A step that the motion
-before makes impossible (a jump, a restart) is not used, nor are those after it until a frame is registered; nor is one
-that the scan contradicts. Those that are far off again and again make all that follow doubtful, until they are right
-for a while. Where the scene leaves a direction open, as in a tunnel, nothing contradicts it: it decides.
+Only its steps count, from the last registered frame to the current one, so that its drift does no harm. A step that is
+impossible after the previous motion (a jump, a restart) is not used, nor are the next ones until a frame is registered;
+nor is a step that the scan contradicts. If steps are far off repeatedly, all later steps are rejected until they have
+been right for a while. Where the scene leaves a direction unconstrained, as in a tunnel, nothing contradicts the other
+odometry: it decides.
 """
 
 from __future__ import annotations
@@ -19,42 +20,42 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.motion import predicted
 from dpm2_core.slam.registration.protocol import MAP_NOISE
 
-# Standard deviations of a step: of a robot that stands, and for each m (or rad) of the way. Points outweigh so much.
+# Standard deviations of a step: at rest, and per m (or rad) of motion. They are so large that points outweigh them.
 _STANDING = np.array([0.5 * np.pi / 180, 0.05])
 _SHARE = 0.05
-_POSSIBLE = 9.0  # squared sigmas from the scan, or from the motion before, of which one is hard braking already
-_JUDGED = (0.5, 1.0)  # m or s: a shorter way of a slow robot is within what a step may be off, whatever is wrong
-_MEMORY = 0.1  # fraction of the newest way in how far the steps are doubted
-_USUAL = 3.0  # squared sigmas that a measurement may be off; more makes the sensor doubtful,
-_WORST = 25.0  # up to so many times that: a single jump is forgiven
-_CREDIBLE = 4.0  # doubt up to which it is used
+_POSSIBLE = 9.0  # squared sigmas from the scan, or from the previous motion; hard braking already takes one
+_JUDGED = (0.5, 1.0)  # m or s: over less, any error of a slow robot is within the assumed error of a step
+_MEMORY = 0.1  # weight of the newest motion in the doubt
+_USUAL = 3.0  # squared sigmas of a usual measurement; more makes the sensor doubtful,
+_WORST = 25.0  # up to this multiple of it, so that a single jump is forgiven
+_CREDIBLE = 4.0  # largest doubt at which the sensor is used
 
 
 class Doubt:
-    """How far off a sensor beside the scans has been of late, relative to what is usual; 1 at the start.
+    """The recent errors of an additional sensor, relative to usual errors; 1 at the start.
 
     Attributes:
-        value: weighted mean of the squares.
+        value: weighted mean of the squared errors.
     """
 
     def __init__(self, memory: float, least: float = 0.0) -> None:
-        """`memory`: fraction of the newest measurement in it. `least`: no less, however right the sensor is."""
+        """`memory`: weight of the newest measurement. `least`: lower limit, however accurate the sensor is."""
         self._memory, self._least, self.value = memory, least, 1.0
 
     def add(self, squared: float) -> None:
-        """A measurement was off by so many squared sigmas."""
+        """Add a measurement with this error in squared sigmas."""
         newest = min(squared / _USUAL, _WORST)
         self.value = max(self._least, (1 - self._memory) * self.value + self._memory * newest)
 
     @property
     def is_credible(self) -> bool:
-        """Whether it is used."""
+        """Whether the sensor is used."""
         return self.value <= _CREDIBLE
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """T_before_now (4, 4) since the last registered frame, and its covariance (6, 6) [rad, m] if it does not slip."""
+    """T_before_now (4, 4) since the last registered frame, and its covariance (6, 6) [rad, m] without slip."""
 
     T: Array
     covariance: Array
@@ -62,7 +63,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """Some steps in a row, by both: each T (4, 4), the covariance (6, 6) of that by the scans, and how long it took."""
+    """Consecutive steps by both: each T (4, 4), the covariance (6, 6) of the scans' T, and the duration."""
 
     T_other: Array
     T_scans: Array
@@ -84,11 +85,11 @@ class _Way:
 
 
 class OtherMotion:
-    """The steps of another odometry, judged by what the scans show.
+    """The steps of another odometry, checked against the scans.
 
     Attributes:
-        step: since the last registered frame; None without one, or where it is not used.
-        comparison: of this frame, if there was a step and the frame was registered.
+        step: since the last registered frame; None without one, or if it is not used.
+        comparison: for this frame, if there was a step and the frame was registered.
     """
 
     def __init__(self, steadiness: float) -> None:
@@ -97,21 +98,21 @@ class OtherMotion:
         self.step: Step | None = None
         self.comparison: Comparison | None = None
         self._raw: Array | None = None  # the step, possible or not
-        self._unsure = False  # by its own covariance, and by nothing else
-        self._jumped = False  # since the last registered frame; or it repeats a pose that it cannot have stopped at
+        self._unsure = False  # only by its own covariance
+        self._jumped = False  # since the last registered frame; or it repeats a pose where it cannot have stopped
         self._now: Guess | None = None
         self._last: Guess | None = None  # that of the last registered frame
-        self._before: Guess | None = None  # the last one, and how long that is after `_last`, s, and its motion (6,)
+        self._before: Guess | None = None  # the last one; below: its time after `_last`, s, and its motion (6,)
         self._seconds, self._twist = 0.0, np.zeros(6)
-        self._way: _Way | None = None  # since it was last judged
+        self._way: _Way | None = None  # motion since the last judgement
         self._doubt = Doubt(_MEMORY, least=1.0)
 
     def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
-        """Of a new frame, `seconds` after the last registered one.
+        """Process the guess of a new frame, `seconds` after the last registered one.
 
         Args:
-            twist: (6,) [rad/s, m/s] there; None if it is not known.
-            of_prediction: covariance (6, 6) of the pose that follows from it.
+            twist: (6,) [rad/s, m/s] predicted for it; None if unknown.
+            of_prediction: covariance (6, 6) of the pose predicted by it.
         """
         self._now, self.step, self._raw, self.comparison, self._unsure = guess, None, None, None, False
         if guess is None or self._last is None:
@@ -133,7 +134,8 @@ class OtherMotion:
         self.step = Step(T, covariance)
 
     def _is_unsteady(self, guess: Guess, seconds: float) -> bool:
-        """Whether a guess, `seconds` after the last registered frame, follows the last guess as no vehicle moves."""
+        """Whether a guess, `seconds` after the last registered frame, makes an impossible jump from the previous
+        guess."""
         assert self._before is not None
         before, period = self._before, seconds - self._seconds
         T, T_steady = se3.inverse(before.T_other_lidar) @ guess.T_other_lidar, predicted(np.eye(4), self._twist, period)
@@ -143,13 +145,13 @@ class OtherMotion:
         return se3.squared_sigmas(T_steady, T, covariance) > _POSSIBLE
 
     def agrees(self, T_before: Array, result: Registration) -> bool:
-        """Whether a scan that was registered from the step's end (the last one at T_before (4, 4)) confirms it."""
+        """Whether a scan registered from the end of the step (the last one at T_before (4, 4)) confirms the step."""
         assert self.step is not None
         covariance = result.of_scene + self.step.covariance + MAP_NOISE
         return se3.squared_sigmas(T_before @ self.step.T, result.T_target_source, covariance) <= _POSSIBLE
 
     def compare(self, T_scans: Array, of_scene: Array, seconds: float, used: bool) -> None:
-        """With the step (4, 4) that the scans show, to a covariance (6, 6), since the last registered frame."""
+        """Compare with the step (4, 4) of the scans, covariance (6, 6), since the last registered frame."""
         if self._raw is None:
             self._way = None
             return
@@ -162,7 +164,7 @@ class OtherMotion:
         self.comparison = Comparison(self._raw, T_scans, used, self._doubt.value**0.5, self._unsure)
 
     def keep(self) -> None:
-        """This frame was registered: the next step begins here."""
+        """This frame was registered: the next step starts here."""
         self._last = self._before = self._now
         self._seconds = 0.0
 
@@ -174,8 +176,8 @@ def _spread(T: Array) -> Array:
 
 
 def _grown(before: Guess, now: Guess) -> Array:
-    """By how much the covariance (6, 6) that the odometry itself states has grown, along fixed axes; 0 where it states
-    none, or always the same."""
+    """Increase of the covariance (6, 6) that the odometry itself reports, in fixed axes; 0 if it reports none, or
+    always the same."""
     if before.covariance is None or now.covariance is None:
         return np.zeros((6, 6))
     turn = np.kron(np.eye(2), now.T_other_lidar[:3, :3].T @ before.T_other_lidar[:3, :3])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The odometry for where the robot is: with tools for streets or rooms, by what the scans show (`slam.preset: auto`).
+"""Odometry that selects its tools, for streets or for rooms, by what the scans show (`slam.preset: auto`).
 
-The first scan that shows what it is decides. Later every fifth is looked at, and only several in a row that are clearly
-of the other kind change it. Then the odometry goes on with the other tools from the same pose and motion, with the last
-scan as its map. In fog or dust all that is seen is near, too, but less is seen: that is no room.
+The first scan that shows the scene type decides. Later, every fifth scan is checked, and only several checks in a row
+that are clearly of the other type change the tools. The odometry then continues with the other tools from the same pose
+and motion, with the last scan as its map. In fog or dust all returns are near, too, but they are fewer: not a room.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from dpm2_core.frame import Frame
 from dpm2_core.geometry.scale import ByScale, look
 from dpm2_core.slam.odometry.odometry import Odometry, Tools
 
-_EVERY = 5  # scans: a look takes a tenth of the time of a registration
-_SURE = 4  # looks in a row
+_EVERY = 5  # scans: a check takes a tenth of the time of a registration
+_SURE = 4  # checks in a row
 _CLEAR = 2 / 3
-"""Of the most points that a scan in the open had: a room has more. Measured, 16 and 64 beams: 0.63 to 0.93 of the
-pulses come back in the open, 0.65 to 0.90 in rooms; where one sees no farther than 10 m, 0.12 to 0.55 on roads."""
+"""Of the largest number of points of a scan in the open: a room has more. Measured, with 16 and 64 beams: 0.63 to 0.93
+of the pulses return in the open, 0.65 to 0.90 in rooms; with a visibility of 10 m, 0.12 to 0.55 on roads."""
 
 
 class ScaledOdometry(Odometry):
-    """One that changes its tools."""
+    """An odometry that changes its tools with the scene."""
 
     def __init__(self, choice: ByScale[Tools], robot: str = "") -> None:
         self._choice = choice
@@ -29,20 +29,20 @@ class ScaledOdometry(Odometry):
 
     @property
     def scale(self) -> str:
-        """`outdoor` or `indoor`, by the tools at work; empty before the first scan that decides."""
+        """`outdoor` or `indoor`, the type of the current tools; empty before the first scan that decides."""
         return "" if self._undecided else "indoor" if self._tools is self._choice.indoor else "outdoor"
 
     def reset(self) -> None:
-        """Forget everything; the next scan is the first."""
+        """Reset the state; the next scan is the first."""
         self._use(self._choice.outdoor)
         super().reset()
         self._undecided, self._others, self._scans = True, 0, 0
-        self._begun = False  # a scan has been registered while it was undecided
+        self._begun = False  # whether a scan was registered while undecided
         self._most = 0  # points of a scan in the open
-        self._last = 0  # points that the scan looked at before has shown
+        self._last = 0  # points of the previously checked scan
 
     def process(self, frame: Frame) -> OdometryResult:
-        """As of `Odometry`."""
+        """As `Odometry.process`."""
         self._scans += 1
         if not self._undecided and self._scans % _EVERY:
             return super().process(frame)
@@ -64,7 +64,7 @@ class ScaledOdometry(Odometry):
     def _found(self, frame: Frame) -> bool | None:
         """Whether a scan shows a room, see `is_room`.
 
-        A second LiDAR of half the rate is in every second scan: what it sees counts in the next one, too.
+        A second LiDAR with half the rate contributes only to every second scan: its points count in the next one, too.
         """
         found, points = look(frame.points)
         if found is False:

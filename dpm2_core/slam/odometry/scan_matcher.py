@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registration of one frame to the map, from wherever its pose may be expected."""
+"""Registers one frame to the map, from all poses where it may be expected."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 from dpm2_core.slam.registration.swept import JOINT, Swept
 
-_BENT = 0.02  # m at the ends of the sweep and the usual range: a scan that is bent by less is straight
-_BENT_ON_AVERAGE = 0.1  # m, the same, where only the way from scan to scan tells
+_BENT = 0.02  # m at the ends of the sweep and the usual range: smaller distortions are ignored
+_BENT_ON_AVERAGE = 0.1  # m, the same if only the motion between scans is known
 
 
 class Match(NamedTuple):
-    """A frame in the map.
+    """A frame registered in the map.
 
     Attributes:
-        scan: for which the result holds: the given one, or one that was prepared anew.
-        result: the registration. led: another odometry has led to it.
-        swept: the motion during the sweep, where the points have shown it.
-        contradicted: the points, with their times, show a motion that cannot follow from the one before.
+        scan: the scan of the result: the given one, or one that was prepared anew.
+        result: the registration. led: whether it started from another odometry.
+        swept: the motion during the sweep, if the points show it.
+        contradicted: the points, with their times, show a motion that cannot follow from the previous motion.
     """
 
     scan: Scan
@@ -47,10 +47,10 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class ScanMatcher:
-    """Registers frames from where the motion so far, an IMU or another odometry leads, or from rest.
+    """Registers frames from a prediction by the motion so far, an IMU or another odometry, or from rest.
 
     Attributes:
-        registration: the map. motion: up to the last registered frame. bridge: across a pause, while there is one.
+        registration: the map. motion: up to the last registered frame. bridge: across a pause, during one.
     """
 
     settings: OdometrySettings
@@ -59,7 +59,7 @@ class ScanMatcher:
     bridge: Bridge | None
 
     def match(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
-        """Of a prepared frame, predicted at T_predicted (4, 4), `dt` s after the one before."""
+        """Match a prepared frame, predicted at T_predicted (4, 4), `dt` s after the previous one."""
         if frame.problem is not None:
             unknown = self.motion.unknown(dt)
             return Match(scan, Registration(T_predicted, unknown, 0.0, np.inf, "none", False, frame.problem))
@@ -71,18 +71,19 @@ class ScanMatcher:
         if led is not None and fits_there:
             return Match(scan, led, led=True)
         own = self._alone(frame, scan, T_predicted, dt)
-        # Along a tunnel most of a scan fits a map that was made at rest at rest: it says nothing of the step.
+        # In a tunnel most of a scan fits at rest to a map that was made at rest: that does not determine the step.
         if led is not None and own.result.worst_sigma >= OPEN:
             return Match(scan, led, led=True)
         return own
 
     def straightened(self, frame: Frame, match: Match, twist: Array, dt: float, half: float) -> Match:
-        """A frame that was prepared by a twist (6,) and matched, with the motion that its points show during its sweep,
-        from `half` s before its middle on: anew, where that bends the scan otherwise. What did not fit may fit then."""
+        """Prepare and register a matched frame anew with the motion that its points show during the sweep, if that
+        differs from the twist (6,) it was prepared by; `half`: s from the middle of the sweep to its ends. A frame that
+        did not fit may fit then."""
         motion = self.motion
         if not half or match.led or match.result.method in ("none", "first"):
             return match
-        if not match.result.ok and motion.twist is None:  # it may be anywhere
+        if not match.result.ok and motion.twist is None:  # its pose is unknown
             return match
         seconds, T_predicted = motion.seconds + dt, motion.predicted(twist, dt)
         turn = measured_turn(frame)
@@ -91,7 +92,7 @@ class ScanMatcher:
             beginning = without_imu.turning(measured)
         swept = self.registration.swept(match.scan, match.result, beginning)
         if swept is None:
-            if beginning is not without_imu:  # is it the points that contradict it, or the IMU?
+            if beginning is not without_imu:  # do the points contradict it because of the IMU?
                 swept = self.registration.swept(match.scan, match.result, without_imu)
             timed = match.result.ok and len(match.scan.times) > 0
             match = match._replace(contradicted=timed and swept is None)
@@ -105,8 +106,8 @@ class ScanMatcher:
         return match._replace(swept=swept.placed(match.result)) if match.result.ok else match
 
     def again_without_imu(self, frame: Frame, dt: float, half: float) -> Match:
-        """A frame that fits nowhere with its IMU, matched and straightened as if there were none: after a wrong turn
-        the points of the sweep do not show how a turn begins."""
+        """Match and straighten a frame without its IMU, after it fitted nowhere with it: after a wrong rotation the
+        points of the sweep do not show the start of a rotation."""
         motion = copy(self.motion)
         motion.inertial, motion.reckoned = None, None
         motion.T = predicted(motion.T_registered, motion.ahead, motion.seconds)
@@ -115,7 +116,7 @@ class ScanMatcher:
         return matcher.straightened(frame, match, twist, dt, half)
 
     def _steadied(self, frame: Frame, match: Match, twist: Array, seconds: float, half: float) -> Match:
-        """As `straightened`, by the average motion of the `seconds` since the last scan, where the points of the sweep
+        """As `straightened`, by the average motion during the `seconds` since the last scan, if the points of the sweep
         do not show it."""
         motion, T = self.motion, match.result.T_target_source
         average = se3.way(motion.T_registered, T) / seconds
@@ -127,7 +128,7 @@ class ScanMatcher:
         return match._replace(scan=scan, result=result) if result.ok else match
 
     def _alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
-        """By the motion so far, or from rest."""
+        """Match from the prediction by the motion so far, or from rest."""
         motion = self.motion
         if motion.twist is None:
             return Match(scan, self._from_rest(scan, T_predicted, dt))
@@ -135,7 +136,8 @@ class ScanMatcher:
         widen = min(seconds / dt, 5.0)
         result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
         result = motion.gated(result, T_predicted, dt)
-        # A wrong turn leads to a place of its own and holds the scan there: that few of its points fit is what tells.
+        # A wrong rotation leads to a wrong pose where the scan is stuck; only the small part of fitting points shows
+        # it.
         if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
             steady = self._without_imu(frame, motion.twist, dt)
             if fits_better(steady.result, result):
@@ -147,7 +149,8 @@ class ScanMatcher:
         return Match(scan, turned if turned.ok else result)
 
     def _without_imu(self, frame: Frame, twist: Array, dt: float) -> Match:
-        """Should the IMU be wrong: from a steady motion, in prediction and scan; a wrong turn bends a scan as well."""
+        """Match without the IMU, in prediction and scan, in case it is wrong: a wrong rotation distorts a scan as
+        well."""
         motion = self.motion
         seconds = motion.seconds + dt
         scan = self.registration.prepare(replace(frame, imu=None), twist)
@@ -156,7 +159,8 @@ class ScanMatcher:
         return Match(scan, motion.gated(result, T, dt))
 
     def _led_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
-        """From where another odometry leads, and whether the scan fits there; None without one, or far from there."""
+        """The result from the other odometry's prediction, and whether the scan fits there; None without one, or far
+        off."""
         motion = self.motion
         if motion.other is None or (step := motion.other.step) is None:
             return None, False
@@ -164,12 +168,12 @@ class ScanMatcher:
         information = np.linalg.inv(step.covariance).astype(np.float64)
         prediction = Prediction([T], information=information)
         result = motion.gated(self.registration.register(scan, prediction), T, dt)
-        # A wrong step holds the scan where it leads; that few of its points fit there is what tells the two apart.
+        # From a wrong step the scan gets stuck near the wrong pose: only the small part of fitting points shows that.
         agrees = result.ok and motion.other.agrees(motion.T_registered, result)
         return (result if agrees else None), agrees and prediction.convinced(result)
 
     def _from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
-        """While the velocity is unknown: the best of many starts; after a pause first as before it."""
+        """While the velocity is unknown: the best of many starts; after a pause first with the motion before it."""
         if self.bridge is not None and self.bridge.twist is not None:
             expected = self.bridge.expected(T, dt)
             result = self.registration.register(scan, expected)
@@ -184,8 +188,8 @@ class ScanMatcher:
 
 
 def _bent(scan: Scan, prepared: Callable[[Array], Array], motion: Array, half: float) -> float:
-    """How far the ends of a scan, m, that was prepared for poses at times are from where a motion has them, (6,) or
-    (K, 6), `half` s from its middle."""
+    """Largest displacement, m, of the ends of a scan, `half` s from its middle, between the motion it was prepared by
+    and another one, (6,) or (K, 6)."""
     times = np.array([-half, 0.0, half])
     off = se3.way(prepared(times), curve.poses(times, motion))[[0, 2]]
     reach = float(np.median(np.linalg.norm(scan.points[:, :3], axis=1)))

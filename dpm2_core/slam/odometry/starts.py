@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the next scan may be while no motion is known, and where it may be that is not where the motion leads."""
+"""Start poses for the next scan, while no motion is known or where the predicted pose does not fit."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _HEADINGS = 3  # to each side
 
 
 def starts_from_rest(T: Array, turns: float) -> Iterator[list[Array]]:
-    """Poses (4, 4) from which the scan after the one at `T` is looked for: straight ahead; then, needed only if none of
-    these fits well, in a curve and turned as well.
+    """Poses (4, 4) from which the scan after the one at `T` is searched: straight ahead; then, only if none of these
+    fits well, also in curves and with rotations.
 
     Args:
         turns: see `OdometrySettings.turns`.
@@ -29,12 +29,12 @@ def starts_from_rest(T: Array, turns: float) -> Iterator[list[Array]]:
 
 
 def turned_starts(T: Array, T_before: Array, turns: float) -> Sequence[Array]:
-    """Poses (4, 4) at the place of `T`: with the attitude of `T_before`, as what swings may have turned back, and with
-    other headings, as of a robot that turned on the spot."""
+    """Poses (4, 4) at the position of `T`: with the attitude of `T_before`, in case a swing has reversed, and with
+    other headings, in case the robot turned on the spot."""
     back = se3.make(T_before[:3, :3], T[:3, 3])
     return [back, *(T @ se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in _headings(turns))]
 
 
 def _headings(most: float) -> list[float]:
-    """Turns on the spot that are tried, deg."""
+    """Rotations on the spot that are tried, deg."""
     return [side * most * (i + 1) / _HEADINGS for i in range(_HEADINGS) for side in (1, -1)] if most else []
