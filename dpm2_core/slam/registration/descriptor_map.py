@@ -13,12 +13,12 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.registration.spacing import Spacing
 
-_KEPT = 20  # frames: at least as many as can lie around the next one
+_KEPT = 20  # frames: at least as many as can be around the next one
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where a frame was taken, T_odom_kf (4, 4), and what the network makes of it."""
+    """Pose of a frame, T_odom_kf (4, 4), and its descriptors."""
 
     T_odom_kf: Array
     description: LazyDescriptors
@@ -36,26 +36,25 @@ class DescriptorMap:
         return len(self._places)
 
     def wants(self, T_odom_lidar: Array) -> bool:
-        """Whether a frame taken at that pose would show enough that is new."""
+        """Whether a frame at that pose shows enough that is new."""
         if not self._places:
             return True
         meters, degrees = se3.apart(self._places[-1].T_odom_kf, T_odom_lidar)
         return meters >= self._spacing.meters or degrees >= 15
 
     def insert(self, description: LazyDescriptors, T_odom_lidar: Array) -> None:
-        """Add those of a frame taken there."""
+        """Add the descriptors of a frame at that pose."""
         self._places.append(_Place(T_odom_lidar, description))
 
     def around(self, T_odom_lidar: Array, frames: int) -> tuple[Array, Descriptors] | None:
-        """Pose T_odom_kf of the nearest frame, and the descriptors of it and its neighbors, up to `frames` in all,
-        merged in its frame.
+        """Pose T_odom_kf of the nearest frame, and in its frame the merged descriptors of up to `frames` frames.
 
-        None where the frames nearby have no descriptors.
+        None if the frames nearby have no descriptors.
         """
         distance = [float(np.linalg.norm(p.T_odom_kf[:3, 3] - T_odom_lidar[:3, 3])) for p in self._places]
         order = np.argsort(distance, kind="stable")[:frames]
         near = [self._places[i] for i in order if distance[i] <= self._radius or i == order[0]]
-        if self._merged is not None and self._merged[0] == near:  # the same object: the decoder keeps its part of it
+        if self._merged is not None and self._merged[0] == near:  # the same object: the decoder caches its part of it
             return near[0].T_odom_kf, self._merged[1]
         found = [(place, d) for place in near if (d := place.description.get()) is not None]
         if not found:

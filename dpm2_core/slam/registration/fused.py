@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ICP and the network's registration: each checks the other, and disagreement is reported in `reason`."""
+"""ICP combined with the network's registration: each checks the other; disagreement is reported in `reason`."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ _LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
 _UNCONFIRMED = isotropic(np.radians(1), 0.3)
-"""Covariance that a network pose has besides its own where the points fit nowhere near it: above a town, hovering, such
-poses err by 0.27 m and claim 0.06 m."""
-_MUCH_BETTER = 0.1  # confidence: more of the points fit, where a direction stays open
-_SURE_SIGMA = 0.08  # m, standard deviation of a position with no direction left open
+"""Covariance added to that of a network pose if the points fit nowhere near it: hovering above a town, such poses have
+errors of 0.27 m and report 0.06 m."""
+_MUCH_BETTER = 0.1  # confidence: gain in fitting points that counts while a direction is unconstrained
+_SURE_SIGMA = 0.08  # m, standard deviation of a position that is constrained in all directions
 
 
 class FusedScanRegistration:
-    """ICP, led and checked by the network's registration.
+    """ICP, initialized and checked by the network's registration.
 
-    If both agree (see `agree`), the pose is that of the points. If they disagree, ICP starts from the network's pose as
-    well, and the more likely of its results is kept, unless the points are just where the motion leads: among what
-    repeats, such as doors and parked cars, a place beside may fit better. Points that have strayed from where the
-    motion leads are registered anew from a network's pose that they agree with. Where little is known of the motion, it
-    starts there at once: a direction that seems open from afar may be closed at the right place. If ICP fails, it is
-    tried again from the network's pose; if it fails there too, or converges elsewhere, the network's pose is returned,
-    less sure than it claims, and drawn to where the motion leads if that is known and elsewhere. `reason` says which of
-    the two disagreed, and why.
+    If both agree (see `agree`), the pose is that of the points. If they disagree, ICP also starts from the network's
+    pose, and the more likely of its results is kept, unless the points are exactly at the predicted pose: with repeated
+    structures, such as doors and parked cars, a wrong pose nearby may fit better. Points that are away from the
+    predicted pose are registered anew from a network's pose that they agree with. If little is known of the motion, ICP
+    starts there at once: a direction that seems unconstrained from afar may be constrained at the right pose. If ICP
+    fails, it is tried again from the network's pose. If it fails there too, or converges elsewhere, the network's pose
+    is returned with a larger covariance than its own, and drawn to the predicted pose if that is known and elsewhere.
+    `reason` states which of the two disagreed, and why.
     """
 
     def __init__(
         self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration, always: bool = True
     ) -> None:
-        """`always` False: the network is asked only where the points do not know their pose: few fit, or a direction is
-        open. Of 700 pairs of scans, real and simulated, without a known motion, those that knew it were all right."""
+        """`always` False: use the network only if the points do not determine their pose: few fit, or a direction is
+        unconstrained. Of 700 pairs of scans, real and simulated, with unknown motion, all that did were right."""
         self._neural = neural
         self._geometric = geometric
         self._always = always
@@ -73,14 +73,14 @@ class FusedScanRegistration:
             doubted = self._geometric.doubted(scan, prediction, points)
             if _sure(doubted, prediction) and not prediction.strays(doubted):
                 return doubted
-        # Not beside the doubt: with it, everything agrees with them.
+        # Compare with the result before the doubt: with the doubt's large covariance everything agrees.
         return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
 
     def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
         return self._geometric.swept(scan, result, beginning)
 
     def _with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
-        """What the network says as well, of points that were registered or, where it is always asked, are not yet."""
+        """Combine with the network's registration; `points` is None if they are not registered yet (`always`)."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = neural.rejected("found where no vehicle can have come")
@@ -98,7 +98,7 @@ class FusedScanRegistration:
     def _from_both(
         self, scan: Scan, neural: Registration, prediction: Prediction, points: Registration | None
     ) -> tuple[Registration, Prediction]:
-        """The points from the pose of the network as well, and what led there; unless that only lures them away."""
+        """Register the points from the network's pose as well; returns result and prediction, unless that misleads."""
         also = _also_from(neural, prediction)
         found = self._geometric.located(scan, also)
         if prediction.information is not None and not self._seen(scan):
@@ -108,11 +108,11 @@ class FusedScanRegistration:
         return found, also
 
     def _weighed(self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration) -> Registration:
-        """What of two results counts."""
+        """Select or combine two results."""
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
             return _outvoting(points, neural, prediction)
         agreed, together = agree(points, neural), near(points.T_target_source, neural.T_target_source)
-        # What leaves a direction open at the wrong place, so that both agree, may close it at the right one.
+        # A wrong pose that both agree on may leave a direction unconstrained that the right pose constrains.
         if prediction.known and not (agreed and (points.worst_sigma <= _SURE_SIGMA or together)):
             starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.located(scan, replace(prediction, starts=starts))
@@ -122,18 +122,18 @@ class FusedScanRegistration:
             points = likelier if likelier.ok and not agreed else points
         if not agreed:
             if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
-                # Where points fit anywhere, they fit best where nothing has moved.
+                # Where points fit anywhere, they fit best at a pose without motion.
                 return self._led(scan, neural, prediction)
             return _outvoting(points, neural, prediction)
-        if prediction.strays(points):  # the motion that held them has changed
+        if prediction.strays(points):  # the motion has changed and the points are stuck at the predicted pose
             led = self._points_from(scan, neural)
             points = led if led.ok and agree(led, neural) else points
         if not self._always and _sure(points, prediction):
-            return points  # all that they needed was the start
+            return points  # they needed the network only for the start
         return _confirmed(points)
 
     def _led(self, scan: Scan, neural: Registration, prediction: Prediction) -> Registration:
-        """The points from the pose of the network, when the motion so far did not lead them to a result."""
+        """Register the points from the network's pose, after the prediction did not lead to a result."""
         points = self._points_from(scan, neural)
         if not points.ok:
             unsure = replace(neural, covariance=neural.covariance + _UNCONFIRMED)
@@ -150,23 +150,26 @@ class FusedScanRegistration:
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         kept = self._geometric.update(scan, T_odom_lidar)
-        if kept:  # both remember the same scans, and the network's part is not passed on every frame
+        if kept:  # both maps have the same scans; the network's `update` is not called for every frame
             self._neural.keep(scan, T_odom_lidar)
         return kept
 
 
 def _confirmed(points: Registration) -> Registration:
-    """The points, with which the network agrees.
+    """The points' result, confirmed by the network.
 
-    A mean of both would be worse: at the walls of a building, seen by 16 beams, its poses err by 0.2 to 0.4 m and claim
-    0.06 m; along a tunnel or a highway, where all that a scan shows looks alike, it is sure of standing still.
+    A mean of both would be worse: at the walls of a building, with 16 beams, the network's poses have errors of 0.2 to
+    0.4 m and report 0.06 m. Along a tunnel or a highway, where everything in a scan looks alike, the network reports
+    standstill with high confidence.
     """
     return replace(points, method="refined")
 
 
 def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
-    """A network pose that no points confirm, between it and where the motion leads, by what both are worth, if it is
-    beside that: in a fast turn, seen by a LiDAR 70 degrees wide, such a pose was 0.5 m off, and the motion 0.03 m."""
+    """A network pose that no points confirm, fused with the prediction by their covariances if the two are apart.
+
+    In a fast rotation, with a LiDAR 70 degrees wide, such a pose was 0.5 m off, and the prediction 0.03 m.
+    """
     T, T_predicted, of_motion = neural.T_target_source, prediction.starts[0], prediction.information
     if of_motion is None or not prediction.known or near(T_predicted, T):
         return neural
@@ -176,38 +179,38 @@ def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
 
 
 def _lures(found: Registration, points: Registration) -> bool:
-    """Whether a result is no reason to leave another one: it fits hardly better, and leaves a direction open.
+    """Whether `found` is no reason to leave `points`: it fits hardly better, and leaves a direction unconstrained.
 
-    A scan fits best where the map is as dense as it is: along a highway of 16 beams to 6 m away, up to 0.06 better.
+    A scan fits best where the map has the same density: on a highway with 16 beams up to 6 m away, by up to 0.06.
     """
     return points.ok and found.worst_sigma >= OPEN and found.confidence <= points.confidence + _MUCH_BETTER
 
 
 def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
-    """With the network's pose as one more start: the first of equals only where there is nothing else to go by."""
+    """Add the network's pose to the starts: as the first, preferred among equals, only without other information."""
     start, starts = neural.T_target_source, prediction.starts
     return replace(prediction, starts=[start, *starts] if prediction.information is None else [*starts, start])
 
 
 def _sure(points: Registration, prediction: Prediction) -> bool:
-    """Whether they fit well, with no direction left open; just where the motion leads those suffice that make a result.
+    """Whether points fit well and constrain all directions; exactly at the predicted pose any accepted result will do.
 
-    Of a scan that has moved much finds nothing in a young map of few beams. Both the network and the likelihood of the
-    points then prefer the place where the map was made, as what the beams meet looks the same from there.
+    Much of a scan after a large motion matches nothing in a young map of few beams. Both the network and the likelihood
+    of the points then prefer the pose where the map was made, since the beams hit the same pattern there.
     """
     fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
     return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
 
 
 def _outvoting(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
-    """The points, that exclude the network: where they fit well by themselves they know it."""
+    """The points' result, which contradicts the network; with a doubt unless the points fit well by themselves."""
     if prediction.convinced(points):
         return points.because(_apart(points, neural))
     return _instead(points, neural)
 
 
 def _instead(result: Registration, other: Registration) -> Registration:
-    """One of two that exclude each other, as uncertain as they are apart: which of them is right nothing has shown."""
+    """One of two contradicting results, with a covariance that covers both: nothing shows which one is right."""
     way = se3.way(result.T_target_source, other.T_target_source)
     return result.doubted(way).because(_apart(result, other))
 

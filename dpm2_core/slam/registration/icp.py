@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points to a local map by point-to-plane least squares, each residual weighed by how well the plane is known.
+"""Point-to-plane least-squares registration to a local map; residuals are weighted by the uncertainty of the plane.
 
-`GeometricRegistration` registers a cloud from one start; `GeometricScanRegistration` is the odometry's, which may have
-several.
+`GeometricRegistration` registers a cloud from one start; `GeometricScanRegistration` is the registration of the
+odometry, with one or several starts.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ class GeometricSettings(Settings):
     min_points: int = Field(80, ge=1)
     """A registration with fewer inliers is rejected."""
     min_inliers: float = Field(0.5, ge=0, le=1)
-    """A registration with a smaller ratio of inliers is rejected; with less than 0.3 where the map has at most 3 scans
-    and the result agrees with the predicted motion (0.3 m, 2 degrees)."""
+    """A registration with a smaller ratio of inliers is rejected. The limit is 0.3 if the map has at most 3 scans and
+    the result agrees with the predicted motion (0.3 m, 2 degrees)."""
 
 
 _STEPS = 15  # of Gauss-Newton, at most
 _EXPECTED = 0.3
-"""Least ratio of inliers of a result that was expected, in a map of few scans: while traffic occludes parts of so small
-a map, fewer points match. In a larger one few matches mean a wrong place."""
+"""Minimum ratio of inliers of an expected result in a map of few scans: traffic occludes parts of such a small map, so
+fewer points match. In a larger map few matches mean a wrong pose."""
 _COARSE, _FINE = (1e-3, 0.02), (1e-4, 1e-3)  # rad and m: a smaller step ends the pass
 CORRELATED = 10
 _NORMAL_NOISE = 0.12  # rad, of fitted normals; measured rms along smooth tunnels: 0.02 to 0.12, on open roads over 0.2
 
-_UNFIT = 0.2  # share of the points that do not fit: 1 % of 870 scans, real and simulated, have it, 8 % in dense traffic
+_UNFIT = 0.2  # fraction of unmatched points; 1 % of 870 scans, real and simulated, have it, 8 % in dense traffic
 _TOGETHER, _AT_REST = 0.15, 0.3
-"""Share of the points that fit a second pose alone: none of those scans has half of it. Of people that walk along, and
-of walls that slide past where they are taken for what stands still, it is 0.16 to 0.31. At rest, where the map was
-made, the beams meet much at the same distance again: with 16 beams in a hall full of shelves 0.17."""
+"""Fraction of the points that fit only a second pose: none of those scans has half of it. With people who walk along,
+and with walls that slide past while moving objects are taken for static, it is 0.16 to 0.31. At rest, where the map was
+made, the beams hit much at the same distance again: with 16 beams in a hall full of shelves 0.17."""
 _APART = 0.05  # m, from one pose to a second one
 _EQUAL = 0.02
-"""Mean log likelihoods of the points that differ by less say nothing, such as along a tunnel."""
+"""Smaller differences of the points' mean log likelihood are not significant, such as along a tunnel."""
 DISTINCT = 0.06
-"""By so much must the mean log likelihood of a place exceed that of every other one that a search has found."""
-_FEW = 400  # points show which heading fits where the motion is not known, and which places of a search are likely;
-_PLACES = 6  # so many of them are registered to,
-_PART = 4  # by one point in so many; all points compare the best two
+"""The mean log likelihood of a pose must exceed that of every other pose found in a search by this much."""
+_FEW = 400  # points that select the heading where the motion is unknown, and the likely poses of a search;
+_PLACES = 6  # number of these poses that are registered,
+_PART = 4  # with every fourth point; all points compare the best two
 _AXES = np.eye(6)
 _HEADINGS = np.array([se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) for yaw in (0, 3, -3, 6, -6, 9, -9)])
 _JOLTS = np.array(
@@ -70,13 +70,13 @@ _JOLTS = np.array(
     + [se3.exp(np.radians(deg) * _AXES[2]) for deg in range(-45, 46, 3)]
     + [se3.exp(np.radians(deg) * axis) for axis in _AXES[:2] for deg in range(-20, 21, 4)]
 )
-"""From where the motion leads: as a robot that begins or ends a turn, or is shaken, is found at 5 frames per second."""
-_BETTER = 0.06  # so much must another heading fit better (0 to 2): on a plain 0.05 is chance
-_NEAR = (1.0, 5.0)  # m and degrees: results within are one place
+"""Poses relative to the prediction for a robot that begins or ends a rotation, or is shaken, at 5 frames per second."""
+_BETTER = 0.06  # least advantage of another heading (fit: 0 to 2): on a plain 0.05 is chance
+_NEAR = (1.0, 5.0)  # m and degrees: results within count as the same pose
 
 
 class GeometricRegistration:
-    """Iteratively reweighted Gauss-Newton; a coarse pass over every fourth point brings the full one close."""
+    """Iteratively reweighted Gauss-Newton; a coarse pass over every fourth point gives the full pass a close start."""
 
     def __init__(self, settings: GeometricSettings) -> None:
         self.settings = settings
@@ -90,9 +90,9 @@ class GeometricRegistration:
             source: (N, 3) float64 points in the sensor frame.
             target: the local map; T_target_source is then T_odom_lidar.
             T_guess: (4, 4) prediction.
-            widen: factor on the first gate, for a prediction that is known to be poor.
-            prior: (6, 6) information [rad, m] of the prediction. Along a tunnel nothing else says how far the car went;
-                anywhere else the points outweigh it. It is no part of the covariance of the result.
+            widen: factor on the first gate, for an uncertain prediction.
+            prior: (6, 6) information [rad, m] of the prediction. Along a tunnel only this determines the distance;
+                anywhere else the points outweigh it. It is not part of the covariance of the result.
         """
         s, source = self.settings, target.in_sight(source)
         if len(source) < s.min_points or len(target) < s.min_points:
@@ -119,7 +119,7 @@ class GeometricRegistration:
                 if not coarse:
                     break
                 coarse, gate = False, s.final_gate
-        T = se3.orthonormalized(T)  # what rounding has added up to
+        T = se3.orthonormalized(T)  # removes accumulated rounding errors
         ratio = inliers / len(points)
         expected = predicted and target.is_young and near(T_guess, T)
         least = min(_EXPECTED, s.min_inliers) if expected else s.min_inliers
@@ -129,34 +129,34 @@ class GeometricRegistration:
         return with_calibration(result, target.from_nearest_scan(T))
 
     def swept(self, scan: Scan, target: LocalMap, T: Array, beginning: Beginning) -> Swept | None:
-        """Pose and motion of the sweep of a scan, which was found at T (4, 4) as if it were rigid; None if its points
+        """Pose and motion of the sweep of a scan that was registered at T (4, 4) as a rigid scan; None if its points
         have no times."""
         if not len(scan.times) or len(target) < self.settings.min_points:
             return None
-        gate = 2 * self.settings.final_gate  # the ends of the sweep are farther off than its middle
+        gate = 2 * self.settings.final_gate  # the ends of the sweep are farther from the map than its middle
         return register_sweep(scan, lambda points, T: self._matched(points, target, T, gate), T, beginning, CORRELATED)
 
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
-        """The best of several results, with the way to the farthest that is nearly as likely in its covariance."""
+        """The best of several results, with a covariance that covers the farthest that is nearly as likely."""
         fit = [self.likelihood(source, target, r.T_target_source) for r in found]
         ok = max(r.ok for r in found)
         best = max(value for r, value in zip(found, fit, strict=True) if r.ok == ok)
-        # The first of equals: least motion, where a tunnel fits anywhere.
+        # The first of equally likely results: in a tunnel, where all poses fit, the one with the least motion.
         chosen = next(r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - _EQUAL)
         likely = [r for r, value in zip(found, fit, strict=True) if r.ok == ok and value >= best - DISTINCT]
         ways = [se3.way(chosen.T_target_source, other.T_target_source) for other in likely]
         return chosen.doubted(max(ways, key=lambda xi: float(np.linalg.norm(xi[3:]))))
 
     def likelihood(self, source: Array, target: LocalMap, T: Array) -> float:
-        """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better a pose fits.
+        """Mean log likelihood of the (N, 3) points at a pose T_target_source: the greater, the better the pose fits.
 
         Distances along the normals are Cauchy distributed; a point without a counterpart has a density of 1 per meter,
-        and no points have it too.
+        and so does a scan without points.
         """
         return float(self.log_density(source, target, T).mean()) if len(source) else 0.0
 
     def second(self, source: Array, target: LocalMap, result: Registration, T_guess: Array) -> Registration | None:
-        """Another pose, near a guess, at which many of the points fit that do not at a result's: they move together."""
+        """A second pose, near a guess, for many of the points that do not fit at `result`: they move together."""
         unfit = np.ascontiguousarray(source[self.log_density(source, target, result.T_target_source) <= 0])
         found = self.register(unfit, target, T_guess)
         at_rest = se3.magnitude(target.from_nearest_scan(found.T_target_source))[0] < _APART
@@ -164,24 +164,24 @@ class GeometricRegistration:
         return found if found.ok and found.confidence * len(unfit) >= least else None
 
     def log_density(self, source: Array, target: LocalMap, T: Array) -> Array:
-        """Of each of the (N, 3) points (N,), see `likelihood`; 0 where none of the map's surfaces explains it."""
+        """(N,) log density of each of the (N, 3) points, see `likelihood`; 0 where no surface explains a point."""
         residual, _, variance = self._matched(source, target, T, self.settings.final_gate)
         return np.fmax(-0.5 * np.log(variance) - np.log1p(residual * residual / variance), 0)
 
     def fits(self, source: Array, target: LocalMap, T: Array) -> NDArray[np.bool_]:
-        """Which of the (N, 3) points lie on a surface of the map (N,), to three standard deviations."""
+        """Mask (N,) of the (N, 3) points that lie on a surface of the map, to three standard deviations."""
         residual, _, variance = self._matched(source, target, T, self.settings.final_gate)
         return residual * residual < 9 * variance  # False for NaN
 
     def _matched(self, source: Array, target: LocalMap, T: Array, gate: float) -> tuple[Array, Array, Array]:
-        """Of each point (N, 3) its distance (N,) m from the surface within the gate, its normal (N, 3) and variance
-        (N,) m2; NaN where there is none."""
+        """For each point (N, 3) its distance (N,), m, from the surface within the gate, the normal (N, 3) and variance
+        (N,), m2; NaN where there is none."""
         residual, normals, spread = target.match(source @ T[:3, :3].T + T[:3, 3], gate)
         return residual, normals, self.settings.noise**2 + spread
 
 
 class GeometricScanRegistration:
-    """Points to a local map of points."""
+    """Registers points to a local map of points."""
 
     uses_images = False
 
@@ -195,10 +195,10 @@ class GeometricScanRegistration:
         return len(self._local_map)
 
     def _forget_second(self) -> None:
-        """Both motions begin anew: a scan that has just entered the map fits there."""
+        """Reset the second motion: a scan that has just entered the map fits there."""
         self._scans = 0  # since then
-        self._way: Array | None = None  # (6,) from the pose of the last one to the second pose
-        self._T_second: Array | None = None  # (4, 4) by the last registration: that of the next scan, if it is kept
+        self._way: Array | None = None  # (6,) from the pose of the last scan to the second pose
+        self._T_second: Array | None = None  # (4, 4) by the last registration, for the next scan if this one is kept
 
     def fresh(self) -> GeometricScanRegistration:
         return GeometricScanRegistration(self._preprocessor, self._registration, self._local_map.fresh())
@@ -217,7 +217,7 @@ class GeometricScanRegistration:
         return self._registration.swept(scan, self._local_map, result.T_target_source, beginning)
 
     def located(self, scan: Scan, prediction: Prediction) -> Registration:
-        """As `register`, whatever many of the points may do together."""
+        """As `register`, without the check for points that move together."""
         p = prediction
         if p.unique:
             return self._searched(scan.source, p)
@@ -230,9 +230,9 @@ class GeometricScanRegistration:
         return found[0]
 
     def _jolted(self, source: Array, prediction: Prediction, result: Registration) -> Registration:
-        """Of points (N, 3) that fit badly where the motion leads: from where they fit best beside, if they fit better.
+        """For points (N, 3) that fit badly at the predicted pose: the result from the best of the poses around it.
 
-        What begins or ends between two scans, as a turn does, leaves the points of a room at the wrong walls.
+        A motion that begins or ends between two scans, such as a rotation, matches the points of a room to wrong walls.
         """
         T_steered = self._steered(source, prediction.starts[0], _JOLTS)
         if T_steered is prediction.starts[0]:
@@ -241,11 +241,11 @@ class GeometricScanRegistration:
         return other if fits_better(other, result) else result
 
     def doubted(self, scan: Scan, prediction: Prediction, result: Registration) -> Registration:
-        """A result whose covariance holds the way to a second pose, where many of the points move otherwise.
+        """The result, with a covariance that covers a second pose if many of the points fit only there.
 
-        They are a crowd that walks along or the walls beside it, trucks or the street between them: which of them
-        stands still the points do not say. Where the second pose is no longer found and as many points do not fit, it
-        is where its motion leads.
+        It may be a crowd that walks along or the walls beside it, trucks or the street between them: the points do not
+        show which of the two is static. If the second pose is no longer found although as many points do not fit, it
+        is predicted by its motion.
         """
         self._T_second, source = None, scan.source
         if prediction.unique or not result.ok or result.confidence > 1 - _UNFIT:
@@ -261,10 +261,10 @@ class GeometricScanRegistration:
         return result.doubted(way).because(doubt)
 
     def _steered(self, source: Array, T: Array, motions: Array = _HEADINGS) -> Array:
-        """A start (4, 4) at the heading where the scan fits best: a curve may have begun or ended meanwhile.
+        """A start (4, 4) with the heading where the scan fits best, since a curve may have begun or ended meanwhile.
 
-        Otherwise 0.6 s after the last scan one in 40 settles beside its place, with 80 % of its points on the map. It
-        costs no time: a better start needs fewer steps.
+        Otherwise, 0.6 s after the last scan, one scan in 40 converges to a wrong pose with 80 % of its points on the
+        map. It costs no time: a better start needs fewer steps.
         """
         if not len(source):
             return T
@@ -273,7 +273,7 @@ class GeometricScanRegistration:
         return np.asarray(poses[fit.argmax()]) if fit.max() > fit[0] + _BETTER else T
 
     def _searched(self, source: Array, prediction: Prediction) -> Registration:
-        """The place that fits best, if no other one fits nearly as well."""
+        """The best pose of a search, if no other pose fits nearly as well."""
         poses = np.asarray(prediction.starts)
         few = _few(source)
         places: list[Array] = []
@@ -299,7 +299,7 @@ class GeometricScanRegistration:
         return replace(result, ok=True, reason="")
 
     def _fitted(self, source: Array, T: Array) -> tuple[Registration, float]:
-        """Registered from T, and the likelihood there."""
+        """Result of the registration from T, and its likelihood."""
         result = self._registration.register(source, self._local_map, T)
         return result, self._registration.likelihood(source, self._local_map, result.T_target_source)
 
@@ -312,7 +312,7 @@ class GeometricScanRegistration:
             self._scans += 1
             self._way = None if self._T_second is None else se3.way(T_odom_lidar, self._T_second)
             if self._way is not None and np.linalg.norm(self._way[3:]) < _APART:
-                self._way = None  # of two trials of a scan the pose that was taken
+                self._way = None  # of two trials of a scan, the second pose was chosen
         return wanted
 
 
@@ -324,8 +324,8 @@ def _few(source: Array) -> Array:
 def _covariance(H: Array) -> Array:
     """Covariance (6, 6) from the Hessian, minus the spurious information due to noise in the normals.
 
-    Along a perfectly smooth tunnel every normal should be square to the axis; their noise makes it look as if some were
-    not, and the motion along it as if it were known.
+    Along a perfectly smooth tunnel every normal should be perpendicular to the axis. Their noise makes some appear
+    tilted, and thus the motion along the axis appear constrained.
     """
     information = H / CORRELATED
     information[3:, 3:] -= _NORMAL_NOISE**2 * np.trace(information[3:, 3:]) * np.eye(3)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intensity where the geometry is silent: how far along a tunnel or a highway, without a camera.
+"""Intensity for directions that the geometry does not constrain: position along a tunnel or highway, without camera.
 
-As by an image (`texture`), one number is unknown, the way along the open direction. What a scan shows is laid out
-around that direction, as a tunnel that is cut open and unrolled. The way is the one at which the intensities of a scan
-correlate best with those of the scans before.
+As with an image (`texture`), one number is unknown, the offset along the unconstrained direction. A scan is mapped to a
+cylinder around that direction, like a tunnel that is cut open and unrolled. The offset is the one at which the
+intensities of a scan correlate best with those of the previous scans.
 
-Two things look as if nothing moved: each beam has a gain of its own, and what does not change along the way, such as
-the edge of a road, is always beside the sensor. So an intensity counts relative to its neighbors in the beam, and less
-what the scans before had in that direction of the sensor.
+Two effects look like standstill: each beam has its own gain, and structure that does not change along the motion, such
+as the edge of a road, is always next to the sensor. So an intensity is taken relative to its neighbors in the beam, and
+minus the mean of the previous scans in that direction of the sensor.
 """
 
 from __future__ import annotations
@@ -28,40 +28,40 @@ from dpm2_core.slam.registration.texture import Peak, moved_along, peak
 
 Float = NDArray[np.float32]
 
-_SCANS, _SPACING = 5, 0.5  # that are remembered, and the way between them, m
-_PATIENCE = 5  # scans without a known way, after which nothing holds those before to the next one
+_SCANS, _SPACING = 5, 0.5  # scans that are kept, and the distance between them, m
+_PATIENCE = 5  # scans with unknown motion, after which the previous scans are no longer connected to the next one
 _RING = np.radians(0.2)  # beams are farther apart
 _NEIGHBORS = 25  # in the beam, to either side
 _NOISE = 0.03  # standard deviation of an intensity
-_CELL = 0.1  # m along the way
+_CELL = 0.1  # m along the axis
 _ROWS, _COLUMNS = 180, 600  # cells around, and along
 _NEAR, _FAR = 1.0, 30.0  # m away from the axis
-_LOCAL = 45  # cells along the way, to either side: what changes more slowly is no texture
-_KNOWN = 4  # of these, at least
+_LOCAL = 45  # cells along the axis, to either side: what changes more slowly is no texture
+_KNOWN = 4  # minimum number of these with points
 _LEAST_SPREAD = 0.1  # standard deviations: less is noise
-_LIMIT = 3.0  # standard deviations: a reflector is not everything
+_LIMIT = 3.0  # standard deviations: limits the weight of reflectors
 _SHARED = 300  # cells, at least
-_SEARCHED = 150  # cells to either side: what correlates at random
-_APART = 6  # cells: another place, not the slope of the best one
+_SEARCHED = 150  # cells to either side: shows the random correlation
+_APART = 6  # cells: a separate peak, not the slope of the best one
 _CLEAR, _DISTINCT = 5.0, 2.5
-"""The best place correlates better than at random, and than any other one, by so many standard deviations of what is at
-random. In 460 scans without texture they were 4.4 and 2.0 at most, within 6 m."""
+"""The best offset must correlate better than at random, and than any other, by this many standard deviations of the
+random correlation. In 460 scans without texture these were 4.4 and 2.0 at most, within 6 m."""
 _ALONE, _MOST_ALONE = 0.5, 3.0
-"""By one scan alone it does so by so much more per meter that is looked to a side, and at most. Of vehicles on a road
-without texture, each of which is found at its own speed, it was 0.9 more than `_CLEAR` within 6 m."""
-_OWN = 0.5  # of what each cell says it says alone: by the errors of 300 scans of KITTI 00 and 04
+"""With only one earlier scan `_CLEAR` increases by this per meter of search to a side, and at most by the second. With
+vehicles on a road without texture, each matched at its own speed, 0.9 more than `_CLEAR` was reached within 6 m."""
+_OWN = 0.5  # fraction of each cell's information that is independent: by the errors of 300 scans of KITTI 00 and 04
 
 
 class IntensitySearch:
-    """The way along an open direction, from the last scans to another one."""
+    """Offset of a scan along an unconstrained direction from the previous scans."""
 
     def __init__(self) -> None:
         self._scans: deque[_Placed] = deque(maxlen=_SCANS)
-        self._missed = 0  # scans since the way was known
-        self._searched = _Scan(NO_POINTS)  # the last one: it is often the next to be remembered
+        self._missed = 0  # scans since the motion was known
+        self._searched = _Scan(NO_POINTS)  # the last one, which is often the next to be kept
 
     def update(self, points: Points, T_odom_lidar: Array, tied: bool = True) -> None:
-        """A scan (P, 4) that is now at a pose (4, 4); `tied` if its way from those before is known."""
+        """Process a scan (P, 4) at its pose (4, 4); `tied` if its motion from the previous scans is known."""
         self._missed = 0 if tied else self._missed + 1
         if self._scans and self._missed <= (_PATIENCE if self._scans[-1].tied else 0):
             way = np.linalg.norm(self._scans[-1].T_odom_lidar[:3, 3] - T_odom_lidar[:3, 3])
@@ -71,10 +71,10 @@ class IntensitySearch:
         self._scans.append(_Placed(scan, T_odom_lidar, tied))
 
     def along(self, result: Registration, points: Points, reach: float) -> Registration:
-        """A registration of a scan (P, 4), moved along its open direction by `search`, or why it is not.
+        """A registration of a scan (P, 4), moved along its unconstrained direction by `search`, or the reason why not.
 
         Args:
-            reach: the farthest that is looked to either side, m.
+            reach: search range to either side, m.
         """
         found = self.search(points, result.T_target_source, result.open_direction, reach)
         if isinstance(found, str):
@@ -82,10 +82,10 @@ class IntensitySearch:
         return moved_along(result, found, se3.inverse(self._scans[-1].T_odom_lidar), "intensity")
 
     def search(self, points: Points, T_odom_lidar: Array, axis: Array, reach: float) -> Peak | str:
-        """How far along an axis (3,) of the LiDAR frame a scan (P, 4) is, or why that is not known; "" at a start.
+        """Offset of a scan (P, 4) along an axis (3,) of the LiDAR frame, or why it is unknown; "" at the start.
 
         Args:
-            T_odom_lidar: (4, 4), but for the way along the axis. reach: the farthest that is looked to either side, m.
+            T_odom_lidar: (4, 4), except for the offset along the axis. reach: search range to either side, m.
         """
         if len(self._scans) < _SCANS:
             return ""
@@ -106,14 +106,14 @@ class IntensitySearch:
 
 
 class _Scan:
-    """A scan, of which what its intensities show is found when it is first asked for."""
+    """A scan; its intensity cells are computed when they are first needed."""
 
     def __init__(self, points: Points) -> None:
         self.points = points
         self._cells: _Cells | None = None
 
     def cells(self, axis: Array) -> _Cells:
-        """Around an axis (3,) of the LiDAR frame, or one that was asked for before: they are fine, whatever it was."""
+        """Cells around an axis (3,) of the LiDAR frame, or around that of an earlier call: they are fine enough."""
         if self._cells is None:
             self._cells = _in_cells(self.points, axis)
         return self._cells
@@ -121,7 +121,7 @@ class _Scan:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A scan and where it was taken (4, 4); `tied` if the way from the one before is known."""
+    """A scan and its pose (4, 4); `tied` if the motion from the previous scan is known."""
 
     scan: _Scan
     T_odom_lidar: Array
@@ -130,25 +130,25 @@ class _Placed:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Points (N, 3) of a scan in its LiDAR frame, m, one for each cell that it shows, and their contrast (N,)."""
+    """Points (N, 3) of a scan in its LiDAR frame, m, one per non-empty cell, and their contrast (N,)."""
 
     points: Float
     contrast: Float
 
     def moved(self, T: Array) -> _Cells:
-        """By a transform (4, 4)."""
+        """Transformed by (4, 4)."""
         return _Cells(se3.transform(T, self.points), self.contrast)
 
 
 @dataclass(frozen=True, eq=False)
 class _Unrolled:
-    """Mean contrast (_ROWS, _COLUMNS) by the angle around an axis and the way along it, and of how many points."""
+    """Mean contrast (_ROWS, _COLUMNS) by the angle around an axis and the position along it, and number of points."""
 
     mean: Float
     count: Float
 
     def texture(self) -> _Unrolled:
-        """What changes within `_LOCAL` cells along the way, over its spread there; each cell counts once."""
+        """Changes within `_LOCAL` cells along the axis, divided by their spread there; all cells weigh the same."""
         known = (self.count > 0).astype(np.float32)
         around = np.maximum(_window(known), 1)
         away = (self.mean - _window(self.mean * known) / around) * known
@@ -158,7 +158,7 @@ class _Unrolled:
 
 
 def _contrast(points: Points) -> Float:
-    """(P,) intensity of points (P, 4) relative to its neighbors in the beam, in standard deviations of these."""
+    """(P,) intensity of points (P, 4) relative to neighbors in the beam, in standard deviations of these."""
     x, y, z, intensity = points.T
     ring = np.rint(np.arctan2(z, np.hypot(x, y)) / np.float32(_RING)).astype(np.int64)
     order = np.argsort((ring << 32) + (np.arctan2(y, x) * np.float32(1e8)).astype(np.int64))
@@ -175,7 +175,7 @@ def _contrast(points: Points) -> Float:
 
 
 def _in_cells(points: Points, axis: Array) -> _Cells:
-    """Points (P, 4), one for each cell around and along an axis (3,): the mean of those that are in it."""
+    """Points (P, 4) averaged in cells around and along an axis (3,)."""
     near = points[(points[:, :3] ** 2).sum(1) < (_COLUMNS * _CELL / 2) ** 2]
     cell, kept = _cell(near[:, :3], axis)
     count = np.bincount(cell, minlength=_ROWS * _COLUMNS)
@@ -186,7 +186,7 @@ def _in_cells(points: Points, axis: Array) -> _Cells:
 
 
 def _cell(points: Float, axis: Array) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Number of the cell around and along an axis (3,) of those of the points (N, 3) that are in one, and which."""
+    """Cell numbers, around and along an axis (3,), of those points (N, 3) that are in a cell, and their indices."""
     across = np.linalg.svd(axis[None])[2][1:].astype(np.float32)
     along, (y, z) = points @ axis.astype(np.float32), across @ points.T
     column = np.floor(along / np.float32(_CELL)).astype(np.int64) + _COLUMNS // 2
@@ -213,7 +213,7 @@ def _window(values: NDArray[np.floating[Any]]) -> Float:
 
 
 def _correlation(a: _Unrolled, b: _Unrolled) -> Array:
-    """Correlation (2 `_SEARCHED` + 1,) of a with b moved along by up to `_SEARCHED` cells, NaN where few are shared."""
+    """Correlation (2 `_SEARCHED` + 1,) of a with b shifted by up to `_SEARCHED` cells, NaN where few are shared."""
     n = scipy.fft.next_fast_len(_COLUMNS + _SEARCHED, real=True)
     (count_a, sum_a, squares_a), (count_b, sum_b, squares_b) = (
         [scipy.fft.rfft(x, n, axis=1) for x in (one.count, one.mean, one.mean**2)] for one in (a, b)
@@ -244,7 +244,7 @@ def _best(correlation: Array, reach: float, clear: float) -> Peak | str:
     around = slice(max(best - 1, 0), best + 2)
     if (
         not random or top <= clear * random or not top >= correlation[around].max()
-    ):  # the latter beside a place beyond reach
+    ):  # no maximum: next to a peak beyond the search range
         return "intensity: no place stands out"
     if top - second < _DISTINCT * random:
         return "intensity: several places are alike"

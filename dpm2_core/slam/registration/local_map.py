@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings that a scan is registered to: recent points, and planes fitted where they are asked for."""
+"""The local map that a scan is registered to: recent points, with planes that are fitted when they are needed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from dpm2_core.slam.registration.occupied_voxels import OccupiedVoxels
 from dpm2_core.slam.registration.point_to_plane import distances
 
 _YOUNG = 3  # scans
-_SIGHT = (0.99, 1.1)  # quantile of the distances of a scan's points, and times that: farther away it shows nothing
+_SIGHT = (0.99, 1.1)  # quantile of the ranges of a scan, and factor on it: beyond, the map has no information
 _NEIGHBORS = 15  # points that a plane is fitted to
-_SCANS = 25  # later, points are forgotten: it bounds memory, and traces of what moves
+_SCANS = 25  # scans after which points are dropped: it bounds memory, and traces of moving objects
 _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
@@ -27,27 +27,27 @@ class LocalMapSettings(Settings):
     """The local map of the odometry."""
 
     spacing: float = Field(2.0, ge=0)
-    """A scan enters the map after this much motion, m (or a turn of 10 degrees)."""
+    """A scan enters the map after this much motion, m (or a rotation of 10 degrees)."""
     radius: float = Field(100.0, gt=0)
-    """Points farther than this from the sensor are forgotten, m."""
+    """Points farther than this from the sensor are dropped, m."""
 
 
 class LocalMap:
     """Points (M, 3) float64 in the odometry frame, empty until the first `insert`."""
 
     def __init__(self, settings: LocalMapSettings, voxel: float) -> None:
-        """voxel: edge of the cells that hold one point each, m."""
+        """voxel: edge of the cells that contain one point each, m."""
         self._settings, self._voxel = settings, voxel
         self.points: Array = np.zeros((0, 3))
         self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
         self._inserted = 0
         self._T_last: Array | None = None
         self._taken = np.zeros((0, 4, 4))
-        self._sights = np.zeros(0)  # m, of the scans that have entered
-        self._voxels: OccupiedVoxels | None = None  # made when it is needed
+        self._sights = np.zeros(0)  # m, range of the scans that have entered
+        self._voxels: OccupiedVoxels | None = None  # computed when needed
 
     def fresh(self) -> LocalMap:
-        """Another one, empty."""
+        """A new, empty map with the same settings."""
         return LocalMap(self._settings, self._voxel)
 
     def __len__(self) -> int:
@@ -55,34 +55,34 @@ class LocalMap:
 
     @property
     def is_young(self) -> bool:
-        """Whether few scans have entered: another one may well see what none of them did."""
+        """Whether few scans have entered: a new scan may show much that none of them did."""
         return self._inserted <= _YOUNG
 
     def wants(self, T_odom_lidar: Array) -> bool:
-        """Whether a scan taken at that pose would show enough that is new."""
+        """Whether a scan at that pose shows enough that is new."""
         if self._T_last is None:
             return True
         meters, degrees = se3.apart(self._T_last, T_odom_lidar)
         return meters > self._settings.spacing or degrees > 10
 
     def in_sight(self, source: Array) -> Array:
-        """Of a scan (N, 3) the points no farther away than scans of the map could see.
+        """The points of a scan (N, 3) that are not farther away than the scans of the map could see.
 
-        Where fog lifts, or a door opens, most of what a scan shows is farther away, and says nothing about its pose.
+        When fog lifts or a door opens, most points of a scan are farther away and do not determine its pose.
         """
         squared, sight = np.einsum("ij,ij->i", source, source), _SIGHT[1] * self._sights.max(initial=0.0)
         return source if squared.max(initial=0.0) <= sight * sight else source[squared <= sight * sight]
 
     def from_nearest_scan(self, T_odom_lidar: Array) -> Array:
-        """A pose (4, 4) as seen from the nearest one that a scan of the map was taken at."""
+        """A pose (4, 4) relative to the nearest pose of a scan in the map."""
         away = self._taken[:, :3, 3] - T_odom_lidar[:3, 3]
         return se3.inverse(self._taken[np.einsum("ij,ij->i", away, away).argmin()]) @ T_odom_lidar
 
     def insert(self, points: NDArray[np.floating], T_odom_lidar: Array, taken: Array | None = None) -> None:
-        """Add the (N, 3+) points of a scan where the map has none yet; drop what is far or old.
+        """Add the (N, 3+) points of a scan where the map has none yet; drop those that are far away or old.
 
         Args:
-            taken: (K, 4, 4) where the scans were taken that the points are merged from, as seen from T_odom_lidar.
+            taken: (K, 4, 4) poses of the scans that the points are merged from, relative to T_odom_lidar.
         """
         away = np.linalg.norm(points[:, :3], axis=1)
         sight = np.quantile(away, _SIGHT[0]) if len(away) else 0.0
@@ -105,25 +105,25 @@ class LocalMap:
         self._variances = np.full(len(self.points), np.nan)
 
     def match(self, queries: Array, radius: float) -> tuple[Array, Array, Array]:
-        """The surface at the map point nearest to each of the (Q, 3) queries, among those closer than `radius`, m.
+        """The surface at the map point nearest to each of the (Q, 3) queries, among those within `radius`, m.
 
         Returns:
             Distance of the query from it (Q,), m, its unit normal (Q, 3) and the variance along that (Q,), m2; NaN
-            where no point is so close.
+            if no point is within the radius.
         """
         index = self._grid.nearest(queries, radius)
         self._fit_planes(index[index >= 0])
         return distances(queries, index, self.points, self._normals, self._variances)
 
     def fit(self, source: Array, poses: Array) -> Array:
-        """How well a scan (N, 3) fits at each of the poses (P, 4, 4), roughly; see `OccupiedVoxels`."""
+        """Approximate fit of a scan (N, 3) at each of the poses (P, 4, 4); see `OccupiedVoxels`."""
         if self._voxels is None:
             assert self._T_last is not None
             self._voxels = OccupiedVoxels(self.points, self._T_last[:3, 3])
         return self._voxels.fit(source, poses)
 
     def _fit_planes(self, index: NDArray[np.int32]) -> None:
-        """Where there are none yet."""
+        """Fit planes at these map points, if not done yet."""
         asked = np.zeros(len(self.points), bool)
         asked[index] = True
         requested = np.flatnonzero(asked & np.isnan(self._variances))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scan to map by neural descriptors: those of a frame to the merged ones of keyframes around it; no start needed."""
+"""Registration of a scan to a map by neural descriptors, against merged ones of keyframes; it needs no start."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
 
 
 class NeuralSettings(Settings):
-    """Registration by the network; `registration` must be another than `geometric`."""
+    """Registration by the network; `registration` must not be `geometric`."""
 
     weights: str = "small"
     """Name of weights that come with dpm2, or path of a .safetensors file."""
     spacing: float = Field(1.0, gt=0)
-    """A frame's descriptors enter the map after this much motion, m (or a turn of 15 degrees)."""
+    """A frame's descriptors enter the map after this much motion, m (or a rotation of 15 degrees)."""
     residual: float = Field(0.0, ge=0)
     """Residual at which `spacing` shrinks, as `keyframes.residual`."""
     frames: int = Field(2, ge=1, le=16)
-    """So many of the map's frames, the nearest to the predicted pose, are merged and registered to."""
+    """Number of the map's frames, those nearest to the predicted pose, that are merged for the registration."""
     solver: Literal["consensus", "confident"] = "consensus"
-    """How pairs of descriptors become a pose: by a consensus, and matched again with the pose at hand; or, as in the
-    paper, by a robust SVD that starts from the most confident pairs. Loops and relocalization follow it."""
+    """How pairs of descriptors become a pose: by a consensus, with a second matching at the resulting pose; or, as in
+    the paper, by a robust SVD that starts from the most confident pairs. Loops and relocalization use it, too."""
     refined: int = Field(0, ge=0, le=64)
-    """Register a frame that enters the map once more, to so many frames merged, and take the more certain pose: the
-    paper's refinement from scan to map. 0: not."""
+    """Register a frame that enters the map a second time, to this many merged frames, and use the pose with the smaller
+    covariance: the scan-to-map refinement of the paper. 0: off."""
     min_confidence: float = Field(0.1, ge=0, le=1)
-    """Probability that a pose is right, below which there is no result: here the motion so far can contradict it. In a
-    search for a place, where nothing does, at least 0.6."""
+    """Probability that a pose is right, below which it is rejected; the motion so far can contradict it here. In a
+    search for a place, where nothing can, at least 0.6."""
 
 
-_RADIUS = 20.0  # m: frames farther than this from the predicted pose are not registered to, unless all are
+_RADIUS = 20.0  # m: frames farther than this from the predicted pose are not used, unless all are farther
 _MAX_SIGMA = 0.6  # m, standard deviation of the position in its worst direction
 _PLACE = 0.6
-"""Least confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and wrong ones
+"""Minimum confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and wrong poses
 agree with each other."""
 
 
 class NeuralScanRegistration:
-    """Descriptors to the descriptors of earlier frames. The prediction only chooses which those are."""
+    """Registers descriptors to the descriptors of earlier frames. The prediction only selects these frames."""
 
     def __init__(self, settings: NeuralSettings, preprocessor: Preprocessor, model: DeepPointMap2) -> None:
         self.uses_images = model.encoder.image is not None
@@ -84,10 +84,10 @@ class NeuralScanRegistration:
         )
 
     def describe(self, points: Points, images: tuple[Image, ...] = (), up: Up | None = None) -> Descriptors:
-        """The descriptors of a prepared scan (P, 4), `up` in it as in `Frame`.
+        """The descriptors of a prepared scan (P, 4) with its `up` as in `Frame`.
 
         Raises:
-            Dpm2Error: it has none.
+            Dpm2Error: the scan has none.
         """
         return self._model.describe(Frame(0, points, images=images, up=up))
 
@@ -121,7 +121,7 @@ class NeuralScanRegistration:
         return None
 
     def _registered(self, scan: Scan, T_near: Array, frames: int) -> Registration:
-        """T_odom_lidar by the descriptors of the frames nearest to a pose (4, 4), merged."""
+        """T_odom_lidar by the merged descriptors of the frames nearest to a pose (4, 4)."""
         if scan.descriptors is None:
             return Registration.failed("neural", self.rejection(scan), T_near)
         if (around := self._map.around(T_near, frames)) is None:
@@ -139,11 +139,11 @@ class NeuralScanRegistration:
         return wanted
 
     def keep(self, scan: Scan, T_odom_lidar: Array) -> None:
-        """Remember a scan that was taken there."""
+        """Add a scan at its pose to the map."""
         if scan.description is None:
             return
         description = scan.description
-        if not description.made:  # a whole scan with its images, which may never be needed, takes megabytes
+        if not description.made:  # do not keep the whole scan and its images, megabytes that may never be needed
             network = self._model.settings
             few = scan.points[voxel_first(scan.points, network.points.voxel)]
             images = scan.images if self.uses_images else ()

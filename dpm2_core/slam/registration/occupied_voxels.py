@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a scan fits a map at hundreds of poses, roughly: which of its points fall into occupied voxels.
+"""Approximate fit of a scan to a map at hundreds of poses: the number of its points in occupied voxels.
 
 After E. Olson, "Real-time correlative scan matching", ICRA 2009, in three dimensions.
 """
@@ -11,12 +11,12 @@ import numpy as np
 from dpm2_core.frame import Array
 
 _VOXEL = 0.5  # m
-_RANGE, _HEIGHT = 60.0, 15.0  # m from the center: what lies farther says little of a position
-_INSIDE, _BESIDE = 2, 1  # what a point counts in a voxel that is occupied, and in one next to it
+_RANGE, _HEIGHT = 60.0, 15.0  # m from the center: points farther away hardly constrain the position
+_INSIDE, _BESIDE = 2, 1  # value of a point in an occupied voxel, and in one next to it
 
 
 class OccupiedVoxels:
-    """The voxels around a center that hold map points."""
+    """The voxels around a center that contain map points."""
 
     def __init__(self, points: Array, center: Array) -> None:
         """`points` (M, 3) and `center` (3,) in the map frame, m."""
@@ -33,11 +33,11 @@ class OccupiedVoxels:
         self._value[x, y, z] = _INSIDE
 
     def fit(self, source: Array, poses: Array) -> Array:
-        """Mean value of the voxels that the points (N, 3) of a scan fall into at each of the poses (P, 4, 4)."""
+        """Mean value of the voxels that contain the points (N, 3) of a scan, at each of the poses (P, 4, 4)."""
         R, t = poses[:, :3, :3].astype(np.float32), (poses[:, :3, 3] - self._origin).astype(np.float32)
         moved = np.einsum("pij,nj->pni", R, source.astype(np.float32), optimize=True) + t[:, None]
         inside = ((moved >= 0) & (moved < np.float32(_VOXEL) * np.array(self._value.shape, np.float32))).all(-1)
-        moved[~inside] = 0  # a corner, which is empty; what is beyond any integer may be outside
+        moved[~inside] = 0  # a corner, which is empty; coordinates outside may exceed any integer
         cell = (moved / np.float32(_VOXEL)).astype(np.int32)
         value = self._value[cell[..., 0], cell[..., 1], cell[..., 2]]
         return np.asarray(value.mean(1))

@@ -10,8 +10,8 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
 
 ORDER = 3
-"""Of the way during a sweep as a polynomial in time: a twist, its rate and the rate of that. Legs make 4 steps per
-second, in a sweep of 0.1 s nearly half of one: at order 2 such a robot's errors were 2 to 3 times as large."""
+"""Degree of the motion during a sweep as a polynomial in time: a twist, its rate and the rate of that. Legs make 4
+steps per second, nearly half a step in a sweep of 0.1 s: with degree 2 its errors were 2 to 3 times as large."""
 
 
 @compiled("Tuple((f8[::1], f8[:, ::1], f8[::1]))(f8[:, ::1], i4[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
@@ -35,8 +35,8 @@ def distances(
 
 @compiled("void(f8[::1], f8[:, ::1], f8[::1], f8[::1])")
 def _slope(point: Array, R: Array, normal: Array, J: Array) -> None:
-    """Writes into J (6,) how the distance of a point (3,) along a normal (3,) changes with a step on the right of a
-    pose with the rotation R (3, 3)."""
+    """Write the derivative of a point's (3,) distance along a normal (3,) to J (6,), for a step on the right of a pose
+    with the rotation R (3, 3)."""
     for i in range(3):
         J[3 + i] = normal[0] * R[0, i] + normal[1] * R[1, i] + normal[2] * R[2, i]
     J[0] = point[1] * J[5] - point[2] * J[4]
@@ -48,15 +48,15 @@ def _slope(point: Array, R: Array, normal: Array, J: Array) -> None:
 def linearize(
     source: Array, R: Array, residual: Array, normals: Array, variances: Array
 ) -> tuple[Array, Array, int, float]:
-    """One step of least squares with a Cauchy kernel.
+    """One least-squares step with a Cauchy kernel.
 
     Args:
         source: (N, 3) points in the sensor frame; R: (3, 3) the rotation of the pose.
-        residual: (N,) distances from planes, m, NaN where there is none; normals: (N, 3); variances: (N,), m2.
+        residual: (N,) distances from planes, m, NaN for unmatched points; normals: (N, 3); variances: (N,), m2.
 
     Returns:
-        Hessian (6, 6) and gradient (6,) of a step [rad, m] on the right of the pose; how many residuals lie within
-        three deviations, and the root of their mean square, m.
+        Hessian (6, 6) and gradient (6,) of a step [rad, m] on the right of the pose; number of residuals within three
+        standard deviations, and their root mean square, m.
     """
     H, gradient, J = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     fits, total = 0, 0.0
@@ -83,7 +83,7 @@ def linearize(
 def moments(
     source: Array, times: Array, R: Array, residual: Array, normals: Array, variances: Array
 ) -> tuple[Array, Array]:
-    """As `linearize`, with the Hessian and the gradient weighed by powers of the times (N,) of the points.
+    """As `linearize`, with Hessian and gradient weighted by powers of the times (N,) of the points.
 
     Returns:
         (2 ORDER + 1, 6, 6) Hessians, the k-th with each point times its time^k, and (ORDER + 1, 6) gradients.

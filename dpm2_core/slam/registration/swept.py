@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sweep in motion to a local map: its pose and, together with it, the motion that bent it.
+"""Registration of a sweep in motion to a local map: its pose together with the motion that distorted it.
 
-A rigid scan assumes one velocity during a sweep; who walks, hovers or drives over a bump changes it meanwhile. Here the
-way during the sweep is a polynomial of third degree in time that begins where, and as fast as, the sweep before ended.
+A rigid scan assumes a constant velocity during a sweep, but a walking, hovering or bouncing platform changes it. Here
+the motion during the sweep is a polynomial of third degree in time. It starts with the pose and the velocity at the end
+of the previous sweep.
 """
 
 from __future__ import annotations
@@ -22,27 +23,27 @@ from dpm2_core.slam.registration.point_to_plane import ORDER, moments
 
 _ITERATIONS = 12
 _CHI2 = 21.03
-"""95 % quantile of chi2 with 12 degrees of freedom. Of sweeps on foot, on legs and of cars the largest was 10; where a
-driver's times run backwards it is 30 on average."""
-_END = (3e-4, 3e-3)  # rad and m: a smaller change of the pose, and of the ends of the sweep, is none
+"""95 % quantile of chi2 with 12 degrees of freedom. Of sweeps on foot, on legs and of cars the largest was 10; with
+times that run backwards in a driver it is 30 on average."""
+_END = (3e-4, 3e-3)  # rad and m: iterations end at smaller changes of the pose, and of the ends of the sweep
 JOINT = np.diag(np.repeat([np.radians(0.05), 0.005, 0.1, 0.1], 3) ** 2)
-"""Covariance (12, 12) [rad, m, rad/s, m/s] of what is left between the end of a sweep and the beginning of the next."""
+"""Covariance (12, 12) [rad, m, rad/s, m/s] of the difference between the end of a sweep and the start of the next."""
 
 _GYROSCOPE = 0.07
-"""Standard deviation of a measured rate of turn beside the points, rad/s, as that of a turn from scan to scan."""
+"""Standard deviation of a measured rotation rate next to the points, rad/s, as that of a rotation between scans."""
 
 Matched = Callable[[Array, Array], tuple[Array, Array, Array]]
-"""Of points (N, 3) at a pose (4, 4): distances from the map's planes (N,), m, normals (N, 3), variances (N,), m2."""
+"""For points (N, 3) at a pose (4, 4): distances from the map's planes (N,), m, normals (N, 3), variances (N,), m2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beginning:
-    """What is known of a sweep before it is registered.
+    """Prior of a sweep before it is registered.
 
     Attributes:
-        T: (4, 4) T_odom_lidar at its first point. twist: (6,) [rad/s, m/s] then. covariance: (12, 12) of both.
-        half: s from then to the middle of the sweep.
-        expected, deviation: (ORDER, 6) of the motion around its middle, beside that.
+        T: (4, 4) T_odom_lidar at its first point. twist: (6,) [rad/s, m/s] there. covariance: (12, 12) of both.
+        half: s from the first point to the middle of the sweep.
+        expected, deviation: (ORDER, 6) additional prior of the motion around the middle.
     """
 
     T: Array
@@ -53,7 +54,7 @@ class Beginning:
     deviation: Array
 
     def turning(self, measured: Array) -> Beginning:
-        """With the rotation during the sweep as an IMU has measured it, derivatives (ORDER, 3) of it."""
+        """The same with the rotation during the sweep measured by an IMU, its derivatives (ORDER, 3)."""
         expected, deviation = self.expected.copy(), self.deviation.copy()
         expected[:, :3] = measured
         deviation[:, :3] = _GYROSCOPE / self.half ** np.arange(ORDER)[:, None]
@@ -62,10 +63,10 @@ class Beginning:
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """A sweep that was registered.
+    """A registered sweep.
 
     Attributes:
-        T: (4, 4) T_odom_lidar in its middle. motion: (ORDER, 6) around then, see `curve.poses`.
+        T: (4, 4) T_odom_lidar at its middle. motion: (ORDER, 6) around it, see `curve.poses`.
         covariance: (6 + 6 ORDER, 6 + 6 ORDER) of the pose, on its right, and of the motion.
         half: s from its middle to its ends.
     """
@@ -76,7 +77,7 @@ class Swept:
     half: float
 
     def placed(self, result: Registration) -> Swept:
-        """With the pose of a result, which may rest on more than the points: what differs was motion, too."""
+        """Take the pose of a result, which may use more than the points; the motion changes by the correlated part."""
         T = result.T_target_source
         off = se3.way(self.T, T)
         gain = np.linalg.solve(self.covariance[:6, :6] + result.of_scene, self.covariance[:6]).T
@@ -84,7 +85,7 @@ class Swept:
         return replace(self, T=T, motion=motion, covariance=self.covariance - gain @ self.covariance[:6])
 
     def next(self, seconds: float, half: float, steadiness: float) -> Beginning:
-        """Of a sweep whose middle is `seconds` later."""
+        """The prior of a sweep whose middle is `seconds` later."""
         pause = max(seconds - self.half - half, 0.0)
         of_end = _at(self.half)
         go_on = np.eye(12)
@@ -99,20 +100,20 @@ class Swept:
 
 
 def begun_steadily(T_before: Array, twist: Array, seconds: float, half: float, steadiness: float) -> Beginning:
-    """Of a sweep whose middle is `seconds` after the pose T_before (4, 4), if nothing is known but the twist (6,) from
-    there to here."""
+    """The prior of a sweep whose middle is `seconds` after the pose T_before (4, 4), if only the twist (6,) between the
+    two is known."""
     sigma = steadiness * seconds / 2
     covariance = np.diag(np.repeat([sigma * half, sigma], 6) ** 2)
     return Beginning(T_before @ se3.exp((seconds - half) * twist), twist, covariance, half, *_steady(half, steadiness))
 
 
 def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning, shared: float) -> Swept | None:
-    """Pose and motion of a sweep, by least squares from a pose T (4, 4) and a steady motion on; None where they
-    contradict how it began: its times are wrong, or its points are at the wrong walls.
+    """Pose and motion of a sweep by least squares, starting from a pose T (4, 4) and a constant motion. None if they
+    contradict the prior: the times of the points are wrong, or they are matched to the wrong walls.
 
     Args:
-        scan: timed from the middle of the sweep. matched: points to the map.
-        shared: so many points count as one, as those of a plane are not independent.
+        scan: with times relative to the middle of the sweep. matched: matches points with the map.
+        shared: number of points that count as one, since the points of a plane are not independent.
     """
     motion = np.concatenate([beginning.twist[None], np.zeros((ORDER - 1, 6))])
     information = np.linalg.inv(beginning.covariance)
@@ -134,7 +135,7 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
             break
     if off @ information @ off > _CHI2:
         return None
-    T = se3.orthonormalized(T)  # what rounding has added up to
+    T = se3.orthonormalized(T)  # removes accumulated rounding errors
     return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), beginning.half)
 
 
@@ -149,19 +150,19 @@ def _normal_equations(
 
 
 def _steady(half: float, steadiness: float) -> tuple[Array, Array]:
-    """`expected` and `deviation` of a `Beginning`: an acceleration with that deviation (m/s2 and rad/s2), which may
-    become its opposite in half a sweep."""
+    """`expected` and `deviation` of a `Beginning`: an acceleration with this standard deviation (m/s2 and rad/s2),
+    which may reverse in half a sweep."""
     deviation = [np.inf, *(steadiness * (2 / half) ** k for k in range(ORDER - 1))]
     return np.zeros((ORDER, 6)), np.repeat(np.array(deviation)[:, None], 6, 1)
 
 
 def _at(time: float) -> Array:
-    """(12, 6 + 6 ORDER) how the pose and the twist at a time, s, change with the pose at 0 and the motion; to first
-    order in the way."""
+    """(12, 6 + 6 ORDER) Jacobian of pose and twist at a time, s, with respect to the pose at 0 and the motion; to first
+    order in the motion."""
     of_pose = [time**k / factorial(k) for k in range(ORDER + 1)]
     return np.concatenate([np.kron(of_pose, np.eye(6)), np.kron([0.0, *of_pose[:-1]], np.eye(6))])
 
 
 def _twist(at: Array, motion: Array) -> Array:
-    """(6,) at a time of which `at` is `_at`."""
+    """(6,) twist at the time of `at`, which is `_at`."""
     return np.asarray(at[6:, 6:] @ motion.ravel())

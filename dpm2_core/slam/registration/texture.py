@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texture where the geometry is silent: how far along a tunnel or a highway.
+"""Texture for directions that the geometry does not constrain: the position along a tunnel or a highway.
 
-Points and descriptors leave a direction open there: along it, every pose fits alike. The points of one scan have a
-brightness in the image that was taken with it, and the same points are looked for in the image of another scan. One
-number is unknown, the way along the open direction; it is the one at which the two correlate best.
+Points and descriptors leave a direction unconstrained there: along it, all poses fit equally. The points of one scan
+have a brightness in the image taken with it, and the same points are searched in the image of another scan. One number
+is unknown, the offset along the unconstrained direction: the best is the one with the highest correlation of the two.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from dpm2_core.geometry.contrast import local_contrast
 
 
 class VisualSettings(Settings):
-    """How far along, by the image or by the intensities of the LiDAR."""
+    """Offset along an unconstrained direction, by the image or by the intensities of the LiDAR."""
 
     enabled: bool = True
-    """Where scans leave a direction open, ask the intensities of the LiDAR and a camera: the first one; a second one
-    only where that has no image."""
+    """Where scans leave a direction unconstrained, use the intensities of the LiDAR and a camera: the first camera, or
+    a second one if the first has no image."""
     min_correlation: float = Field(0.3, ge=0, le=1)
     """Minimum correlation; lower values are discarded."""
     distinct: float = Field(0.1, ge=0, le=1)
@@ -37,27 +37,27 @@ class VisualSettings(Settings):
 
 
 _WIDTH = 640  # pixels: images are reduced to it
-_POINTS = 1500  # are compared, at most
+_POINTS = 1500  # maximum number of compared points
 _NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
-_STEPS = (0.1, 0.02)  # m, between the places tried: everywhere, then around the best
-_GLANCE, _FEW = 0.2, 3  # m, between the places at a glance, by each third point
-_BLUR = (2.5, 1.0)  # pixels: so that nothing is missed between two of them
-_BESIDE = 1.0  # m, before and behind: what is the same there says nothing
-_LOCAL = 12.0  # pixels: light that changes more slowly is no texture
+_STEPS = (0.1, 0.02)  # m, between the offsets that are tried: everywhere, then around the best
+_GLANCE, _FEW = 0.2, 3  # m, between the offsets of a quick search, with every third point
+_BLUR = (2.5, 1.0)  # pixels: so that no maximum is missed between two offsets
+_BESIDE = 1.0  # m, before and behind: structure that is the same there does not constrain the offset
+_LOCAL = 12.0  # pixels: brightness that changes more slowly is no texture
 _LEAST = 100  # points that both images must show
-_CORRELATED = 100  # pixels next to each other, and the points between them, say the same
+_CORRELATED = 100  # neighboring pixels, and the points between them, that count as one independent value
 _COARSE_MARGIN = 0.3  # candidates within it of the best coarse correlation are refined at the fine level
-_APART = 0.6  # m: other places, not the slope of the best one
+_APART = 0.6  # m: a separate peak, not the slope of the best one
 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Brightness of an image without its slow changes.
+    """Brightness of an image without its slow variation.
 
     Attributes:
         levels: (h, w) float32, blurred by each of `_BLUR`.
         K: (3, 3) of the reduced image. T_cam_lidar: (4, 4).
-        sigma: standard deviation of the camera's place along the way, m, where the image has a time of its own.
+        sigma: standard deviation of the camera's position along the motion, m, if the image has its own time.
     """
 
     levels: tuple[NDArray[np.float32], ...]
@@ -66,7 +66,7 @@ class Texture:
     sigma: float = 0.0
 
     def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Pixels (..., N, 2) of points (..., N, 3) of the camera frame, m, and which of them the image shows."""
+        """Pixels (..., N, 2) of points (..., N, 3) in the camera frame, m, and a mask of those inside the image."""
         ahead = points[..., 2] > _NEAR / 2
         image = points @ self.K.T
         uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
@@ -75,9 +75,9 @@ class Texture:
         return uv, shown
 
     def sample(self, points: Array, level: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Texture (S, N) at points (S, N, 3) of the camera frame, m, and which of them the image shows."""
+        """Texture (S, N) at points (S, N, 3) in the camera frame, m, and a mask of those inside the image."""
         uv, shown = self.project(points)
-        if not shown.size:  # OpenCV takes no empty map
+        if not shown.size:  # OpenCV accepts no empty map
             return np.zeros(shown.shape, np.float32), shown
         found = cv2.remap(self.levels[level], uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
         return np.asarray(found, np.float32), shown
@@ -85,7 +85,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Points (N, 3) of a scan in its LiDAR frame, float32, and how their texture (N,) changes, at each of `_BLUR`."""
+    """Points (N, 3) of a scan in its LiDAR frame, float32, and the change of their texture (N,), per level of blur."""
 
     points: Points
     texture: tuple[NDArray[np.float32], ...]
@@ -93,7 +93,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Peak:
-    """A way along the open direction where two scans look alike: m, its standard deviation, m, and the correlation."""
+    """An offset along the unconstrained direction, m, its standard deviation, m, and the correlation of two scans."""
 
     offset: float
     sigma: float
@@ -101,7 +101,7 @@ class Peak:
 
 
 def textured(image: Image) -> Texture:
-    """Brightness without its slow changes, over its local contrast, undistorted."""
+    """Brightness without its slow variation, divided by its local contrast, undistorted."""
     camera, gray = image.camera, cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
     if camera.distortion:
         gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
@@ -113,10 +113,10 @@ def textured(image: Image) -> Texture:
 
 
 def reference(points: Points, image: Texture, axis: Array) -> Reference:
-    """Some of the points (P, 4) that the image shows, spread evenly over the scan.
+    """A subset of the points (P, 4) that are inside the image, spread evenly over the scan.
 
     Args:
-        axis: (3,) in the LiDAR frame, the direction that is open; either sign.
+        axis: (3,) in the LiDAR frame, the unconstrained direction; either sign.
     """
     in_camera = se3.transform(image.T_cam_lidar, points[:, :3].astype(np.float64))
     kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
@@ -130,11 +130,11 @@ def reference(points: Points, image: Texture, axis: Array) -> Reference:
 def along(
     s: VisualSettings, result: Registration, known: Reference, image: Texture, T_ref_target: Array, reach: float
 ) -> Registration:
-    """A registration, moved along its open direction to where the images agree; unchanged, and why, if they do not.
+    """A registration, moved along its unconstrained direction to where the images match; else unchanged, with a reason.
 
     Args:
-        known: what is looked for in the image of the source. T_ref_target: (4, 4) from the target to its scan.
-        reach: the farthest that is looked to either side, m.
+        known: reference that is searched in the image of the source. T_ref_target: (4, 4) from the target to its scan.
+        reach: search range to either side, m.
     """
     found = _search(s, known, image, T_ref_target @ result.T_target_source, result.open_direction, reach)
     if isinstance(found, str):
@@ -143,13 +143,13 @@ def along(
 
 
 def moved_along(result: Registration, found: Peak, T_ref_target: Array, method: str) -> Registration:
-    """A registration, moved along its open direction by what was found there, as far as that is surer.
+    """A registration, moved along its unconstrained direction to a peak, weighted by their covariances.
 
     Args:
-        T_ref_target: (4, 4) from the target to the scan by which it was found. method: what the result is of.
+        T_ref_target: (4, 4) from the target to the scan with which the peak was found. method: of the new result.
     """
     b = np.concatenate([np.zeros(3), result.open_direction])
-    prior = result.of_scene  # images say as little of calibration errors as points, and those grow with the new motion
+    prior = result.of_scene  # like points, images do not reduce calibration errors, which grow with the new motion
     gain = prior @ b / (b @ prior @ b + found.sigma**2)
     T = se3.orthonormalized(result.T_target_source @ se3.exp(gain * found.offset))
     covariance = prior - np.outer(gain, b @ prior)
@@ -160,7 +160,7 @@ def moved_along(result: Registration, found: Peak, T_ref_target: Array, method: 
 def _search(
     s: VisualSettings, known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float
 ) -> Peak | str:
-    """The way along `axis` of the LiDAR frame, or why it is not known."""
+    """The offset along `axis` of the LiDAR frame, or why it is unknown."""
     if len(known.points) < _LEAST:
         return f"image: only {len(known.points)} points in it"
     best, *others = peaks(s, known, image, T_ref_lidar, axis, reach) or [Peak(0.0, np.inf, 0.0)]
@@ -174,11 +174,11 @@ def _search(
 def peaks(
     s: VisualSettings, known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float
 ) -> list[Peak]:
-    """Where along `axis` (3,) of the LiDAR frame the texture of a reference is found in an image, the best first.
+    """Offsets along `axis` (3,) of the LiDAR frame where the texture of a reference matches an image, the best first.
 
     Args:
-        T_ref_lidar: (4, 4) from the LiDAR frame of the image to that of the reference, but for the way along the axis.
-        reach: the farthest that is looked to either side, m.
+        T_ref_lidar: (4, 4) from the image's LiDAR frame to that of the reference, except for the offset along the axis.
+        reach: search range to either side, m.
     """
     offsets = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
     correlation = _correlated(known, image, T_ref_lidar, axis, offsets, 0)
@@ -192,7 +192,7 @@ def peaks(
 
 
 def glance(known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float) -> Peak:
-    """As the best of `peaks`, by fewer points and coarser steps: a tenth of the time."""
+    """Approximately the best of `peaks`, with fewer points and coarser steps: a tenth of the time."""
     few = Reference(known.points[::_FEW], tuple(level[::_FEW] for level in known.texture))
     offsets = np.arange(-reach, reach + _GLANCE / 2, _GLANCE)
     correlation = _correlated(few, image, T_ref_lidar, axis, offsets, 0)
@@ -203,7 +203,7 @@ def glance(known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, re
 def _correlated(
     known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, offsets: Array, level: int
 ) -> NDArray[np.float32]:
-    """Correlation (S,) of the texture with that of the image for the LiDAR at each of the offsets (S,), m."""
+    """Correlation (S,) of the texture with the image for each offset (S,), m, of the LiDAR."""
     there = se3.transform(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
     step = image.T_cam_lidar[:3, :3] @ axis
     return _correlations(known.texture[level], *_changes(image, there, step, offsets, level))
@@ -212,14 +212,14 @@ def _correlated(
 def _changes(
     image: Texture, points: Array, step: Array, offsets: Array, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Texture (S, N) at points (N, 3) less `offsets` (S,) times `step` (3,), but only what changes along that.
+    """Texture (S, N) at points (N, 3) minus `offsets` (S,) times `step` (3,): only its changes along that step.
 
-    Rails and the edges of a road and of its walls look the same everywhere along it: the texture is
-    taken relative to that at the points `_BESIDE` m before and behind, which lie on the same surfaces.
+    Rails and the edges of roads and walls look the same everywhere along them. Therefore the texture is relative to
+    that at the points `_BESIDE` m before and behind, which lie on the same surfaces.
     """
     every = float(offsets[1] - offsets[0]) if len(offsets) > 1 else _BESIDE
     k = round(_BESIDE / every)
-    if len(offsets) > 2 * k:  # the places beside are among the offsets
+    if len(offsets) > 2 * k:  # the positions before and behind are among the offsets
         wide = offsets[0] + every * np.arange(-k, len(offsets) + k)
         found, shown = image.sample(points - wide[:, None, None] * step, level)
         parts = [(found[a : a + len(offsets)], shown[a : a + len(offsets)]) for a in (0, k, 2 * k)]
@@ -239,7 +239,7 @@ def _maxima(correlation: NDArray[np.float32], least: float) -> NDArray[np.intp]:
 def _correlations(
     values: NDArray[np.float32], found: NDArray[np.float32], shown: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Correlation (S,) of values (N,) with each row of found (S, N) over what is shown; 0 where that is too little."""
+    """Correlation (S,) of values (N,) with each row of found (S, N) where shown; 0 if too few are shown."""
     weight = shown.astype(np.float32)
     count = weight.sum(1)
     x = (values - (weight @ values / np.maximum(count, 1))[:, None]) * weight

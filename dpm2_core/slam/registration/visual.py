@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image or intensity where the geometry is silent, from scan to scan. In town neither is ever touched.
+"""Image or intensity for directions that the geometry does not constrain, from scan to scan. Never used in towns.
 
-Both images are of one camera. One is enough for one number, so that of two cameras the second is asked only where the
-earlier scan has no image of the first. Where the intensities of the LiDAR tell the way, the image is their check.
+Both images are from one camera. One is enough for one unknown, so a second camera is used only if the earlier scan has
+no image of the first. If the intensities of the LiDAR determine the distance, the image checks them.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, a
 from dpm2_core.slam.registration.swept import Beginning, Swept
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
-_BASELINE = 3.0  # m: way after which another image is the one to compare with
-_REACH, _LEAST_REACH = 20.0, 0.6  # m to either side: the farthest that is looked, and however well the motion is known
-_PERIOD = 0.1  # s, of most LiDARs: the prediction is of one period, its error over that time is the error of the speed
-_ANY_SPEED = 15.0  # m/s, standard deviation while it is not known
+_BASELINE = 3.0  # m: distance after which the reference image is replaced
+_REACH, _LEAST_REACH = 20.0, 0.6  # m to either side: largest search range, and the least for a known motion
+_PERIOD = 0.1  # s, of most LiDARs: the prediction is over one period; its error divided by it is that of the speed
+_ANY_SPEED = 15.0  # m/s, standard deviation of an unknown speed
 
 
 class VisualScanRegistration:
-    """Any registration, and image or intensity along the direction that it leaves open."""
+    """Any registration, with image or intensity along the direction that it leaves unconstrained."""
 
     def __init__(self, settings: VisualSettings, registration: ScanRegistration, open_sigma: float) -> None:
-        """open_sigma: standard deviation of the position, m, above which its worst direction counts as open."""
+        """open_sigma: standard deviation of the position, m, above which its worst direction is unconstrained."""
         self._settings, self._open_sigma = settings, open_sigma
         self._registration = registration
-        self._last: tuple[Scan, Array] | None = None  # a scan with images and where it was taken
-        self._reference: Reference | None = None  # made of it when first needed
+        self._last: tuple[Scan, Array] | None = None  # a scan with images and its pose
+        self._reference: Reference | None = None  # computed from it when first needed
         self._intensity = IntensitySearch()
-        self._tied = False  # whether the last scan left no direction open
+        self._tied = False  # whether the last scan left no direction unconstrained
 
     uses_images = True
 
@@ -76,8 +76,8 @@ class VisualScanRegistration:
         return bool(np.linalg.norm(self._last[1][:3, 3] - T_odom_lidar[:3, 3]) >= _BASELINE)
 
     def _told(self, scan: Scan, result: Registration, information: Array | None) -> Registration:
-        """The result moved along its open direction by the intensities, which need no calibration, or else by the
-        image; as uncertain as these are apart where they exclude each other."""
+        """The result, moved along its unconstrained direction by the intensities, which need no calibration, or else by
+        the image. If the two contradict each other, the covariance covers both."""
         reach, of_speed = self._reach(result, information)
         by_image = self._by_image(scan, result, reach, of_speed)
         seen = by_image.method == "visual"
@@ -90,9 +90,9 @@ class VisualScanRegistration:
         return by_intensity
 
     def _by_image(self, scan: Scan, result: Registration, reach: float, of_speed: float) -> Registration:
-        """The result moved along its open direction to where the images agree; unchanged if they do not.
+        """The result, moved along its unconstrained direction to where the images match; unchanged if they do not.
 
-        The camera is elsewhere at an image that was taken later, relative to the scans, than that of the earlier scan.
+        If an image is taken later relative to its scan than that of the earlier scan, the camera's pose is adapted.
         """
         if self._last is None:
             return result
@@ -104,14 +104,14 @@ class VisualScanRegistration:
         if self._reference is None:
             axis = T_odom_ref[:3, :3].T @ result.T_target_source[:3, :3] @ result.open_direction
             self._reference = reference(earlier.points, textured(before), axis)
-        # Only the difference: the twist itself follows from the images, so that moving the camera by its whole offset
-        # feeds an error back, and it grows from half a period on. What is left is the offset times the change of speed.
+        # Only the difference of the two delays: the twist depends on the images, so moving the camera by the whole
+        # delay feeds errors back, which grow from half a period on. The remaining error: delay times speed change.
         late = image.time_offset - before.time_offset
         image_now = replace(textured(placed(image, late, scan.twist)), sigma=of_speed * abs(late))
         return along(self._settings, result, self._reference, image_now, se3.inverse(T_odom_ref), reach)
 
     def _reach(self, result: Registration, information: Array | None) -> tuple[float, float]:
-        """How far to look along the open direction, m, and the standard deviation of the speed along it, m/s."""
+        """Search range along the unconstrained direction, m, and the standard deviation of the speed along it, m/s."""
         if information is None:
             return _REACH, _ANY_SPEED
         b = np.concatenate([np.zeros(3), result.open_direction])
