@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which keyframes may enter a map: one that is not sound would spoil the poses, the clouds or the search of all others.
+"""Checks keyframes before they enter a map: an invalid one would corrupt poses, clouds or the search of all others.
 
-Asked where a keyframe comes in over the network, and again before the graph is touched.
+Called when a keyframe is received over the network, and again before the graph is changed.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_core.slam.store.rows import MAX_ID, why_no_pose
 
 MAX_DESCRIPTORS = 4096
-_REACH = 32_000.0  # m: as far as a packed cloud reaches
-_LARGEST_VARIANCE = 1e12  # m^2: of a pose that is not known at all
+_REACH = 32_000.0  # m: the range of a packed cloud
+_LARGEST_VARIANCE = 1e12  # m^2: of an unknown pose
 _LARGEST_FEATURE = 1000.0  # trained networks give less than 10; more would outweigh all other places in the search
 
 
 class RejectedError(UsageError):
-    """A keyframe that may not enter; `reason` is one of a few words to count it by, the text is one line."""
+    """A keyframe is rejected; `reason` is one of a few words, for counting; the text is one line."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -31,10 +31,10 @@ class RejectedError(UsageError):
 
 
 def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
-    """Reject a keyframe that could do harm.
+    """Reject a keyframe that could corrupt the map.
 
     Args:
-        channels: width of the features that the map's network makes; None: any.
+        channels: width of the features of the map's network; None: any.
 
     Raises:
         RejectedError: id, pose, cloud, covariance of the edge, or descriptors.
@@ -52,7 +52,7 @@ def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
 
 
 def check_pose(T: Array) -> None:
-    """Raises RejectedError unless (4, 4) is a rigid transform to a place nearer than `rows.FARTHEST`."""
+    """Raises RejectedError unless (4, 4) is a rigid transform to a position nearer than `rows.FARTHEST`."""
     if why := why_no_pose(T):
         raise RejectedError("pose", f"its pose is {why}")
 
@@ -64,7 +64,7 @@ def check_covariance(covariance: Array) -> None:
 
 
 def check_cloud(cloud: Points) -> None:
-    """Raises RejectedError unless (M, 4) is a cloud that can be kept."""
+    """Raises RejectedError unless (M, 4) is a cloud that can be stored."""
     if cloud.ndim != 2 or cloud.shape[1] != 4 or len(cloud) > MAX_POINTS:
         raise RejectedError("cloud", f"its cloud has shape {cloud.shape}; want (M, 4), at most {MAX_POINTS} points")
     if not np.isfinite(cloud).all():
@@ -74,7 +74,7 @@ def check_cloud(cloud: Points) -> None:
 
 
 def check_descriptors(d: Descriptors, channels: int | None) -> None:
-    """Raises RejectedError unless they can be compared with those of a network of so many `channels`."""
+    """Raises RejectedError unless they can be compared with those of a network with this number of `channels`."""
     count, width = d.features.shape
     if channels is not None and width != channels:
         raise RejectedError("descriptors", f"its descriptors have {width} channels, the map's network makes {channels}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes in, a globally consistent map out; with a store, a map file that is never more than a keyframe behind."""
+"""Builds a globally consistent map from keyframes; with a store, the map file is never more than a keyframe behind."""
 
 from __future__ import annotations
 
@@ -30,31 +30,31 @@ from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.writer import MapWriter
 
-_MOST_MISSED = 1000  # keyframes between two, for which an edge is made less certain
+_MOST_MISSED = 1000  # missing keyframes between two, for which the covariance of an edge is increased
 
 
 class MapSettings(Settings):
-    """The map that is shown and saved."""
+    """The map that is displayed and saved."""
 
     voxel: float = Field(0.3, gt=0)
-    """Spacing of its points, m."""
+    """Spacing of the map's points, m."""
     thumbnail: int = Field(0, ge=0, le=1024)
-    """Width of the image that a map file keeps of each keyframe, pixels. 0: only of the first of a drive, and of those
-    by whose picture one can say how far along a tunnel or a highway one is, see `slam.visual`: 6 to 10 kB each."""
+    """Width of the image that a map file stores of each keyframe, pixels. 0: only of the first keyframe of a drive, and
+    of those whose image gives the position along a tunnel or a highway, see `slam.visual`: 6 to 10 kB each."""
     moving_window: int = Field(5, ge=0)
-    """So many keyframes before and after one tell which of its points move, and are no part of the map; 0 keeps all."""
+    """Number of keyframes before and after one that show which of its points move; the map omits these; 0 keeps all."""
     redundancy: float = Field(SAME, ge=0)
-    """A keyframe gives up its cloud and descriptors for those of an older one that an accepted loop ties it to, within
-    this, m, and a turn of 30 degrees; 0 keeps all."""
+    """A keyframe gives up its cloud and descriptors for those of an older one if an accepted loop connects the two
+    within this distance, m, and a rotation of 30 degrees; 0 keeps all."""
 
 
 @dataclass(eq=False)
 class _Robot:
-    """One that has sent keyframes.
+    """A robot that has sent keyframes.
 
     Attributes:
         window: of its clouds. last: node of its last keyframe in this session, None before the first.
-        ids: so many are given. offset: of those of its present drive.
+        ids: number of ids given so far. offset: of the ids of its present drive.
     """
 
     window: MovingWindow
@@ -64,31 +64,31 @@ class _Robot:
 
 
 class _Start(NamedTuple):
-    """Where a session in a loaded map begins, as `Mapper.start_session` is told it, which says what is what."""
+    """Start of a session in a loaded map; see `Mapper.start_session`."""
 
     T_map_odom: Array | None
     covariance: Array
 
 
 class Mapper:
-    """Holds keyframes and pose graph of one robot or several; their odometry runs on untouched.
+    """Keyframes and pose graph of one robot or several; their odometry is not changed by the map.
 
-    Every robot has an odometry frame of its own. The map's frame is that of the first; where another one is in it is
-    not known before a loop ties the two.
+    Each robot has its own odometry frame. The map's frame is that of the first robot; the pose of another one in it is
+    not known before a loop connects the two.
 
     Attributes:
-        keyframes: all, without their clouds; a node is a position among them. ids count on over a robot's sessions.
-        clouds: (M, 4) of each in its own frame, read from disk; without what moves.
-        graph: their poses, and what ties them.
-        session_start: node of the first keyframe of this session: those before are of a map that was loaded.
+        keyframes: all, without their clouds; a node is an index into them. ids continue over a robot's sessions.
+        clouds: (M, 4) of each keyframe in its own frame, read from disk; without moving points.
+        graph: poses of the keyframes, and the constraints between them.
+        session_start: node of the first keyframe of this session: earlier ones are of a loaded map.
         loops: tried in this session, accepted or rejected.
-        thumbnail: JPEG of a node of a map that was loaded, or None.
+        thumbnail: JPEG of a node of a loaded map, or None.
     """
 
     def __init__(
         self, settings: MapSettings, graph: PoseGraph, loops: LoopCloser, store: MapStore | None = None
     ) -> None:
-        """`store`: the map file to go on with, its session begun; None keeps the map in memory, clouds on disk."""
+        """`store`: the map file to continue, its session begun; None keeps the map in memory, clouds on disk."""
         self._settings = settings
         self.graph = graph
         self._closer = loops
@@ -115,7 +115,7 @@ class Mapper:
 
     @property
     def T_map_odom(self) -> Array | None:
-        """(4, 4) of the robot whose keyframe came last, which carries every correction; None before it is known."""
+        """(4, 4) of the robot of the last keyframe, with all corrections; None before it is known."""
         if not self.keyframes:
             return np.eye(4)
         if len(self.keyframes) == self.session_start:
@@ -123,7 +123,7 @@ class Mapper:
         return self.T_map_odom_of(self.keyframes[-1].robot)
 
     def T_map_odom_of(self, robot: str) -> Array | None:
-        """(4, 4) of a robot; None before it is known where in the map it is."""
+        """(4, 4) of a robot; None before its pose in the map is known."""
         last = self._robots[robot].last if robot in self._robots else None
         if last is None or self.graph.part(last) != 0:
             return None
@@ -131,48 +131,48 @@ class Mapper:
 
     @property
     def placed(self) -> NDArray[np.bool_]:
-        """(N,) of each keyframe, whether it is known where in the map it is: what nothing ties to it is not drawn."""
+        """(N,) whether the pose of each keyframe in the map is known; unconnected keyframes are not drawn."""
         return self.graph.placed
 
     @property
     def robots(self) -> list[str]:
-        """Names of those that have sent keyframes in this session."""
+        """Names of the robots that have sent keyframes in this session."""
         return [name for name, robot in self._robots.items() if robot.last is not None]
 
     @property
     def store_problem(self) -> str:
-        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        """Why the map file is behind, in words; empty if it is not, or if there is none."""
         return "" if self._writer is None else self._writer.problem
 
     @property
     def channels(self) -> int | None:
-        """Width of the features that its network makes; None without a network."""
+        """Width of the network's features; None without a network."""
         return self._closer.channels
 
     def start_session(self, T_map_odom: Array | None, covariance: Array) -> None:
-        """Before the first keyframe of a session in a loaded map: where its odometry begins. Else only a loop tells.
+        """Set where the odometry of a session in a loaded map begins, before its first keyframe; else only a loop can.
 
         Args:
-            T_map_odom: (4, 4), by which a loop ties the first keyframe to the nearest whose place is known; None: it is
-                where the last of the map is, whose frame it is of, and the odometry goes on from there.
+            T_map_odom: (4, 4); a loop with it connects the first keyframe to the nearest one with a known pose. None:
+                it has the pose of the map's last keyframe, is of the same frame, and continues its odometry.
             covariance: (6, 6) of the first keyframe's pose relative to that one.
         """
         self._start = _Start(T_map_odom, covariance)
 
     def forget_start(self) -> None:
-        """The odometry that `start_session` has placed begins anew before its first keyframe: only a loop tells."""
+        """The odometry of `start_session` restarts before its first keyframe: only a loop can give its pose."""
         self._start = None
 
     def described(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe with descriptors, if loops are searched with them and its registration made none."""
+        """The keyframe with descriptors, if loops need them and its registration made none."""
         return self._closer.described(keyframe)
 
     def add(self, keyframe: Keyframe) -> list[Edge]:
-        """Take a keyframe in; returns the loops that were tried, accepted or not.
+        """Add a keyframe; returns the loops that were tried, accepted or not.
 
         Raises:
-            RejectedError: it is not sound. Whatever is raised before the search for loops, the map is as it was before;
-                after that the keyframe is in, with what was found until then.
+            RejectedError: the keyframe is invalid. Any error before the search for loops leaves the map unchanged;
+                after a later error the keyframe is in the map, with the results so far.
         """
         check_keyframe(keyframe, self._closer.channels)
         node, cloud, thumbnail, way = len(self.keyframes), keyframe.cloud, keyframe.thumbnail, keyframe.edge
@@ -192,7 +192,7 @@ class Mapper:
         try:
             self._close_loops(keyframe.fix is not None and self.graph.add_fix(node, keyframe.fix))
             self._lend(node, to_before, self.loops[before:])
-            if not follows:  # from where it was before the way is not known: those clouds are no witnesses of this one
+            if not follows:  # the motion since the previous keyframe is unknown: its clouds cannot show moving points
                 self._mark_moving(robot.window.finish(self.poses))
                 robot.window = MovingWindow(self._settings.moving_window)
             self._mark_moving(robot.window.add(node, cloud, self.poses, origin, keyframe.up))
@@ -201,9 +201,9 @@ class Mapper:
         return self.loops[before:]
 
     def _lend(self, node: int, to_before: list[Edge], loops: list[Edge]) -> None:
-        """Let keyframes that came back to older ones borrow their clouds: the new one, and any whose loop waited."""
+        """Let keyframes that revisit older ones borrow their clouds: the new one, and any with a postponed loop."""
         odometry = [edge for edge in to_before if edge.kind == "odometry"]
-        again = odometry if node == self.session_start else []  # the frame with which the session before ended
+        again = odometry if node == self.session_start else []  # the frame with which the previous session ended
         ties = [*again, *self.kept(loops)]
         for back in sorted({edge.to_node for edge in ties}):
             loan = lender(back, ties, self.clouds.loan, self._settings.redundancy)
@@ -217,21 +217,21 @@ class Mapper:
                 self._writer.add(back, self.keyframes[back], None, [])
 
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
-        """Bring the map file, if there is one, up to date with a new keyframe."""
+        """Update the map file, if there is one, with a new keyframe."""
         if self._writer is not None:
             self._writer.add(node, self.keyframes[node], thumbnail, edges)
             self._writer.sync(self.poses, self.graph.georeference)
 
     def kept(self, loops: Sequence[Edge]) -> list[Edge]:
-        """Those that the optimization has not rejected: for no other is a cloud given up, or a break crossed."""
+        """Loops that the optimization has not rejected: only for these a cloud is given up, or a break crossed."""
         rejected = {(loop.from_node, loop.to_node) for loop in self.graph.loops if not loop.ok}
         return [loop for loop in loops if (loop.from_node, loop.to_node) not in rejected]
 
     def settle(self, wait: bool = False) -> bool:
-        """Take in what another process has solved since the last keyframe: where the robot has stopped none follows.
-        And write what the file lacks, if it can be by now.
+        """Apply what another process has solved since the last keyframe, as none follows when the robot has stopped.
+        Also write what the file lacks, if that is possible by now.
 
-        `wait`: for all that is to be solved. Returns whether anything was.
+        `wait`: for everything that is to be solved. Returns whether anything was.
         """
         if unsolved := wait and self.graph.unsolved:
             self._optimize(changed=True)
@@ -250,12 +250,12 @@ class Mapper:
             self._writer.sync(self.poses, self.graph.georeference, self.graph.loops)
 
     def cloud(self, voxel_size: float | None = None) -> Points:
-        """The map (M, 4) float32 in the map frame, one point in each voxel of that size (default: settings)."""
+        """The map (M, 4) float32 in the map frame, one point per voxel of that size (default: settings)."""
         placed = np.flatnonzero(self.placed).tolist()
         return map_cloud(self.clouds, self.poses, voxel_size or self._settings.voxel, placed)
 
     def update_grid(self, grid: OccupancyMap, seconds: float) -> bool:
-        """Bring a grid that is kept for this map up to date; False if there is more to do than `seconds` allow."""
+        """Update a grid of this map; False if there is more to do than `seconds` allow."""
         return not self.keyframes or grid.update(self.clouds, self.poses, seconds, self.placed)
 
     def _load(self, store: MapStore) -> None:
@@ -279,8 +279,8 @@ class Mapper:
         return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving_window)))
 
     def _add_node(self, keyframe: Keyframe, way: Registration | None, last: int | None) -> list[Edge]:
-        """A node with an edge to its robot's `last` one, also when some between them never arrived; `way`: its edge as
-        it came."""
+        """Add a node with an edge to its robot's `last` one, even if some between them were lost; `way`: the edge as
+        received."""
         node, result = len(self.keyframes), way
         if result is not None and last is not None:
             before = self.keyframes[last]
@@ -297,9 +297,9 @@ class Mapper:
         return [edge]
 
     def _begin_session(self, start: _Start, keyframe: Keyframe, way: Registration | None) -> Edge:
-        """The first node of a session, and what ties it to the map: odometry from the last, or a loop to the nearest.
+        """Add the first node of a session and its edge: odometry from the last node, or a loop to the nearest.
 
-        `way`: to it from a keyframe before the session, if there is one: a break of the odometry may be in it.
+        `way`: edge to it from a keyframe before the session, if there is one: it may include a break of the odometry.
         """
         node, poses = len(self.keyframes), self.poses
         covariance = start.covariance if way is None else start.covariance + way.covariance
@@ -313,9 +313,9 @@ class Mapper:
         return self._tied(Edge("loop", other, node, Registration(se3.inverse(poses[other]) @ T, covariance)))
 
     def _close_loops(self, due: bool) -> None:
-        """Loops of the last keyframe: into the graph, unless they were rejected there or before.
+        """Search loops of the last keyframe and add them to the graph, unless they are rejected.
 
-        `due`: solve it in any case.
+        `due`: optimize in any case.
         """
         found = self._closer.close(self.keyframes, self.clouds, self.poses, self.graph.parts, self.clouds.own)
         tried = [self._tied(loop) for loop in found]
@@ -323,7 +323,7 @@ class Mapper:
         self._optimize(due or any(loop.ok for loop in tried))
 
     def _tied(self, loop: Edge) -> Edge:
-        """A loop that was tried, in the graph if it was accepted; rejected if the graph does not take it."""
+        """A tried loop, added to the graph if it was accepted; rejected if the graph does not accept it."""
         if loop.ok:
             loop = to_lender(loop, self.clouds.loan)
             try:
@@ -333,12 +333,12 @@ class Mapper:
         return loop
 
     def _optimize(self, changed: bool) -> None:
-        """Solve the graph if it has `changed`, take in what another process has solved."""
+        """Optimize the graph if it has `changed`, and apply what another process has solved."""
         self.graph.collect()
         if changed:
             try:
                 self.graph.optimize()
-            except Dpm2Error as error:  # the drive goes on, with the poses as they were
+            except Dpm2Error as error:  # the drive continues with the previous poses
                 self.graph.problem = str(error)
 
     def _mark_moving(self, checked: Iterable[tuple[int, NDArray[np.bool_]]]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several maps into one: side by side where their frames are known, else tied by the loops between them."""
+"""Merges several maps: by a known transform between their frames, or by loops between them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData, numbered_behind
 
-_GIVEN_COVARIANCE = isotropic(0.05, 1.0)  # of a transform by hand: any loop is surer
+_GIVEN_COVARIANCE = isotropic(0.05, 1.0)  # of a transform given by hand: any loop is more accurate
 FindLoops = Callable[[MapData, MapData], list[Edge]]
-"""Accepted loops from a node of one map to a node of another, each in its own numbers."""
+"""Accepted loops from a node of one map to a node of another, each with its own numbers."""
 
 
 def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ()) -> MapData:
-    """One map in the frame of `a`. Nodes and sessions of `b` count on after those of `a`.
+    """One map in the frame of `a`. Nodes and sessions of `b` are numbered after those of `a`.
 
-    Its place on Earth is that of `a`; else that of `b`, if `loops` tie the first keyframes of both: a georeference is
-    that of the first keyframe's part.
+    Its georeference is that of `a`; or else that of `b`, if `loops` connect the first keyframes of both: a georeference
+    is that of the first keyframe's part.
 
     Args:
-        T_a_b: (4, 4). loops: as `FindLoops` gives them.
+        T_a_b: (4, 4). loops: as returned by `FindLoops`.
     """
     n = len(a)
     b = numbered_behind(b, n, max((session.number for session in a.sessions), default=0))
@@ -54,9 +54,9 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
 
 
 def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
-    """A known transform (4, 4) as an edge between two maps, as `FindLoops` gives them; none where one is empty.
+    """A known transform (4, 4) as an edge between two maps, as from `FindLoops`; none if a map is empty.
 
-    Without it the file would not say that it is known where the second map is in the first.
+    Without it the file would not record that the pose of the second map in the first is known.
     """
     if not len(a) or not len(b):
         return []
@@ -65,13 +65,13 @@ def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
 
 
 def _seen_from(T_a_b: Array, known: Georeference) -> Georeference:
-    """The georeference of b as one of a."""
+    """The georeference of b expressed for a."""
     return replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
 
 
 def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
-    """How far a transform (4, 4) puts the keyframes of `b` from where both maps are on Earth, m, their median; 0 where
-    that is not known."""
+    """Median distance, m, between the keyframes of `b` by a transform (4, 4) and by the georeferences of both maps; 0
+    if these are not known."""
     if a.georeference is None or b.georeference is None or not len(b):
         return 0.0
     away = T_a_b @ b.poses - se3.inverse(frame_of(a.georeference)) @ frame_of(b.georeference) @ b.poses
@@ -79,25 +79,25 @@ def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
 
 
 def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]] | None:
-    """T_a_b (4, 4) by the loops between two maps, and these; None without any."""
+    """T_a_b (4, 4) by the loops between two maps, and these loops; None without any."""
     loops = find_loops(a, b)
     if not loops:
         return None
     guesses = np.array([a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops])
-    # The one that the others are nearest to: a start for the optimization, which weighs them all.
+    # The transform nearest to the others: a start for the optimization, which weights them all.
     apart = [np.median(np.linalg.norm(guesses[:, :3, 3] - T[:3, 3], axis=1)) for T in guesses]
-    return se3.orthonormalized(guesses[int(np.argmin(apart))]), loops  # else each merge doubles the rounding
+    return se3.orthonormalized(guesses[int(np.argmin(apart))]), loops  # else rounding errors double with each merge
 
 
 def loops_by(closer: LoopCloser) -> FindLoops:
-    """Let a loop closer drive through the second map with the first one in its memory."""
+    """Let a loop closer process the second map as a drive, with the keyframes of the first one in its memory."""
 
     def find(a: MapData, b: MapData) -> list[Edge]:
         both = merge_maps(a, b, np.eye(4))
         keyframes, parts, own = list(a.keyframes), parts_of(both), both.clouds.own
         out = []
         for node, keyframe in enumerate(b.keyframes):
-            # Another name keeps the odometry of the two apart.
+            # Another robot name keeps the odometry of the two apart.
             keyframes.append(replace(keyframe, robot=f"{keyframe.robot}/second", edge=keyframe.edge if node else None))
             end = len(keyframes)
             for loop in closer.close(keyframes, both.clouds, both.poses[:end], parts[:end], own[:end]):
@@ -109,7 +109,7 @@ def loops_by(closer: LoopCloser) -> FindLoops:
 
 
 def optimized(data: MapData, graph: PoseGraph) -> MapData:
-    """The map with the poses that its constraints ask for, and without the constraints that these poses contradict.
+    """The map with the poses that its constraints give, without the constraints that these poses contradict.
 
     `graph` is empty.
     """

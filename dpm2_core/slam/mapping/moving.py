@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which points of a cloud belong to things that moved away: other keyframes look through the place where they were.
+"""Finds points of a cloud on things that have moved away: other keyframes see through the place where they were.
 
-A cloud is compared with range images of its neighbors. Where a neighbor sees nothing at or before a point but
-something well behind it, the point was not there then. One such witness may be chance (leaves, glass, the rim of a
-pole), so two are wanted, and more than there are neighbors that saw something at the point.
+A cloud is compared with range images of neighboring keyframes. If a neighbor sees nothing at or before a point but
+something well behind it, the point was not there at that time. One such witness may be chance (leaves, glass, the rim
+of a pole), so two are required, and more than the neighbors that saw something at the point.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ Mask = NDArray[np.bool_]
 _PIXEL = np.radians(1.0)
 _COLUMNS = 360
 _LOWEST, _ROWS = np.radians(-45.0), 90
-_HALVES = (1, 2, 4)  # half sizes, pixels, of the windows in which a near return counts
-_CLEARANCE = 0.25  # m above the local ground: lower points stay, for the ground is seen at grazing angles
-_WITNESSES = 2  # so many must look through the place of a point
-_BEHIND = (0.5, 0.03)  # m, and per meter of range: what they see must lie so far behind it
+_HALVES = (1, 2, 4)  # half sizes, pixels, of the windows in which a close return counts
+_CLEARANCE = 0.25  # m above the local ground: lower points are kept, since the ground is seen at grazing angles
+_WITNESSES = 2  # neighbors that must see through the place of a point
+_BEHIND = (0.5, 0.03)  # m, and per meter of range: minimum distance of their return behind the point
 _FOOTPRINT = 0.3  # m: a return within this of the line of sight counts as seeing the point
-_TOUCHES = 0.7  # m: points this near to a moving one move with it, unless neighbors saw them...
-_EXTENT = 2.0  # ...and so on, no farther than this, m, from those that were looked through: not along a whole wall
+_TOUCHES = 0.7  # m: points this close to a moving one move with it, unless neighbors saw them...
+_EXTENT = 2.0  # ...and so on, up to this distance, m, from those that were seen through: not along a whole wall
 
 
 class RangeImage:
-    """The nearest return in each direction from a sensor, one degree per pixel; inf where there is none."""
+    """The closest return in each direction from a sensor, one degree per pixel; inf if there is none."""
 
     def __init__(self, points: Points) -> None:
         """(M, 4) in the sensor's frame."""
         r, row, column = _spherical(points[:, :3])
         self._own = _nearest(r, row, column)
-        # The ground before a thing is within any window around it, and hides nothing.
+        # The ground before an object is within any window around it, but occludes nothing.
         above = height_above_ground(points) > _CLEARANCE
         standing = _nearest(r[above], row[above], column[above])
         self._near = [minimum_filter(standing, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALVES]
 
     def compare(self, points: Points) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """For (M, 3+) points in the sensor's frame: whether they are looked through, and whether they are seen."""
+        """Masks of (M, 3+) points in the sensor's frame: which are seen through, and which are seen."""
         r, row, column = _spherical(points[:, :3])
         margin = _BEHIND[0] + _BEHIND[1] * r
         window = np.searchsorted(_HALVES[:-1], _FOOTPRINT / np.maximum(r, 0.1) / _PIXEL)
@@ -66,11 +66,11 @@ def _nearest(r: Points, row: NDArray[np.intp], column: NDArray[np.intp]) -> Poin
 
 
 def find_moving(cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImage, Array]]) -> NDArray[np.bool_]:
-    """Which of the (M, 4) points of a keyframe belong to moving things.
+    """Which of the (M, 4) points of a keyframe are on moving objects.
 
     Args:
         cloud: in the keyframe's frame, which is level, and whose origin is the LiDAR. T_map_kf: (4, 4).
-        others: range image and T_map_kf of its witnesses.
+        others: range image and T_map_kf of the other keyframes.
 
     Returns:
         (M,) bool.
@@ -87,7 +87,7 @@ def find_moving(cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImag
 
 
 def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
-    """With those candidates that touch a moving point: the rest of a car, against the sky or out of their sight."""
+    """Add the candidates that touch a moving point: the rest of a car, against the sky or outside of their view."""
     grown = moving.copy()
     edge = np.flatnonzero(moving)
     candidates = _within(_EXTENT, candidates, edge, cloud)
@@ -99,7 +99,7 @@ def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
 
 
 def _within(reach: float, these: NDArray[np.intp], others: NDArray[np.intp], cloud: Points) -> NDArray[np.intp]:
-    """Those of some points that are so near, m, to one of the others."""
+    """Those of some points that are within `reach`, m, of one of the others."""
     if not len(these) or not len(others):
         return these[:0]
     near, _ = cKDTree(cloud[others, :3]).query(cloud[these, :3], distance_upper_bound=reach)
@@ -107,7 +107,7 @@ def _within(reach: float, these: NDArray[np.intp], others: NDArray[np.intp], clo
 
 
 class MovingWindow:
-    """The last keyframes of a drive: each is checked once there are as many after it as before it."""
+    """The last keyframes of a drive: each is checked once as many keyframes are after it as before it."""
 
     def __init__(self, window: int) -> None:
         """`window`: see `MapSettings.moving_window`."""
@@ -118,10 +118,10 @@ class MovingWindow:
     def add(
         self, node: int, cloud: Points, poses: Array, origin: ArrayLike = (0.0, 0.0, 0.0), up: Up | None = None
     ) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        """Take in the whole cloud (M, 4) of the next node; yields the node that can be checked now, and its mask.
+        """Add the whole cloud (M, 4) of the next node; yields the node that can be checked now, and its mask.
 
-        `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is where in its frame the LiDAR was, `up`
-        which way is up there, if that is known.
+        `poses` (N, 4, 4) are T_map_kf of all nodes so far, `origin` (3,) is the position of the LiDAR in the node's
+        frame, `up` the up direction there, if it is known.
         """
         if self._window:
             T_kf_level = se3.make(levelling(tilt_of(cloud, up)).T, origin)
@@ -131,7 +131,7 @@ class MovingWindow:
                 yield from self._compare(self._seen[-1 - self._window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        """Check those at the end of the drive by the keyframes that there are."""
+        """Check the keyframes at the end of the drive against those that are available."""
         if self._seen:
             yield from self._compare(self._seen[-1][0], poses)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map as a grid of free and occupied cells, in the format of Nav2's map_server.
 
-Each keyframe says what it sees: in every direction the ground up to the first thing that stands on it. A cell is
-occupied where more keyframes see something standing in it than see through it; newer ones count for more.
+Each keyframe observes, in every direction, the free ground up to the first obstacle. A cell is occupied if more
+keyframes see an obstacle in it than see through it; newer keyframes have a larger weight.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySe
 from dpm2_core.slam.store.cloud_store import CloudStore
 
 _MOST = 400_000_000  # cells
-_LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes, and the fraction of them that must show ground
+_LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes that are checked, and the fraction of them that must show ground
 _SQUARE = 5.0  # m: the steepest ramp rises by less than a storey within one
-_STOREY = 2.4  # m that keyframes may stand above each other: less than a floor, more than from a base to its LiDAR
-_OVER = np.diag(np.array([1, -1, -1], np.float32))  # turned upside down
+_STOREY = 2.4  # m, allowed height between keyframes in a square: below a floor's, above that from a base to its LiDAR
+_OVER = np.diag(np.array([1, -1, -1], np.float32))  # rotated upside down
 
 
 def occupancy_grid(clouds: CloudStore, poses: Array, settings: OccupancySettings) -> Grid:
     """The grid of keyframe clouds at (N, 4, 4) T_map_kf.
 
     Raises:
-        Dpm2Error: it would be too large.
+        Dpm2Error: the grid would be too large.
     """
     shape = np.ceil((np.ptp(poses[:, :2, 3], axis=0) + 2 * settings.reach) / settings.resolution) + 1
     if shape.prod() > _MOST:
@@ -44,10 +44,10 @@ def occupancy_grid(clouds: CloudStore, poses: Array, settings: OccupancySettings
 
 
 def ground_tilt(clouds: CloudStore, poses: Array) -> float:
-    """How far the ground that keyframes show is tilted against the map's x and y, degrees; 0 where they show none.
+    """Tilt of the ground in keyframes against the map's x and y, degrees; 0 if they show no ground.
 
-    Of keyframe clouds at (N, 4, 4) T_map_kf some are looked at, as seen from the LiDAR. Upside down is known outdoors
-    only: rooms have ceilings.
+    Some of the keyframe clouds at (N, 4, 4) T_map_kf are checked, as seen from the LiDAR. Upside down is recognized
+    outdoors only: rooms have ceilings.
     """
     some = evenly(len(poses), _LOOKED_AT).tolist()
     seen = ((node, clouds[node][:, :3] - clouds.origin(node).astype(np.float32)) for node in some)
@@ -59,7 +59,7 @@ def ground_tilt(clouds: CloudStore, poses: Array) -> float:
 
 
 def why_of_no_use(poses: Array) -> str:
-    """Of the grid of keyframes at (N, 4, 4) T_map_kf: what it shows that lies over each other, in words; else empty."""
+    """Why a grid of keyframes at (N, 4, 4) T_map_kf is unusable, as it shows several levels; empty if it is usable."""
     if not len(poses) or (height := _height_over_each_other(poses)) <= _STOREY:
         return ""
     why = "of storeys, which need a map each, or of drift that no loop took away"
@@ -67,7 +67,7 @@ def why_of_no_use(poses: Array) -> str:
 
 
 def _height_over_each_other(poses: Array) -> float:
-    """The most by which keyframes at (N, 4, 4) T_map_kf, N > 0, in one square of 5 m differ in height, m."""
+    """Largest difference in height, m, of keyframes at (N, 4, 4) T_map_kf, N > 0, within one square of 5 m."""
     _, square = np.unique(np.floor(poses[:, :2, 3] / _SQUARE), axis=0, return_inverse=True)
     lowest, highest = np.full((2, len(poses)), [[np.inf], [-np.inf]])
     np.minimum.at(lowest, square, poses[:, 2, 3])
@@ -76,7 +76,7 @@ def _height_over_each_other(poses: Array) -> float:
 
 
 def _up(cloud: Points) -> NDArray[np.float32] | None:
-    """Which way (3,) is up in a cloud (M, 4), also where z points down by and large; None where it shows no ground."""
+    """Up direction (3,) in a cloud (M, 4), also if z points roughly down; None if it shows no ground."""
     up = up_of(cloud)
     if up is None and is_room(cloud) is False and (turned := up_of(cloud[:, :3] @ _OVER)) is not None:
         return _OVER @ turned
@@ -84,7 +84,7 @@ def _up(cloud: Points) -> NDArray[np.float32] | None:
 
 
 def write_grid(path: Path, grid: Grid) -> Path:
-    """Write PATH.yaml and the image PATH.pgm that it names; returns the former.
+    """Write PATH.yaml and the image PATH.pgm that it refers to; returns the former.
 
     Raises:
         Dpm2Error: a file could not be written.

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells that keyframes see through, and cells in which they see something stand; kept up to date as poses change.
+"""Grid of free and occupied cells that keyframes observe; it is updated as poses change.
 
-What a keyframe sees is kept as a fan: how far it is free in each direction, and where something stands. A fan is drawn
-at the keyframe's pose, and, when that changes, taken back and drawn anew: 1 to 2 ms, where reading the cloud takes ten
-times as long. Where the map needs cells of another size all are drawn anew, and the grid that was there is shown until
-then: a robot that plans in it does not lose what it knew.
+The observation of a keyframe is stored as a fan: the free distance in each direction, and the obstacles. A fan is drawn
+at the keyframe's pose. When the pose changes, the fan is removed and drawn anew: 1 to 2 ms, a tenth of the time to read
+the cloud. If the map needs cells of another size, all fans are drawn anew, and the previous grid is returned until
+then: a robot that plans in it does not lose information.
 
-How a place was last seen counts for more than how it looked before: when the robot comes by again, what was moved goes,
-and what is new appears.
+The last observation of a place counts for more than earlier ones: when the robot returns, things that were moved
+disappear, and new ones appear.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from dpm2_core.slam.mapping.redundancy import LAP
 from dpm2_core.slam.store.cloud_store import CloudStore
 
 _DIRECTIONS = 720
-_MARGIN = 20.0  # m around what is needed: the next keyframes fit as well
-_BORDER = 2.0  # m: what is seen is rounded
+_MARGIN = 20.0  # m around the cells that are needed, for the next keyframes
+_BORDER = 2.0  # m, for rounding
 _PLACE = np.array([6.0, 6.0, 3.0])  # m: keyframes in a box of this size see about the same
-_BOX_NUMBER = 1 << np.array([42, 21, 0])  # a box as one number, by which keyframes are sorted
-_NEWER, _VISITS = 3, 3  # a fan counts for three of the visit before; beyond the third all count the same
+_BOX_NUMBER = 1 << np.array([42, 21, 0])  # encodes a box as one number, for sorting
+_NEWER, _VISITS = 3, 3  # a fan counts as much as three of the previous visit; all with 3 or more later visits equal
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray values of map_server
 
 
 class OccupancySettings(Settings):
-    """The grid that robots plan in."""
+    """The grid for navigation."""
 
     resolution: float = Field(0.1, ge=0.01, le=1000)
     """Edge of a cell, m."""
     lowest: float = Field(0.25, ge=0)
-    """Points nearer to the ground than this belong to it, m."""
+    """Points less than this above the ground belong to it, m."""
     highest: float = 2.0
-    """Points higher above the ground than this are no obstacle, m; above `lowest`."""
+    """Points more than this above the ground are no obstacles, m; more than `lowest`."""
     reach: float = Field(30.0, gt=0, le=1000)
     """Points farther from the robot than this are not used, m."""
 
@@ -57,7 +57,7 @@ class OccupancySettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Cells (rows, columns) uint8, the row of the largest y first; `origin` is x, y of the lower left corner, m."""
+    """Cells (rows, columns) uint8, the first row has the largest y; `origin` is x, y of the lower left corner, m."""
 
     cells: NDArray[np.uint8]
     origin: tuple[float, float]
@@ -66,11 +66,11 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """What a keyframe sees around its LiDAR, along the axes of the map while its heading is `yaw` (rad).
+    """The observation of a keyframe around its LiDAR, in the map's axes for a keyframe heading of `yaw` (rad).
 
     Attributes:
-        origin: (2,) m, where the LiDAR is beside the keyframe.
-        free: (720,) m that each direction is free. stands: (K, 2) m, places where something stands.
+        origin: (2,) m, position of the LiDAR relative to the keyframe.
+        free: (720,) m, free distance in each direction. stands: (K, 2) m, positions of obstacles.
     """
 
     yaw: float
@@ -80,9 +80,9 @@ class Fan:
 
 
 def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: Array) -> Fan:
-    """Of a cloud (M, 4) that was seen from `lidar` (3,), in the keyframe's frame, at T_map_kf (4, 4).
+    """The fan of a cloud (M, 4), seen from `lidar` (3,) in the keyframe's frame, at T_map_kf (4, 4).
 
-    All of it is within `reach` of the keyframe: empty, if the LiDAR is not.
+    All of it is within `reach` of the keyframe; it is empty if the LiDAR is not.
     """
     near = np.einsum("ij,ij->i", cloud[:, :2], cloud[:, :2]) < settings.reach**2
     points = np.asarray(se3.transform(T_map_kf, cloud[near].astype(np.float64)), np.float64)
@@ -97,7 +97,7 @@ def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: A
     blocked, seen = np.full(_DIRECTIONS, np.inf), np.zeros(_DIRECTIONS)
     np.minimum.at(blocked, direction[stands], distance[stands])
     np.maximum.at(seen, direction[ground], distance[ground])
-    # To the farthest ground, but not beyond an obstacle; one is seen as well as the ground before it.
+    # Up to the farthest ground, but not beyond an obstacle; an obstacle shows that the ground before it is free.
     seen = np.where(np.isfinite(blocked), np.minimum(np.maximum(seen, blocked), blocked - size), seen)
     cells = np.unique(np.floor(away[stands] / (size / 2)).astype(np.int64), axis=0)
     return Fan(yaw, origin, seen.astype(np.float32), ((cells + 0.5) * (size / 2)).astype(np.float32))
@@ -105,8 +105,8 @@ def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: A
 
 @dataclass(eq=False)
 class _Entry:
-    """A keyframe: its fan, the mask of moving points without which it was made, and how much it counts and the pose
-    (4, 4) at which it is drawn."""
+    """A keyframe: its fan, the mask of moving points that the fan leaves out, its count, and the pose (4, 4) at which
+    it is drawn."""
 
     fan: Fan
     moving: bytes | None
@@ -115,11 +115,11 @@ class _Entry:
 
 
 class OccupancyMap:
-    """The grid of a map that grows and whose poses change.
+    """The grid of a growing map with changing poses.
 
     Args:
         settings: of the grid.
-        most: cells at most; a larger map has cells of twice, four times, ... the edge.
+        most: maximum number of cells; a larger map has cells with twice, four times, ... the edge.
     """
 
     def __init__(self, settings: OccupancySettings, most: int) -> None:
@@ -127,7 +127,7 @@ class OccupancyMap:
         self._entries: dict[int, _Entry] = {}  # by node
         self._low, self._size = np.zeros(2, np.int64), 0.0
         self._hits = self._seen = np.zeros((0, 0), np.int32)
-        self._before: Grid | None = None  # shown until everything is drawn in cells of another size
+        self._before: Grid | None = None  # returned until everything is drawn with another cell size
 
     def update(
         self,
@@ -136,11 +136,11 @@ class OccupancyMap:
         seconds: float = np.inf,
         placed: NDArray[np.bool_] | None = None,
     ) -> bool:
-        """Bring it up to date, the newest keyframes first; False if there is more to do than `seconds` allow.
+        """Update the grid, the newest keyframes first; False if there is more to do than `seconds` allow.
 
         Args:
             clouds: at `poses` (N, 4, 4) T_map_kf.
-            placed: (N,) which of them are drawn, at least one; None: all.
+            placed: (N,) mask of the keyframes that are drawn, at least one; None: all.
         """
         end = time.monotonic() + seconds
         placed = np.ones(len(poses), np.bool_) if placed is None else placed
@@ -165,7 +165,7 @@ class OccupancyMap:
         return True
 
     def grid(self) -> Grid:
-        """What is known by now: a cell is occupied where at least half of the counts that see it see something."""
+        """The current grid: a cell is occupied if at least half of the counts that see it see an obstacle."""
         if self._before is not None:
             return self._before
         cells = np.full(self._seen.shape, UNKNOWN, np.uint8)
@@ -179,7 +179,7 @@ class OccupancyMap:
         return Grid(cut, (float(corner[0]), float(corner[1])), self._size)
 
     def _make_room(self, poses: Array) -> None:
-        """For these keyframes; in cells of another size, if there would be too many."""
+        """Make room for these keyframes; with another cell size, if there would be too many cells."""
         size, end = self._settings.resolution, self._low + self._seen.shape
         first, last = self._corners(poses, size)
         while np.prod(last - first) > self._most:
@@ -187,7 +187,7 @@ class OccupancyMap:
             first, last = self._corners(poses, size)
         if size == self._size and (first >= self._low).all() and (last <= end).all():
             return
-        if size == self._size:  # what is drawn stays, even where it is to be drawn elsewhere
+        if size == self._size:  # fans that are drawn stay, even if they are to be drawn at another pose
             both = self._corners(np.array([*poses, *(e.T for e in self._entries.values() if e.T is not None)]), size)
             if np.prod(both[1] - both[0]) <= self._most:
                 self._move(*both)
@@ -200,13 +200,13 @@ class OccupancyMap:
         self._move(first, last)
 
     def _corners(self, poses: Array, size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First cell, and that after the last, of all that fans at (N, 4, 4) reach."""
+        """First cell, and the one after the last, within reach of fans at (N, 4, 4)."""
         reach = self._settings.reach + _BORDER
         low, high = poses[:, :2, 3].min(0) - reach, poses[:, :2, 3].max(0) + reach
         return np.floor(low / size).astype(np.int64), np.ceil(high / size).astype(np.int64)
 
     def _move(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
-        """Have cells from a corner to another, with a margin, if there is room for one; those that are there stay."""
+        """Resize the grid to these corners, with a margin if there is room for it; existing cells are kept."""
         width, height = (last - first).tolist()
         room = (((width - height) ** 2 + 4 * self._most) ** 0.5 - width - height) / 4  # on each side
         margin = int(max(0.0, min(_MARGIN / self._size, room)))
@@ -225,7 +225,7 @@ class OccupancyMap:
             entry.T = None
 
     def _near(self, entry: _Entry, T_now: Array) -> bool:
-        """Whether a fan is drawn so near to T_now (4, 4) that it may stay."""
+        """Whether a fan is drawn so close to T_now (4, 4) that it need not be redrawn."""
         if entry.T is None:
             return False
         meters = float(np.abs(entry.T[:2, 3] - T_now[:2, 3]).max())
@@ -241,9 +241,9 @@ class OccupancyMap:
 
 
 def _counts(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(N,) how much each of (N, 4, 4) keyframes counts by how often the robot was there later; 0 if it is not `drawn`.
+    """(N,) weight of each of (N, 4, 4) keyframes, by the number of later visits to its place; 0 if it is not `drawn`.
 
-    Places are boxes, in all eight ways to lay them half a box apart: two keyframes that are near share one of them.
+    Places are boxes, in all eight arrangements shifted by half a box: two close keyframes share one of them.
     """
     nodes, counts = np.flatnonzero(drawn), np.zeros(len(poses), np.int64)
     later = np.zeros(len(nodes), np.int64)
@@ -270,7 +270,7 @@ def _draw_fan(  # noqa: PLR0913
     stands: NDArray[np.float32],
     times: int,
 ) -> None:
-    """Add `times` to every cell that a fan at x, y (m from the corner of the grids), turned by `turn` (rad), sees."""
+    """Add `times` to all cells that a fan at x, y (m from the corner of the grids), rotated by `turn` (rad), sees."""
     reach = float(free.max())
     for k in range(len(stands)):
         reach = max(reach, float(np.hypot(stands[k, 0], stands[k, 1])))

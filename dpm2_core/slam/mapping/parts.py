@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which keyframes of a map hang together: where two parts are relative to each other is not known."""
+"""Connected parts of a map's keyframes: the poses of two parts relative to each other are unknown."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from dpm2_core.slam.store.map_data import MapData, subset
 
 
 def parts_of(data: MapData) -> NDArray[np.int32]:
-    """(N,) number of the part that each node is in, by the accepted edges."""
+    """(N,) number of the part of each node, by the accepted edges."""
     ends = np.array([(edge.from_node, edge.to_node) for edge in data.constraints], np.intp).reshape(-1, 2)
     return components(len(data), ends)
 
 
 def placed(data: MapData) -> NDArray[np.bool_]:
-    """(N,) whether each node is tied to the first: where any other is in its map, and on Earth, is not known."""
+    """(N,) whether each node is connected to the first; the pose of any other in its map and on Earth is unknown."""
     return parts_of(data) == 0
 
 
 def first_part(data: MapData) -> MapData:
-    """The map of the keyframes that are tied to the first one."""
+    """The map of the keyframes that are connected to the first one."""
     own = placed(data)
     if own.all():
         return data
     for node in np.flatnonzero(own).tolist():
-        loan = data.clouds.loan(node)  # by a loop that was rejected since then, it may be of another part
+        loan = data.clouds.loan(node)  # if its loop was rejected since then, the lender may be in another part
         own[node] = loan is None or own[loan.lender]
     return subset(data, np.flatnonzero(own).tolist(), data.edges, data.trail)
 
 
 def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
-    """Where on Earth the map is by the fixes of some of its nodes, (N,), alone; None where these do not tell."""
+    """Pose of the map on Earth by the fixes of the nodes in `own` (N,) only; None if they do not determine it."""
     fixes = Fixes()
     for node in np.flatnonzero(own).tolist():
         if (fix := data.keyframes[node].fix) is not None:
@@ -48,7 +48,7 @@ def located(data: MapData, own: NDArray[np.bool_]) -> Georeference | None:
 
 
 def georeferenced(data: MapData) -> MapData:
-    """The map, if it has no georeference, with that of its first part's fixes, where these tell."""
+    """The map; if it has no georeference, with that of its first part's fixes, if they determine one."""
     return replace(data, georeference=data.georeference or located(data, placed(data)))
 
 
@@ -60,8 +60,8 @@ def frame_of(known: Georeference) -> Array:
 def placed_on_earth(data: MapData) -> MapData:
     """The map with poses (N, 4, 4) T_ecef_kf.
 
-    The georeference is that of the first keyframe's part; another part is placed by its own fixes. The poses of a part
-    whose place is not known are NaN.
+    The georeference is that of the first keyframe's part; other parts are placed by their own fixes. The poses of a
+    part with an unknown position are NaN.
     """
     parts, poses = parts_of(data), np.full_like(data.poses, np.nan)
     for part in np.unique(parts):

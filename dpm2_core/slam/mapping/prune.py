@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Taking keyframes out of a map: the constraints through them are composed, and where they were is remembered."""
+"""Removes keyframes from a map: the constraints through them are composed, and their poses are kept as a trail."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from dpm2_core.slam.mapping.redundancy import LAP
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
 
-_LEVER = 20.0  # m: a fix farther from its keyframe would say more of that one's heading than of its place
+_LEVER = 20.0  # m: a fix farther from its keyframe would depend more on the keyframe's heading than on its position
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     """Keyframes without a cloud of their own, and those near an older one that stays and does not borrow; never the
     last of a part.
 
-    Two keyframes that no accepted edges tie are not compared: where they are relative to each other is not known. Nor
-    does one with descriptors go for one without: nobody would be found there any more.
+    Two keyframes that no accepted edges connect are not compared: their relative pose is unknown. A keyframe with
+    descriptors is not removed because of one without: nothing could be localized there any more.
 
     Args:
-        distance: m, at most, where a meter of height counts for four; 0: only those without a cloud.
-        angle: degrees between their headings, at most.
+        distance: m, maximum, where height differences count four times; 0: only those without a cloud.
+        angle: degrees, maximum, between their headings.
     """
     if not len(data):
         return []
@@ -46,11 +46,11 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     for node in range(len(data)):
         if node in needed:
             continue
-        if (loan := data.clouds.loan(node)) is not None:  # one that tells how a place was last seen, stays with it
+        if (loan := data.clouds.loan(node)) is not None:  # keep one with the last observation of a place
             stays[node] = data.clouds.keeps(node) and loan.lender < node and stays[loan.lender]
             continue
         near = np.array(tree.query_ball_point(positions[node], distance) if distance else [], np.intp)
-        # Not one that borrows: its cloud is no part of the map, and nobody is found there.
+        # Not near one that borrows: its cloud is not part of the map, and nothing is localized there.
         near = near[(near < node) & stays[near] & own[near] & (parts[near] == parts[node])]
         near = near[(node - near >= LAP) | (session[near] != session[node])]
         near = near[described[near] >= described[node]]
@@ -60,12 +60,12 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
 
 
 def prune(data: MapData, nodes: Collection[int]) -> MapData:
-    """The map without those nodes. Where they were is kept as `trail`, what tied them together as composed edges.
+    """The map without those nodes. Their poses are kept as `trail`, the constraints through them as composed edges.
 
-    A fix of one that goes is handed to the keyframe beside it, where that has none.
+    A fix of a removed keyframe is passed to the nearest kept keyframe, if that has none.
 
     Raises:
-        ValueError: a node that stays borrows the cloud of one that goes, or nothing of a part stays.
+        ValueError: a kept node borrows the cloud of a removed one, or no node of a part is kept.
     """
     gone = set(nodes)
     kept = [node for node in range(len(data)) if node not in gone]
@@ -95,10 +95,11 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
 
 
 def _with_fixes(data: MapData, parts: NDArray[np.int32], gone: Sequence[int], kept: Index) -> list[Keyframe]:
-    """The keyframes of all nodes, where those that stay have taken over fixes of those that go.
+    """The keyframes of all nodes; kept ones have taken over fixes of removed ones.
 
-    A fix goes to the nearest keyframe of its part that stays, which need not be the one that has its place on the
-    trail: where a whole drive goes, that is the end of the drive. Of several the surest is taken, then the nearest.
+    A fix is passed to the nearest kept keyframe of its part, which need not be its anchor on the trail: if a whole
+    drive is removed, that is the end of the drive. Of several fixes the one with the smallest covariance is used, then
+    the nearest.
     """
     keyframes = list(data.keyframes)
     offered: list[tuple[float, float, int, Fix]] = []
@@ -117,8 +118,8 @@ def _with_fixes(data: MapData, parts: NDArray[np.int32], gone: Sequence[int], ke
 
 
 def _anchor(data: MapData, node: int, near: Index) -> int:
-    """That one of `near`, the nodes of its part that stay, to which a pruned one is tied: its lender, or else the
-    nearest along the drive. With another part it would go where that one is, which is not known."""
+    """The node of `near`, the kept nodes of its part, that a removed node is attached to: its lender, or else the
+    nearest along the drive. Attached to another part it would move with that part, whose relative pose is unknown."""
     if not len(near):
         raise ValueError(f"nothing that is tied to keyframe {node} stays")
     loan = data.clouds.loan(node)
@@ -128,13 +129,14 @@ def _anchor(data: MapData, node: int, near: Index) -> int:
 
 
 def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
-    """Edges of a graph from which nodes are taken, one after the other.
+    """Edges of a graph after nodes are removed, one after the other.
 
-    A node's neighbors are joined by compositions of two of its edges, one less than it had, as on a chain: each to the
-    one that an edge of its kind ties to the node best, and the best loop to the best odometry. (Exact marginalisation
-    would join every one with every other.) Where a street was driven again, its loops stay at their places: the
-    odometry takes one of them on to the next node, not all those of the nodes before. Rejected loops of a node go with
-    it. Of what is composed between the same two the surest stays, else laps would add up.
+    The neighbors of a node are connected by compositions of two of its edges, one fewer than it had, as on a chain.
+    Each edge is composed with the best edge of its kind, and the best loop with the best odometry edge. (Exact
+    marginalization would connect all neighbors with each other.) On a street that was driven again, loops stay near
+    their places: the odometry takes one of them to the next node, not all those of the nodes before. Rejected loops of
+    a node are removed with it. Of several compositions between the same two nodes the one with the smallest covariance
+    is kept, else laps would add up.
     """
     left: dict[int, Edge] = dict(enumerate(edges))
     at: dict[int, set[int]] = {}
@@ -163,7 +165,7 @@ def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
 
 
 def _joined(node: int, incident: list[Edge]) -> list[Edge]:
-    """The edges between its neighbors that replace those of a node."""
+    """The edges between the neighbors of a node that replace the node's edges."""
     spokes = [edge if edge.from_node == node else inverted(edge) for edge in incident]
     surest: dict[str, Edge] = {}
     for spoke in sorted(spokes, key=lambda edge: float(np.trace(edge.covariance))):
@@ -183,7 +185,7 @@ def inverted(edge: Edge) -> Edge:
 
 
 def composed(first: Edge, second: Edge) -> Edge:
-    """One constraint after another, with errors that are independent."""
+    """Two consecutive constraints as one, with independent errors."""
     A = se3.adjoint(se3.inverse(second.T_from_to))
     both = replace(
         second.registration,

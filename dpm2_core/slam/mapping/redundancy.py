@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Driving a block ten times does not make ten maps: a keyframe that came back to an old one uses its payload.
+"""A keyframe that revisits an older one uses the older one's payload, so that repeated drives do not enlarge the map.
 
-Its own cloud tells how the place looks now, for the grid that robots plan in, and stays until the next one comes.
+Its own cloud shows how the place looks now, for the navigation grid, and is kept until the next revisit.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.store.cloud_store import Loan
 
 LAP = 10
-"""Keyframes: those nearer along the drive are its neighbors, and no revisit."""
+"""Keyframes that are closer along the drive are neighbors, and no revisit."""
 SAME = 3.0
-"""m, at most, from a keyframe to the older one that it repeats."""
+"""Maximum distance, m, of a keyframe from the older one that it repeats."""
 TURNED = 30.0
-"""The same, degrees: from another direction a place may look different."""
+"""Maximum rotation between them, degrees: from another direction a place may look different."""
 
 
 def lender(node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | None], distance: float) -> Loan | None:
-    """The node whose payload a new node can share; None: it keeps its own.
+    """The node whose payload a node can share; None: it keeps its own.
 
     Args:
-        node: with `loops` those that were tried for it, to it.
-        loan_of: of older nodes: one that borrows itself hands on.
+        node: the node; loops: the loops that were tried for it, to it.
+        loan_of: loan of an older node: one that borrows itself passes on its lender.
         distance: m, at most, to the lender.
     """
     for edge in loops:
@@ -42,10 +42,10 @@ def lender(node: int, loops: Sequence[Edge], loan_of: Callable[[int], Loan | Non
 
 
 def to_lender(loop: Edge, loan_of: Callable[[int], Loan | None]) -> Edge:
-    """A loop from a keyframe that borrows its cloud, from the lender, whose cloud it is that was seen.
+    """A loop from a keyframe that borrows its cloud, moved to the lender, whose cloud was registered.
 
-    So each lap hangs on keyframes that have clouds, and the solution of the graph takes as much longer as there are
-    more laps. With loops from any lap to any other one it takes four to eight times as long with each doubling.
+    So each lap is connected to keyframes with clouds, and the time to optimize the graph increases linearly with the
+    number of laps. With loops between any two laps it is four to eight times as long with each doubling.
     """
     if (loan := loan_of(loop.from_node)) is None:
         return loop

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map in squares of the ground: a folder with a map file for each, of which only those around a place are open.
+"""A map as tiles: a folder with a map file for each square of the ground; only those around the robot are open.
 
-Beside the files, tiles.json says which there are, and a table has one vector for every keyframe, by which a robot that
-does not know where it is finds the squares that look like what it sees.
+In the same folder, tiles.json lists the tiles, and a table has one vector per keyframe. With these vectors a robot that
+does not know its pose finds the tiles that look like its scan.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from dpm2_core.slam.store.map_store import MapStore
 
 INDEX, VECTORS = "tiles.json", "places.npy"
 _BLOCK = 65_536  # vectors that are compared at once: 140 MB
-_SMALLEST, _MOST = 10.0, 1_000_000  # m, side of a square; squares of a map
+_SMALLEST, _MOST = 10.0, 1_000_000  # m, edge of a tile; number of tiles of a map
 
 Tile = tuple[int, int]
-"""A square: how many sides its corner is from the origin, in x and in y."""
+"""A tile: position of its corner in x and y, in units of its edge."""
 
 
 def write_tiles(data: MapData, folder: Path, size: float) -> int:
-    """Write a map as squares of so many meters; the folder appears whole or not at all.
+    """Write a map as tiles with an edge of `size`, m; the folder appears whole or not at all.
 
-    A keyframe that borrows its cloud is left out: what it shows, its lender shows.
+    A keyframe that borrows its cloud is left out: its lender shows the same.
 
     Returns:
-        The number of squares.
+        The number of tiles.
 
     Raises:
-        UsageError: there is such a folder, or the squares are too small. Dpm2Error: it could not be written.
+        UsageError: the folder exists, or the tiles are too small. Dpm2Error: it could not be written.
     """
     if not _SMALLEST <= size < math.inf:
         raise UsageError(f"tiles of {size:g} m: want at least {_SMALLEST:g} m")
@@ -77,16 +77,16 @@ def _name(tile: Tile) -> str:
 
 
 class TiledMap:
-    """A folder of squares, opened for reading. A context manager, as a `MapStore` is.
+    """A folder of tiles, opened for reading. A context manager, as `MapStore`.
 
     Attributes:
-        path: the folder. size: side of a square, m. weights: with which its descriptors were made.
+        path: the folder. size: edge of a tile, m. weights: ids of the weights that made its descriptors.
     """
 
     read_only = True
 
     def __init__(self, path: Path) -> None:
-        """Nothing but the index is read.
+        """Open the folder; only the index is read.
 
         Raises:
             UsageError: no such folder. Dpm2Error: its index is damaged.
@@ -127,17 +127,17 @@ class TiledMap:
 
     @property
     def open(self) -> set[Tile]:
-        """The squares whose keyframes are in memory."""
+        """The tiles whose keyframes are in memory."""
         return set(self._files)
 
     def around(self, xy: Array, reach: float) -> list[Tile]:
-        """The squares that are there within so many meters of a place (2,)."""
+        """The existing tiles within `reach`, m, of a position (2,)."""
         low, high = (np.floor((xy + side * reach) / self.size).astype(int).tolist() for side in (-1, 1))
         every = ((x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1))
         return [tile for tile in every if tile in self._counts]
 
     def like(self, vector: Vector, count: int) -> list[Tile]:
-        """The squares of the `count` keyframes, of all there are, that look most like a place (528,)."""
+        """The tiles of the `count` keyframes in the whole map that are most similar to a place vector (528,)."""
         (query,) = centered(vector[None], self._mean)
         best: list[tuple[float, int]] = []
         for first in range(0, len(self._vectors), _BLOCK):
@@ -148,8 +148,8 @@ class TiledMap:
         return list(dict.fromkeys(tiles[int(np.searchsorted(ends, node, side="right"))] for _, node in best))
 
     def read(self, tiles: Collection[Tile]) -> tuple[MapData, str]:
-        """One map of some squares, at least one; all others are closed. And why one of them is missing in it, in words;
-        empty where none is.
+        """One map of these tiles, at least one, and why one of them is missing in it, in words; empty if none is. All
+        other tiles are closed.
 
         Raises:
             Dpm2Error: all are missing or damaged.
@@ -184,7 +184,7 @@ class TiledMap:
 
 
 class TiledRelocalizer:
-    """Finds clouds in a map of squares as `Relocalizer` does in a map; in memory are those around the last place."""
+    """Localizes clouds in a tiled map, as `Relocalizer` does in a map; tiles around the last pose are in memory."""
 
     def __init__(
         self,
@@ -193,16 +193,16 @@ class TiledRelocalizer:
         make: Callable[[MapData], Relocalizer],
         describe: Callable[[Keyframe], Descriptors],
     ) -> None:
-        """`make`: for a map that is in memory. `describe`: see `PlaceRecognition.descriptors`."""
+        """`make`: creates the relocalizer of a map in memory. `describe`: see `PlaceRecognition.descriptors`."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
         self._here: Relocalizer | None = None
-        self._problem = ""  # why a square is not in it
+        self._problem = ""  # why a tile is missing
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
-        """As `Relocalizer.find`: around a hint, or else in the squares that look like the cloud.
+        """As `Relocalizer.find`: around a hint, or else in the tiles that look like the cloud.
 
         Raises:
-            Dpm2Error: it is found nowhere, and a square is missing or damaged.
+            Dpm2Error: it is not found, and a tile is missing or damaged.
         """
         try:
             keyframe = replace(keyframe, descriptors=(descriptors := self._describe(keyframe)))
@@ -219,11 +219,11 @@ class TiledRelocalizer:
         """As `Relocalizer.verify`.
 
         Raises:
-            Dpm2Error: it is not confirmed, and a square is missing or damaged.
+            Dpm2Error: it is not confirmed, and a tile is missing or damaged.
         """
         xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
-            self._go_to(self._tiles.around(xy, max(self._tiles.size, reach)))  # more: not again in the next moment
+            self._go_to(self._tiles.around(xy, max(self._tiles.size, reach)))  # more, so that the next call needs none
         return self._known(lambda here: here.verify(keyframe, T_map_lidar))
 
     def _go_to(self, tiles: Collection[Tile]) -> None:
@@ -233,7 +233,7 @@ class TiledRelocalizer:
             self._here = self._make(data)
 
     def _known(self, asked: Callable[[Relocalizer], Registration]) -> Registration:
-        """What is known here, where that is something, also without a square that cannot be read."""
+        """The result with the loaded tiles; if it is not ok and a tile is missing, raise the problem."""
         result = nowhere("outside the map") if self._here is None else asked(self._here)
         if self._problem and not result.ok:
             raise Dpm2Error(self._problem)
