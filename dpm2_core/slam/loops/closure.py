@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops: places that look alike, and places near by the pose; each is registered and verified before it counts.
+"""Loop closure: candidates by descriptors and by pose; each is registered and verified before it is accepted.
 
-A candidate must convince four times: the odometry, whose drift has limits, so that places beyond them are not asked for
-at all; the network, which finds it and registers it without any start; the points of the new keyframe, which must fit
-the map around it; and, where the correction is large, a second loop that says the same. Where the odometry between its
-ends is not known, as of two drives or across a gap, it must also fit clearly better than any other place. Whatever
-fails is kept with the reason.
+A candidate must pass four checks. Odometry: its drift is limited, so places beyond the limit are not candidates at all.
+Network: it finds the candidate and registers it without a start. Points: those of the new keyframe must fit the map
+around the candidate. Second loop: a large correction must be confirmed by another loop. If the odometry between the two
+ends is unknown, as between two drives or across a gap, the candidate must also fit clearly better than any other place.
+Rejected candidates are kept with the reason.
 """
 
 from __future__ import annotations
@@ -31,42 +31,42 @@ from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, looks_elsewh
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
-_SEEN = 40.0  # m, between two keyframes that see the same at most; rooms are enlarged
-_DRIFT = 0.01  # m per m of path, by which the odometry may err: a place near by the pose is farther by so much
+_SEEN = 40.0  # m, maximum distance of two keyframes that see the same; rooms are enlarged
+_DRIFT = 0.01  # m per m of path, drift of the odometry: added to the radius of the search by pose
 _MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
 
 
 class LoopSettings(Settings):
-    """Search for and verification of loops."""
+    """Search and verification of loops."""
 
     enabled: bool = True
-    """Close loops at all."""
+    """Close loops."""
     descriptors: bool = True
-    """Find places again by neural descriptors (`neural.weights`), which then every keyframe gets, whatever registers
-    the scans; without, only keyframes near by the pose are candidates."""
+    """Find loops by neural descriptors (`neural.weights`); then every keyframe has them, whatever registers the scans.
+    Without them, only keyframes that are near by their pose are candidates."""
     gap: float = Field(50.0, ge=0)
     """Path that must lie between two keyframes of a loop, m."""
     candidates: int = Field(4, ge=1)
-    """So many keyframes that look like the new one are registered by the network..."""
+    """Number of keyframes most similar to the new one that the network registers..."""
     verified: int = Field(2, ge=1)
-    """...and so many of them, the most confident first, by their points."""
+    """...and of those, the most confident first, that are registered by their points."""
     min_overlap: float = Field(0.2, ge=0, le=1)
-    """Probability of the network's overlap head, below which the points are not asked."""
+    """Probability of the network's overlap head, below which a candidate is rejected before its points are used."""
     decided_by: Literal["points", "overlap"] = "points"
     """What accepts a candidate of the network: the points and a second loop; or, as in the paper, its overlap head
-    alone, which then also chooses the best of the candidates."""
+    alone, which then also selects the best candidate."""
     radius: float = Field(8.0, ge=0)
-    """The keyframe nearest by the pose is a candidate, too, if nearer than this, m, and 1 % of the path since."""
+    """The keyframe nearest by its pose is a candidate, too, if nearer than this, m, plus 1 % of the path since."""
     surroundings: float = Field(22.0, gt=0)
-    """Keyframes so near to a candidate along the path make up the map to register to, m."""
+    """Keyframes within this distance of a candidate along the path make up the map to register to, m."""
     consistency: ConsistencySettings = ConsistencySettings()
 
 
 class LoopCloser:
-    """Finds and verifies the loops of each new keyframe. A node is a keyframe's position in the map."""
+    """Finds and verifies the loops of each new keyframe. A node is the index of a keyframe in the map."""
 
     def __init__(self, ways: ByScale[tuple[LoopSettings, Verifier]], network: DeepPointMap2 | None = None) -> None:
-        """`ways`: to search and verify, by what a keyframe shows."""
+        """`ways`: settings and verifier, by the type of scene that a keyframe shows."""
         self._ways = ways
         self._settings, self._verifier = ways.outdoor
         self._places = PlaceRecognition(network) if network is not None else None
@@ -75,21 +75,21 @@ class LoopCloser:
 
     @property
     def channels(self) -> int | None:
-        """Width of the features that the network makes; None without a network."""
+        """Width of the network's features; None without a network."""
         return None if self._places is None else self._places.channels
 
     @property
     def _by_head(self) -> bool:
-        """Whether the overlap head alone decides, as in the paper: then it is asked of every candidate."""
+        """Whether the overlap head alone decides, as in the paper: then it is computed for every candidate."""
         return self._settings.decided_by == "overlap"
 
     def described(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe with descriptors, of its cloud where its registration made none; as it is if that has none."""
+        """The keyframe with descriptors, made from its cloud if needed; unchanged if it has none."""
         if keyframe.descriptors is not None or self._places is None:
             return keyframe
         try:
             return replace(keyframe, descriptors=self._places.descriptors(keyframe))
-        except Dpm2Error:  # too few points: no loop begins there, and none ends there
+        except Dpm2Error:  # too few points: no loop starts or ends there
             return keyframe
 
     def close(
@@ -104,13 +104,12 @@ class LoopCloser:
 
         Args:
             keyframes: all of them. clouds: theirs, each (M, 4) in its own frame. poses: (N, 4, 4) T_map_kf.
-            parts: (N,) the part of the map that each is in: where two of them are to each other is not known.
-            own: (N,) which descriptors are their own: those that borrow look like nothing but the lender, whose loop
-                they would confirm, a single witness. None: all.
+            parts: (N,) part of the map of each keyframe: the relative pose of two parts is unknown.
+            own: (N,) mask of keyframes with their own descriptors. Borrowed ones match only the lender; they would
+                confirm the lender's own loop, a single witness. None: all.
 
         Returns:
-            Every candidate, accepted or rejected with its reason; and earlier ones of which it took a second to be
-            sure.
+            Every candidate, accepted or rejected with its reason, and earlier ones that it confirms.
         """
         for node in range(len(self._path), len(keyframes)):
             self._path.append(keyframes[node])
@@ -144,7 +143,7 @@ class LoopCloser:
     def _proposals(
         self, since: Array, keyframes: Sequence[Keyframe], poses: Array, own: NDArray[np.bool_]
     ) -> tuple[list[Edge], list[Edge]]:
-        """Candidates that the network rejected, and those for the points to verify, the most likely first."""
+        """Candidates that the network rejected, and those to verify by their points, the most likely first."""
         node, s = len(keyframes) - 1, self._settings
         descriptors = keyframes[node].descriptors
         distance = np.linalg.norm(poses[:, :3, 3] - poses[node, :3, 3], axis=1)
@@ -153,7 +152,7 @@ class LoopCloser:
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
             allowed = own & (since > s.gap)
-            if not self._by_head:  # what the odometry would reject in any case is not asked for
+            if not self._by_head:  # leave out what the odometry check would reject in any case
                 allowed &= distance <= _SEEN / descriptors.scale + margin(since, s.consistency)
             similar = self._places.similar(descriptors, allowed, s.candidates)
             found = self._registered(node, similar, keyframes)
@@ -185,13 +184,13 @@ class LoopCloser:
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
     def _nearest(self, since: Array, distance: Array) -> int | None:
-        """The keyframe nearest by the pose, if it is near enough for the drift since then."""
+        """The keyframe nearest by its pose, if it is near enough for the drift since then."""
         s = self._settings
         near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + _DRIFT * since))
         return int(near[np.argmin(distance[near])]) if len(near) else None
 
     def _verified(self, proposal: Edge, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Edge:
-        """Verification by the points; if it fails, once more from the pose that the descriptors around both suggest."""
+        """Verify by the points; if that fails, again from the pose by the merged descriptors around both ends."""
         nodes = self._around(proposal.from_node, proposal.to_node, self._settings.surroundings)
         T_candidate_kf = se3.inverse(poses[proposal.from_node]) @ poses[nodes]
         around = self._verifier.surroundings([clouds[n] for n in nodes], T_candidate_kf)
@@ -207,7 +206,7 @@ class LoopCloser:
         return replace(proposal, registration=result)
 
     def _map_to_map(self, proposal: Edge, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
-        """T_from_to by the descriptors of the keyframes around both."""
+        """T_from_to by the descriptors of the keyframes around both ends."""
         assert self._places is not None
         a, b = proposal.from_node, proposal.to_node
         own = keyframes[b].descriptors
@@ -219,15 +218,15 @@ class LoopCloser:
         return self._places.register(source, [target])[0]
 
     def _around(self, candidate: int, node: int, reach: float) -> list[int]:
-        """The candidate and those nearer to it than `reach` m along the path, without what the new one just passed."""
+        """The candidate and the nodes within `reach` m of it along the path, without those just before the new one."""
         near = (self._path.since(candidate) <= reach) & (self._path.since(node) > self._settings.gap / 2)
         return np.flatnonzero(near).tolist()
 
 
 def _is_elsewhere(one: Edge, other: Edge, poses: Array) -> bool:
-    """Whether the new keyframe is at another place of the map (N, 4, 4), or turned, by one loop than by the other.
+    """Whether two loops place the new keyframe at different positions or headings in the map (N, 4, 4).
 
-    What nothing ties to the map yet counts as elsewhere: a place there that fits as well leaves both in doubt.
+    A place that is not connected to the map yet counts as different: if it fits as well, both are doubtful.
     """
     here, there = (poses[loop.from_node] @ loop.T_from_to for loop in (one, other))
     return bool(np.linalg.norm(here[:3, 3] - there[:3, 3]) > SAME_PLACE) or looks_elsewhere(here, there)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a loop agree with what is known already? With the odometry between its ends, or with another loop nearby.
+"""Consistency of a loop with the odometry between its ends, or with another loop nearby.
 
-Two loops and the ways between their ends, by odometry or through the map, make a circle, after which one must be where
+Two loops and the paths between their ends, by odometry or through the map, form a circle, which must close:
 one was: J. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging",
 ICRA 2018.
 """
@@ -19,46 +19,46 @@ from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-UNCERTAIN = 0.5  # m, standard deviation of an odometry edge beyond drift: a direction was open, or nothing fitted
+UNCERTAIN = 0.5  # m, sigma of an odometry edge beyond drift: a direction was unconstrained, or nothing fitted
 _STOREY = 2.0
-"""A loop that corrects the odometry by more than this, m, may be one to a storey that looks alike..."""
+"""A loop that corrects the odometry by more than this, m, may lead to another storey that looks alike..."""
 _MOST_SIGMAS = 3.0
-"""...and is none where the odometry is no more than so many standard deviations off: on the next storey of a car park
-it is 3.7 to 5.1. The odometry promises little: at right loops of whole drives it is 0.2, on real ones perhaps 1."""
-_SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: what odometry may be off by without such an edge
-_TURN = 3.0, 0.02  # degrees, and per meter of path: a loop may correct the odometry so much
-_CIRCLE = 0.01  # m, per meter of path: the circle of two loops may miss its start by so much more
+"""...unless the correction is at most this many standard deviations of the odometry. Loops to the next storey of a car
+park have 3.7 to 5.1. The odometry's covariance is cautious: correct loops of whole drives have 0.2, real ones maybe 1."""
+_SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: error of the odometry without such an edge
+_TURN = 3.0, 0.02  # degrees, and per meter of path: allowed correction of the odometry by a loop
+_CIRCLE = 0.01  # m, per meter of path: added to the allowed error of the circle of two loops
 _COMPARED = 200  # loops, the newest: one that is farther along the path than `reach` agrees with none; 5 ms
 
 
 class ConsistencySettings(Settings):
-    """How far loops may differ from the odometry and from each other."""
+    """Allowed differences of loops from the odometry and from each other."""
 
     drift: float = Field(_DRIFT, gt=0)
-    """Expected odometry drift per meter; a loop that corrects more than this times the path, plus 1 m, is rejected;
-    or by more than 0.02 degrees per meter, plus 3."""
+    """Expected odometry drift per meter. A loop is rejected if it corrects more than this times the path, plus 1 m, or
+    more than 0.02 degrees per meter, plus 3."""
     certain: float = Field(2.0, ge=0)
     """A loop that corrects the odometry by no more than this, m (and degrees), needs no other loop to confirm it."""
     reach: float = Field(100.0, gt=0)
-    """Another loop confirms it if both its ends are nearer than this along the path, m..."""
+    """Another loop can confirm it if both its ends are nearer than this along the path, m..."""
     circle: float = Field(0.4, ge=0)
-    """...and the circle of the two misses its start by no more than this, m, and 0.01 m per meter of its path (three
+    """...and the circle of the two ends within this distance of its start, m, plus 0.01 m per meter of its path (three
     times that in degrees)."""
 
 
 class OdometryChain:
     """The odometry of all keyframes, in segments: one robot, one session.
 
-    Within one it is known where its uncertain edges add no more, with three standard deviations each, than it may drift
-    on the way anyway. So a stretch that leaves 1 m open does not part the two ends of a drive of 1 km, but does part
-    what lies on both sides of it.
+    Within a segment the odometry between two nodes is known if its uncertain edges, with three standard deviations
+    each, add no more than the usual drift over the path. So 1 m of unconstrained motion does not separate the two ends
+    of a drive of 1 km, but it separates the nodes directly before and after it.
     """
 
     def __init__(self) -> None:
         self._segment = np.zeros(256, np.int64)
-        self._meters = np.zeros(256)  # since the segment began
-        self._doubt = np.zeros(256)  # the same: three deviations of all uncertain edges, m or degrees, the larger
-        self._covariances: list[Array] = []  # (6, 6) of the way since the segment began, in the odometry frame
+        self._meters = np.zeros(256)  # path since the start of the segment
+        self._doubt = np.zeros(256)  # since then: three deviations of all uncertain edges, m or degrees, the larger
+        self._covariances: list[Array] = []  # (6, 6) of the motion since then, in the odometry frame
         self._T_odom_kf: list[Array] = []
         self._last: dict[str, int] = {}  # by robot
 
@@ -84,11 +84,11 @@ class OdometryChain:
         self._covariances.append(self._covariances[before] + A @ keyframe.edge.covariance @ A.T)
 
     def since(self, node: int) -> Array:
-        """(N,) meters of path between each node and this one; inf where the odometry between them is not known."""
+        """(N,) meters of path between each node and this one; inf if the odometry between them is unknown."""
         return self._known_meters(slice(len(self)), node)
 
     def between(self, a: int, b: int) -> float:
-        """The same for two nodes."""
+        """Meters of path between two nodes; inf if the odometry between them is unknown."""
         return float(self._known_meters(a, b))
 
     def _known_meters(self, nodes: int | slice, node: int) -> Array:
@@ -105,7 +105,7 @@ class OdometryChain:
         return se3.inverse(self._T_odom_kf[a]) @ self._T_odom_kf[b]
 
     def sigmas(self, loop: Edge) -> float:
-        """How far a loop within a segment is from the odometry, in standard deviations of both together."""
+        """Distance of a loop within a segment from the odometry, in standard deviations of both together."""
         a, b = sorted((loop.from_node, loop.to_node))
         back = se3.adjoint(se3.inverse(self._T_odom_kf[loop.to_node]))
         covariance = back @ (self._covariances[b] - self._covariances[a]) @ back.T + loop.covariance
@@ -114,12 +114,12 @@ class OdometryChain:
 
 
 def margin(since: Array | float, settings: ConsistencySettings) -> Array | float:
-    """How far a loop may be from the odometry, m, after so many meters of path; inf where that is not known."""
+    """Allowed distance of a loop from the odometry, m, after `since` meters of path; inf if that is unknown."""
     return _SLACK + settings.drift * since
 
 
 def _doubt(edge: Registration) -> float:
-    """Three standard deviations, m or degrees, the larger, of an edge that is uncertain; 0 for others."""
+    """Three standard deviations, m or degrees, the larger, of an edge if it is uncertain; else 0."""
     if edge.worst_sigma <= UNCERTAIN:
         return 0.0
     turn = np.degrees(np.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]))
@@ -127,7 +127,7 @@ def _doubt(edge: Registration) -> float:
 
 
 class Consistency:
-    """Lets a verified loop pass when the odometry or another loop agrees; until then it waits."""
+    """Accepts a verified loop when the odometry or another loop agrees; until then the loop waits."""
 
     def __init__(self, path: OdometryChain) -> None:
         self._path = path
@@ -137,11 +137,11 @@ class Consistency:
         self._parts: NDArray[np.integer] = np.zeros(0, np.intp)
 
     def update(self, poses: Array, parts: NDArray[np.integer]) -> None:
-        """The map as it is now: (N, 4, 4) T_map_kf, and the part of it (N,) that each keyframe is in."""
+        """Set the current map: (N, 4, 4) T_map_kf, and the part (N,) of each keyframe."""
         self._poses, self._parts = poses, parts
 
     def is_first(self, loop: Edge, settings: ConsistencySettings) -> bool:
-        """Whether nothing else says where its ends are to each other: no known odometry, and no accepted loop."""
+        """Whether nothing else gives the relative pose of its ends: no known odometry, and no accepted loop."""
         known = np.isfinite(self._path.between(loop.from_node, loop.to_node))
         return not known and not self._agrees_with_accepted(loop, settings)
 
@@ -149,10 +149,10 @@ class Consistency:
         """Check a loop that the points have verified.
 
         Args:
-            settings: for what the loop's new end shows.
+            settings: for the type of scene at the loop's new end.
 
         Returns:
-            The loop, accepted or rejected with the reason; if accepted, with those that waited for one like it.
+            The loop, accepted or rejected with the reason; if accepted, with the waiting loops that it confirms.
         """
         s = settings
         since = self._path.between(loop.from_node, loop.to_node)
@@ -180,11 +180,11 @@ class Consistency:
         return list(loops)
 
     def _agree(self, one: Edge, other: Edge, s: ConsistencySettings) -> bool:
-        """Whether the circle through both closes."""
+        """Whether the circle of both loops closes."""
         if one.to_node == other.to_node:
             return False
         there, T_there = self._way(one.from_node, other.from_node)
-        if there > s.reach:  # as of most pairs of a long drive
+        if there > s.reach:  # true for most pairs of a long drive
             return False
         back, T_back = self._way(other.to_node, one.to_node)
         if back > s.reach:
@@ -194,8 +194,8 @@ class Consistency:
         return meters <= allowed and degrees <= 3 * allowed
 
     def _way(self, a: int, b: int) -> tuple[float, Array]:
-        """Meters and T_a_b (4, 4) from one node to another: by odometry; of two drives through the map, if it has them
-        in one part; else inf."""
+        """Meters and T_a_b (4, 4) from one node to another: by odometry; for two drives through the map if both are in
+        one part of it, else inf."""
         if self._path.of_one_drive(a, b):
             return self._path.between(a, b), self._path.T(a, b)
         T = self._T_in_map(a, b)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localization mode: keyframes are found in a map that stays as it is; kidnapping is noticed and recovered from."""
+"""Localization mode: keyframes are localized in a map that does not change; a kidnapped robot is relocalized."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from dpm2_core.slam.loops.verification import looks_elsewhere
 LOST = isotropic(1.0, 100.0)
 """Covariance of an uninformative prior."""
 _PATIENCE = 1_000_000_000  # ns
-_FAILURES = 3  # keyframes in a row that do not fit the map where they are thought to be: then one is lost
-_MOVED = 1.0  # m: nearer to each other, scans show the same
+_FAILURES = 3  # consecutive keyframes that do not fit the map at their predicted pose, after which the state is lost
+_MOVED = 1.0  # m: scans that are closer to each other show the same
 
 
 @dataclass(frozen=True, eq=False)
 class LocalizationResult:
-    """A keyframe in the map.
+    """The pose of a keyframe in the map.
 
     Attributes:
-        T_map_kf: (4, 4); where the odometry puts it unless `registration.ok`.
+        T_map_kf: (4, 4); by the odometry unless `registration.ok`.
         covariance: (6, 6) of it, as in `Registration`; huge while lost.
-        state: RELOCALISED: it was somewhere else than thought, after being lost, or kidnapped.
+        state: RELOCALISED: the pose is not the expected one, after the robot was lost or kidnapped.
         registration: how it was found, or why not.
-        unreadable: the map could not be read there, `registration.reason` says why. It does not confirm the odometry
-            then, as where nothing fits.
+        unreadable: the map could not be read there, `registration.reason` states why. Then it does not confirm the
+            odometry, as if nothing fits.
     """
 
     T_map_kf: Array
@@ -43,13 +43,13 @@ class LocalizationResult:
 
 
 class Localizer:
-    """Stands where the mapper does: keyframes in, `T_map_odom` out; but the map does not grow.
+    """Takes the part of the mapper: keyframes in, `T_map_odom` out; but the map does not grow.
 
     Attributes:
-        T_map_odom: (4, 4), the last that was verified; it means nothing before `state.located`.
-        state: RELOCALISING before the first result, which makes it RELOCALISED; the next one TRACKING; DEGRADED where
-            the map does not confirm the odometry, LOST when that lasts or the odometry is broken.
-        found: id of the last keyframe that was found in the map; None before the first.
+        T_map_odom: (4, 4), the last verified one; undefined unless `state.located`.
+        state: RELOCALISING before the first result, which makes it RELOCALISED; the next one TRACKING; DEGRADED if the
+            map does not confirm the odometry, LOST if that lasts or the odometry is broken.
+        found: id of the last keyframe that was localized in the map; None before the first.
     """
 
     def __init__(self, relocalizer: FindsPlaces) -> None:
@@ -59,45 +59,45 @@ class Localizer:
 
     @property
     def state(self) -> State:
-        """As of the last keyframe, or LOST if the odometry has been lost since: it may have been carried off."""
+        """State at the last keyframe, or LOST if the odometry was lost since: the robot may have been carried away."""
         return State.LOST if self._last < self._broken and self._state.located else self._state
 
     def odometry_lost(self, following: int) -> None:
-        """The odometry was lost: keyframes from that id on may be anywhere, wherever it leads. Ids tell the order, not
-        stamps: a clock may be set back.
+        """The odometry was lost: the pose of keyframes from id `following` on is unknown. Ids give the order, not
+        stamps, since a clock may be set back.
 
-        May be called in another thread than the other methods: a keyframe from before, which still waits, is found as
-        ever, and the state stays LOST.
+        May be called in another thread than the other methods: an earlier keyframe that still waits is localized as
+        usual, and the state stays LOST.
         """
         self._broken = following
 
     def wants(self, stamp: int) -> bool:
-        """Whether to ask for a keyframe now (ns): once a second, also at a halt, until another confirms the place."""
+        """Whether to request a keyframe now (ns): once per second, also at a halt, until another confirms the pose."""
         return self.state is not State.TRACKING and (self._stamp is None or abs(stamp - self._stamp) >= _PATIENCE)
 
     def restart(self) -> None:
-        """The odometry has begun anew: one may be anywhere."""
+        """The odometry has restarted: the pose is unknown."""
         self.T_map_odom: Array = np.eye(4)
         self._state = State.RELOCALIZING
         self._failures = 0
         self._distrust = 0.0  # m, path since the map last confirmed the odometry
         self._T_last: Array | None = None
         self._far: tuple[Array, Array] | None = None  # T_map_odom and T_odom_kf of a result that must be found again
-        self._alike = False  # places have fitted alike since the last one that was known
+        self._alike = False  # whether several places fitted equally since the last known pose
         self._stamp: int | None = None
         self._last = -1  # id of the last keyframe
         self.found: int | None = None
         self._broken = 0  # id of the first keyframe after the odometry was lost
 
     def hint(self, T_map_lidar: Array) -> None:
-        """Prior for the pose of the next keyframe (4, 4), for example from RViz."""
+        """Set a prior for the pose of the next keyframe (4, 4), for example from RViz."""
         self._hint, self._state, self._alike = T_map_lidar, State.RELOCALIZING, False
 
     def add(self, keyframe: Keyframe) -> LocalizationResult:
-        """Find a keyframe, which has its cloud, in the map."""
+        """Localize a keyframe, which has its cloud, in the map."""
         broken = self._last < self._broken <= keyframe.id
         if broken or (keyframe.edge is not None and keyframe.edge.worst_sigma > UNCERTAIN):
-            self._state = State.LOST if self._state.located else self._state  # its odometry may have been
+            self._state = State.LOST if self._state.located else self._state  # its odometry may have been lost
             self._far = None
         self._stamp, self._last = keyframe.stamp, keyframe.id
         if self._T_last is not None:
@@ -114,7 +114,7 @@ class Localizer:
             return LocalizationResult(T_predicted, LOST, self.state, why, unreadable=True)
 
     def _track(self, keyframe: Keyframe) -> LocalizationResult:
-        """Where the odometry says, if the points agree; else look everywhere."""
+        """Verify the pose by the odometry with the points; if they do not confirm it, search everywhere."""
         T_predicted = self.T_map_odom @ keyframe.T_odom_kf
         result = self._relocalizer.verify(keyframe, T_predicted)
         if result.ok:
@@ -123,8 +123,8 @@ class Localizer:
         return self._find(keyframe, result)
 
     def _find(self, keyframe: Keyframe, rejected: Registration) -> LocalizationResult:
-        """Look in the whole map, or around the hint. What is far off while tracking must be found again, and what is
-        found where places look alike."""
+        """Search the whole map, or around the hint. A result must be found a second time if it is far from the tracked
+        pose, or if places look alike."""
         result = self._relocalizer.find(keyframe, self._hint)
         self._hint = None
         tracking = self._state.located
@@ -144,8 +144,8 @@ class Localizer:
         return LocalizationResult(T_predicted, covariance, self._state, result)
 
     def _found_again(self, keyframe: Keyframe, result: Registration) -> bool:
-        """Whether a result is where another one has been: while tracking, once the map has denied often enough where
-        the odometry leads; else some way on, as sooner or later a scan fits the wrong one of places that look alike."""
+        """Whether a result confirms an earlier one. While tracking: once the map has contradicted the odometry often
+        enough. Else: after some motion, since sooner or later a scan fits the wrong one of places that look alike."""
         T_map_odom, T_odom_other = self._far or (None, keyframe.T_odom_kf)
         again = T_map_odom is not None and self._says_same(T_map_odom @ keyframe.T_odom_kf, result)
         moved = float(np.linalg.norm(keyframe.T_odom_kf[:3, 3] - T_odom_other[:3, 3])) >= _MOVED
@@ -154,12 +154,12 @@ class Localizer:
         return again and (self._failures >= _FAILURES if self._state.located else moved)
 
     def _says_same(self, T_map_lidar: Array, result: Registration) -> bool:
-        """Whether a result is no farther from a pose (4, 4) than the odometry may drift since the map confirmed it."""
+        """Whether a result is as near to a pose (4, 4) as the odometry may have drifted since the last confirmation."""
         meters, _ = se3.apart(T_map_lidar, result.T_target_source)
         return meters <= 2.0 + 0.02 * self._distrust and not looks_elsewhere(T_map_lidar, result.T_target_source)
 
     def _doubt(self) -> None:
-        """Its place, where it has one, is that of the odometry alone."""
+        """Lower the state: the pose, if known, is by the odometry alone."""
         if self._state.located:
             self._state = State.LOST if self._failures >= _FAILURES else State.DEGRADED
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where along a tunnel or a highway am I? From a cloud and a picture, by the pictures of a map's keyframes.
+"""Relocalization along a tunnel or a highway, from a cloud and an image, by the images of a map's keyframes.
 
-The points say where across the road; the texture says where along it. At the right place it correlates by 0.45 to 0.98
-on three simulated highways and in a tunnel of 1 km, by 0.49 to 0.90 on KITTI 04; elsewhere by at most 0.56 and 0.29.
+The points give the position across the road, the texture the position along it. At the right place it correlates by
+0.45 to 0.98 on three simulated highways and in a tunnel of 1 km, by 0.49 to 0.90 on KITTI 04; elsewhere by at most 0.56
+and 0.29.
 """
 
 from __future__ import annotations
@@ -28,20 +29,20 @@ from dpm2_core.slam.registration.texture import (
     textured,
 )
 
-BETWEEN = 6.0  # m to either side of a keyframe: where the next one is nearer
-_CLEARLY = 0.6  # of what does not correlate at the second best place, at most so much does not at the best
+BETWEEN = 6.0  # m to either side of a keyframe: beyond, the next one is nearer
+_CLEARLY = 0.6  # maximum ratio of 1 - correlation at the best place to that at the second best
 _ELSEWHERE = 0.45  # correlation that a place which is not in the map is assumed to have
 _CORRELATED = 1 - _CLEARLY * (1 - _ELSEWHERE)  # at least, at the right place
 _EACH = 2  # every second point is registered, to a single keyframe
-_WIDEN = 2.0  # of how far they may look: it can be in another lane
-_CLOSER = 8  # so many keyframes are compared closely, and those beside them
-_APART = 1.0  # m: other places
+_WIDEN = 2.0  # factor on the search range: the robot can be in another lane
+_CLOSER = 8  # number of keyframes that are compared closely, with their neighbors
+_APART = 1.0  # m: places farther apart are different
 _KEPT = 1000  # references in memory, 30 kB each
 
 
 @dataclass(frozen=True, eq=False)
 class KnownMap:
-    """A map in which places are looked for.
+    """A map in which places are searched.
 
     Attributes:
         keyframes: with descriptors. poses: (N, 4, 4) T_map_kf.
@@ -56,10 +57,10 @@ class KnownMap:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What is looked for: points (N, 3) to be registered, a picture, and T_kf_lidar but for the way along the road.
+    """A query: points (N, 3) to be registered, an image, and T_kf_lidar except for the position along the road.
 
     Attributes:
-        registered: to the keyframes so far, by node; None to one that has no picture.
+        registered: registrations to keyframes so far, by node; None for one without an image.
     """
 
     source: Array
@@ -70,7 +71,7 @@ class _View:
 
 
 class PicturedPlaces:
-    """The keyframes of a map that have pictures."""
+    """The keyframes of a map that have images."""
 
     def __init__(self, settings: VisualSettings, known: KnownMap) -> None:
         self._settings = settings.model_copy(update={"min_correlation": _CORRELATED})
@@ -78,14 +79,14 @@ class PicturedPlaces:
         self._references: dict[int, Reference | None] = {}
 
     def texture(self, keyframe: Keyframe) -> Texture | None:
-        """Of the picture of a keyframe that is looked for; None without one, and if none are to be used."""
+        """Texture of the image of a query keyframe; None without an image, or if images are not used."""
         picture = usable_image(keyframe.thumbnail) if self._settings.enabled else None
         return None if picture is None else textured(picture)
 
     def along(self, picture: Texture, reach: float, nodes: Sequence[int]) -> Along:
-        """How far along a place is, at most `reach` m from where it is thought to be, by the nearest of `nodes`.
+        """A function that finds the position along the road, within `reach` m of the assumed one, by an image.
 
-        The first of them is the target of the registration.
+        The first of `nodes` with a usable image is used; `nodes[0]` is the target of the registration.
         """
 
         def nearest(result: Registration) -> Registration:
@@ -101,13 +102,13 @@ class PicturedPlaces:
     def find(
         self, cloud: Points, picture: Texture, nodes: Sequence[int], verifier: Verifier, T_across: Array
     ) -> Registration | None:
-        """The place T_map_lidar of a cloud (M, 4) among keyframes; `ok` False where another one looks alike; or None.
+        """The pose T_map_lidar of a cloud (M, 4) among keyframes; `ok` False if another place looks alike; or None.
 
         It is not verified by the points.
 
         Args:
-            nodes: no two need be next to each other.
-            T_across: (4, 4) T_kf_lidar, but for the way along the road.
+            nodes: neighbors of the likely ones are added.
+            T_across: (4, 4) T_kf_lidar, except for the position along the road.
         """
         view = _View(np.ascontiguousarray(verifier.source(cloud)[::_EACH]), picture, verifier, T_across)
         seen = {node: self._seen(node, view) for node in nodes}
@@ -121,7 +122,7 @@ class PicturedPlaces:
         return replace(best, ok=not (why := _objection(best, others)), reason=why)
 
     def _seen(self, node: int, view: _View, closely: bool = False) -> list[Registration]:
-        """Places T_map_lidar at which a keyframe shows what the picture does; their confidence is the correlation."""
+        """Poses T_map_lidar where a keyframe shows the same as the image; their confidence is the correlation."""
         s, result = self._settings, self._registered(node, view)
         if result is None or not result.ok:
             return []
@@ -137,7 +138,7 @@ class PicturedPlaces:
         ]
 
     def _registered(self, node: int, view: _View) -> Registration | None:
-        """The points of the view to those of a keyframe; None where it has no picture."""
+        """Registration of the query's points to those of a keyframe; None if it has no image."""
         if node not in view.registered:
             result = None
             if self._known.thumbnail(node) is not None:
@@ -147,9 +148,9 @@ class PicturedPlaces:
         return view.registered[node]
 
     def _reference(self, node: int, T_ref_lidar: Array, axis: Array) -> Reference | None:
-        """What a keyframe's picture shows along `axis` (3,) of another LiDAR; None where it has none that can be used.
+        """Texture of a keyframe's image along `axis` (3,) of another LiDAR; None without a usable image.
 
-        The axis of the first time stays: it is that of the road.
+        The axis of the first call is kept: it is that of the road.
         """
         if node not in self._references:
             if len(self._references) >= _KEPT:
@@ -165,7 +166,7 @@ class PicturedPlaces:
 
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:
-    """Why the place that correlates best is not believed; empty if it is."""
+    """Why the place with the best correlation is rejected; empty if it is not."""
     second = second_best(best, others, _ELSEWHERE, _CLEARLY)
     if second is None:
         return ""

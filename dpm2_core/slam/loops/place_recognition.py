@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network's part in loops and relocalization: which keyframes look like this one, and from where it was taken."""
+"""The network in loop closure and relocalization: finds keyframes that look like a scan, and their relative pose."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 
 AGREEING = 0.08
-"""Part of the pairs of two places' descriptors that must agree on a motion while a drive goes on: nearly every
-candidate is another place, and the next keyframe has another chance. One scan by itself may be right with less.
+"""Fraction of the pairs of descriptors of two places that must agree on a motion during a drive: nearly every candidate
+is another place, and the next keyframe has another chance. For a single scan a smaller fraction may be right.
 
 Measured: up to 8 m apart at least 0.22 on KITTI, 0.24 on synthetic roads in either direction, 0.09 in rooms and 0.14 in
-car parks; of places far apart at most 0.08 on KITTI and, of 95 in 100, on synthetic roads."""
+car parks. Places far apart: at most 0.08 on KITTI and, for 95 in 100, on synthetic roads."""
 
 
 class PlaceRecognition:
-    """The descriptors of all keyframes by their node: their position in the map."""
+    """The descriptors of all keyframes by their node: their index in the map."""
 
     def __init__(self, network: DeepPointMap2) -> None:
         self._network = network
@@ -36,21 +36,21 @@ class PlaceRecognition:
 
     @property
     def channels(self) -> int:
-        """Width of the features that it makes."""
+        """Width of the network's features."""
         return self._network.settings.channels
 
     def descriptors(self, keyframe: Keyframe) -> Descriptors:
-        """Those of a keyframe; of its cloud, if its registration made none.
+        """The descriptors of a keyframe; made from its cloud, if its registration made none.
 
-        The cloud, downsampled as it is, gives descriptors that serve as well as those of the whole scan.
+        The downsampled cloud gives descriptors that are as good as those of the whole scan.
 
         Raises:
-            Dpm2Error: it has none.
+            Dpm2Error: the keyframe has none.
         """
         return keyframe.descriptors or self._network.describe(Frame(0, keyframe.cloud, up=keyframe.up))
 
     def update(self, keyframes: Sequence[Keyframe]) -> None:
-        """Take in those that are new."""
+        """Add the new keyframes."""
         for node in range(len(self._index), len(keyframes)):
             self._index.append(keyframes[node].descriptors)
 
@@ -64,7 +64,7 @@ class PlaceRecognition:
         """The pose of a place in the frame of each of the others; no start is needed.
 
         Args:
-            agreeing: a place of which a smaller part of the descriptors agrees on a motion is rejected before the
+            agreeing: if a smaller fraction of the descriptors agrees on a motion, a place is rejected before the
                 network correlates the two, which takes seven times as long.
         """
         agree = self._network.agreement(source, targets) if agreeing else [1.0] * len(targets)
@@ -77,8 +77,8 @@ class PlaceRecognition:
 
 
 def merged(keyframes: Sequence[Keyframe], poses: Array, nodes: Sequence[int], at: int) -> Descriptors:
-    """The descriptors of several nodes in the frame of node `at`, which has some; `poses` (N, 4, 4) T_map_kf."""
+    """Descriptors of several nodes, merged in the frame of node `at`, which has some; `poses` (N, 4, 4) T_map_kf."""
     T_at_map = se3.inverse(poses[at])
-    first = [at, *(node for node in nodes if node != at)]  # the scale of what is merged, of a room or not, is its own
+    first = [at, *(node for node in nodes if node != at)]  # `merge` keeps the scale (room or not) of the first
     found = ((node, keyframes[node].descriptors) for node in first)
     return merge([d if node == at else d.moved(T_at_map @ poses[node]) for node, d in found if d is not None])

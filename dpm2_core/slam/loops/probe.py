@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a direction that a registration leaves open is closed by how the scan fits on either side."""
+"""Checks whether the fit of a scan to either side constrains a direction that a registration leaves unconstrained."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.registration.icp import CORRELATED, DISTINCT, GeometricRegistration
 from dpm2_core.slam.registration.local_map import LocalMap
 
-_PROBE = 1.0  # m either way along a direction that may be open
-_HELD = 1e7  # information, 1 / m2, that keeps a scan there: to less than a millimeter
-_CLOSED = 0.05  # m, standard deviation along a direction in which it fits clearly worse on either side
+_PROBE = 1.0  # m to either side along a direction that may be unconstrained
+_HELD = 1e7  # information, 1 / m2, that fixes a scan there: to less than a millimeter
+_CLOSED = 0.05  # m, standard deviation along a direction in which it fits clearly worse to either side
 
 
 def probed(registration: GeometricRegistration, source: Array, target: LocalMap, result: Registration) -> Registration:
-    """A result that leaves a direction open, after a look 1 m either way along it; unchanged if that is open.
+    """A result with an unconstrained direction, checked 1 m to either side along it; else unchanged.
 
-    The covariance takes the noise of normals off what they say: cautious where poles and trees are few, and needed
-    in a tunnel. A direction is closed where the scan fits clearly worse on either side, whatever else of its pose
-    may change there. Starts on either side find the better place where the first one was off.
+    The covariance subtracts the noise of normals from their information. That is cautious where poles and trees are
+    few, but needed in a tunnel. A direction is constrained if the scan fits clearly worse to either side, even if the
+    rest of its pose may change there. Starts to either side find a better pose if the first one was off.
     """
     b = np.concatenate([np.zeros(3), result.open_direction])
     beside = [se3.exp(way * b) for way in (-_PROBE, _PROBE)]
@@ -37,7 +37,7 @@ def probed(registration: GeometricRegistration, source: Array, target: LocalMap,
 
 
 def _closed(result: Registration, b: Array) -> Registration:
-    """With its position known to `_CLOSED` along a direction, b (6,), or better, where it is already."""
+    """The result with its standard deviation along a direction b (6,) limited to `_CLOSED`."""
     C_b = result.of_scene @ b
     variance = float(b @ C_b)
     excess = max(variance - _CLOSED**2, 0.0) / variance**2
@@ -45,5 +45,5 @@ def _closed(result: Registration, b: Array) -> Registration:
 
 
 def _is_clear(gain: Array) -> bool:
-    """Whether log likelihoods of the points (N,) differ by more than by chance."""
+    """Whether log likelihoods of the points (N,) differ by more than chance."""
     return bool(gain.mean() > max(DISTINCT, 3 * gain.std() * np.sqrt(CORRELATED / len(gain))))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where in a map am I? From one cloud, without any prior, from anywhere and whatever the heading.
+"""Global relocalization in a map, from one cloud, without any prior, at any position and heading.
 
-The descriptors find the keyframes that look alike and a pose in each; the points decide. Where the second best place
-fits nearly as well there is no answer: it is better not to know than to be sure of the wrong one. Where the points do
-not know how far along a road one is, a picture may: see `pictures`.
+The descriptors find similar keyframes and a pose in each; the points decide. If the second best place fits nearly as
+well, there is no result: no pose is better than a wrong one. If the points do not determine the position along a road,
+an image may: see `pictures`.
 """
 
 from __future__ import annotations
@@ -33,36 +33,36 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 
 HEIGHT = 4.0
-"""m that a meter of height counts for between two places: 3 m up, on the next storey, one sees other things."""
+"""Weight of height in the distance of two places: 3 m higher, on the next storey, the view is different."""
 CANDIDATES = 6
-"""Keyframes that look like the scan, which the network registers and the points verify."""
-_PICTURED = 150  # keyframes, no two next to each other, whose pictures are compared where the points leave the way open
-_KEYFRAMES = 9  # make up the map around a place, at most
-_REACH = 1.0  # m, along the road around a place that a picture has found
+"""Keyframes similar to the scan that the network registers and the points verify."""
+_PICTURED = 150  # keyframes, no two adjacent, whose images are compared if the points do not determine the position
+_KEYFRAMES = 9  # maximum number of keyframes of the map around a place
+_REACH = 1.0  # m, along the road around a place that an image has found
 
 
 class RelocalizationSettings(Settings):
-    """Finding oneself in a map."""
+    """Relocalization in a map."""
 
     surroundings: float = Field(22.0, gt=0)
-    """Keyframes so near to a candidate make up the map to register to, m; a meter of height counts for four;
-    of more than nine the nearest."""
+    """Keyframes within this distance of a candidate make up the map to register to, m; a meter of height counts as
+    four; if there are more than nine, the nearest nine."""
     hint_radius: float = Field(20.0, gt=0)
-    """With a hint, keyframes farther from it than this are no candidates, m."""
+    """With a hint, keyframes farther from it than this are not candidates, m."""
 
 
 class FindsPlaces(Protocol):
-    """What a `Localizer` asks: see `Relocalizer`."""
+    """Interface that a `Localizer` uses: see `Relocalizer`."""
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
-        """T_map_lidar of a keyframe, which has its cloud, or why it is not known."""
+        """T_map_lidar of a keyframe with its cloud, or why it is unknown."""
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
-        """Verifies a pose in the map by the points."""
+        """Verify a pose in the map by the points."""
 
 
 class Relocalizer:
-    """A map to find oneself in. Reads it, never changes it."""
+    """A map for relocalization; it is only read, never changed."""
 
     def __init__(
         self,
@@ -83,12 +83,12 @@ class Relocalizer:
         return len(self._keyframes)
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
-        """T_map_lidar of a keyframe, which has its cloud, or why it is not known.
+        """T_map_lidar of a keyframe with its cloud, or why it is unknown.
 
-        Its thumbnail is asked where the points do not say how far along a road it was.
+        Its thumbnail is used if the points do not determine the position along a road.
 
         Args:
-            hint: T_map_lidar (4, 4) to look around; its heading does not matter.
+            hint: T_map_lidar (4, 4) to search around; its heading is not used.
         """
         cloud = keyframe.cloud
         try:
@@ -96,7 +96,7 @@ class Relocalizer:
         except Dpm2Error as error:
             return nowhere(str(error))
         allowed = np.ones(len(self), bool)
-        if hint is not None:  # as on a plan: who points at a map on a screen gives no height
+        if hint is not None:  # in x and y only: a click on a map on a screen has no height
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= self._settings.hint_radius
         places = self._by_points(cloud, descriptors, allowed)
         found = _unique(places) if places else nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
@@ -113,14 +113,14 @@ class Relocalizer:
         return self._verified(cloud, place.T_target_source, texture, _REACH)
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
-        """Verifies a pose in the map by the points, and the thumbnail where they leave a direction open: T_map_lidar,
-        `ok` or not."""
+        """Verify a pose in the map by the points, and by the thumbnail if they leave a direction unconstrained; returns
+        T_map_lidar, `ok` or not."""
         return self._verified(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), BETWEEN)
 
     def _verified(
         self, cloud: Points, T_map_lidar: Array, picture: Texture | None = None, reach: float = 0.0
     ) -> Registration:
-        """As `verify`; where the points leave a direction open a picture is compared up to `reach` m to either side."""
+        """As `verify`; an image is compared up to `reach` m to either side along an unconstrained direction."""
         distance = _distance(self._poses, T_map_lidar)
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
@@ -135,12 +135,12 @@ class Relocalizer:
         return replace(result, T_target_source=T, method="relocalisation")
 
     def _by_points(self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]) -> list[Registration]:
-        """The places that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
+        """The poses that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
         nodes = self._places.similar(descriptors, allowed, CANDIDATES)
         return [self._verified(cloud, proposal.T_target_source) for proposal in self._proposals(descriptors, nodes)]
 
     def _across(self, places: Sequence[Registration]) -> Array:
-        """Where across the road, seen from a keyframe beside it that looks the same way, and with which heading."""
+        """Position across the road and heading, relative to a keyframe nearby with a similar heading."""
         nearest = [self._poses[_distance(self._poses, place.T_target_source).argmin()] for place in places]
         seen = [(place, se3.inverse(T) @ place.T_target_source) for place, T in zip(places, nearest, strict=True)]
         ahead = [(place, T) for place, T in seen if place.confidence > 0 and T[0, 0] > 0]
@@ -151,7 +151,7 @@ class Relocalizer:
         return se3.make(T[:3, :3], T[:3, 3] - way * (way @ T[:3, 3]))
 
     def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
-        """T_map_lidar by each keyframe, the most confident first, one for each place."""
+        """T_map_lidar by each keyframe, the most confident first, one per place."""
         known = [(node, d) for node in nodes if (d := self._keyframes[node].descriptors) is not None]
         results = self._places.register(descriptors, [d for _, d in known])
         proposals: list[Registration] = []
@@ -167,7 +167,7 @@ class Relocalizer:
 
 
 def _unique(places: Sequence[Registration]) -> Registration:
-    """The best of several verified places, if no other one fits nearly as well; else why not."""
+    """The best of several verified poses, if no other place fits nearly as well; else why there is none."""
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
         return nowhere("; ".join(place.reason for place in places))
@@ -175,7 +175,7 @@ def _unique(places: Sequence[Registration]) -> Registration:
     objection = objection_of_others(best, others)
     if objection:
         return nowhere(objection, best.confidence)
-    for other in others:  # which of two equal storeys fits better depends on where the keyframes were taken
+    for other in others:  # which of two equal storeys fits better depends on the positions of the keyframes
         beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
         storey = beside <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
         if storey and other.ok and not objection_of_others(other, []):
@@ -189,10 +189,10 @@ def _is_elsewhere(place: Registration, other: Registration) -> bool:
 
 
 def _distance(poses: Array, pose: Array) -> Array:
-    """Between the positions of (..., 4, 4) poses and another (4, 4), m."""
+    """Distance between the positions of (..., 4, 4) poses and another (4, 4), m, with weighted height."""
     return np.linalg.norm((poses[..., :3, 3] - pose[:3, 3]) * [1.0, 1.0, HEIGHT], axis=-1)
 
 
 def nowhere(reason: str, confidence: float = 0.0) -> Registration:
-    """No pose, and why; `confidence`: of the best of places that fit alike, 0 where none fits."""
+    """No pose, with the reason; `confidence`: of the best of places that fit equally well, 0 if none fits."""
     return replace(Registration.failed("relocalisation", reason), confidence=confidence)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which places of the map look like this one: one vector per keyframe, compared with all others in one product.
+"""Place retrieval: one vector per keyframe, compared with all others in one matrix product.
 
 The vector is the square root of the covariance of a keyframe's descriptors: P. Li, J. Xie, Q. Wang, Z. Gao, "Towards
 Faster Training of Global Covariance Pooling Networks by Iterative Matrix Square Root Normalization", CVPR 2018. It
-needs no training, and as the descriptors do not depend on the heading of the sensor, neither does it.
+needs no training and, like the descriptors, does not depend on the heading of the sensor.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dpm2_core.descriptors import Descriptors
 Vector = NDArray[np.float32]
 
 CHANNELS = 32
-"""Directions of feature space whose covariance is taken."""
+"""Directions of the feature space whose covariance is used."""
 WIDTH = CHANNELS * (CHANNELS + 1) // 2
-"""Numbers of a vector: 528."""
-_FEW = 2 * CHANNELS  # descriptors; the covariance of fewer says little
+"""Length of a vector: 528."""
+_FEW = 2 * CHANNELS  # descriptors; the covariance of fewer is not reliable
 
 
 def pooled(descriptors: Descriptors) -> Vector:
-    """The (528,) float32 vector of a place; zeros, like no other place, where there are too few descriptors."""
+    """The (528,) float32 vector of a place; zeros, similar to no place, if there are too few descriptors."""
     rows, columns = np.triu_indices(CHANNELS)
     if len(descriptors) < _FEW:
         return np.zeros(len(rows), np.float32)
@@ -38,9 +38,9 @@ def pooled(descriptors: Descriptors) -> Vector:
 
 
 def centered(vectors: Vector, mean: Vector) -> Vector:
-    """(N, 528) less the mean, of length 1: products are cosines. What is zero stays so.
+    """(N, 528) minus the mean, normalized to length 1, so that products are cosines. Zero vectors stay zero.
 
-    The mean is subtracted since what all places share does not tell them apart.
+    The mean is subtracted since the part that all places share does not distinguish them.
     """
     less = np.where(np.any(vectors, axis=1, keepdims=True), vectors - mean, 0)
     return np.asarray(less / np.maximum(np.linalg.norm(less, axis=1, keepdims=True), 1e-6), np.float32)
@@ -54,7 +54,7 @@ def _directions(channels: int) -> NDArray[np.float32]:
 
 
 class PlaceIndex:
-    """The vectors of all keyframes in their order; a search is one matrix product, 10 ms for 20,000 of them."""
+    """The vectors of all keyframes in their order; a search is one matrix product, 10 ms for 20,000 keyframes."""
 
     def __init__(self) -> None:
         self._vectors = np.zeros((256, WIDTH), np.float32)
@@ -80,7 +80,7 @@ class PlaceIndex:
         self._count += 1
 
     def similarities(self, query: Vector) -> NDArray[np.float32]:
-        """Cosine (N,) of each keyframe's vector and the (528,) query, both less the mean of all; -1 where none is."""
+        """Cosine (N,) of each keyframe's vector and the (528,) query, both minus the mean of all; -1 if no vector."""
         mean = (self._sum / max(self._used, 1)).astype(np.float32)
         requested = query - mean
         vectors, squared = self._vectors[: self._count], self._squared[: self._count]
@@ -93,8 +93,8 @@ class PlaceIndex:
         """At most `count` of the `allowed` (N,) keyframes, the most similar first.
 
         Args:
-            apart: a keyframe that is no farther than this in the order from one already taken is passed over: its
-                neighbors show the same place, and other places deserve a look.
+            apart: a keyframe within this distance, in the order, of a selected one is skipped: neighbors show the same
+                place, and other places should be tried, too.
         """
         order = np.flatnonzero(allowed & (self._squared[: self._count] > 0))
         similar = self.similarities(query)[order]

@@ -22,57 +22,57 @@ from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSett
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
 _CELL = 2.0  # m, of the grid whose lowest points are the ground
-_ABOVE = 0.5  # m over it: what stands there
-_WELL = 0.75  # fraction of that which fits where a pose is right; with less, a place beside it may fit better
-_CLEARLY = 0.5  # of what does not fit at the second best place, at most so much does not fit at the best
-_LEAST = 0.02  # that does not fit, however well a place does: small rooms of one plan all fit to 100 %
-_ELSEWHERE = 0.8  # fit that a place which was not tried is assumed to have: in car parks they have 0.5 to 0.89
+_ABOVE = 0.5  # m above it: points on objects
+_WELL = 0.75  # fraction of these that fits at a right pose; with less, a pose next to it may fit better
+_CLEARLY = 0.5  # maximum ratio of the unmatched fraction at the best place to that at the second best
+_LEAST = 0.02  # minimum for the unmatched fraction: small rooms of one plan all fit to 100 %
+_ELSEWHERE = 0.8  # fit that an untried place is assumed to have: in car parks they have 0.5 to 0.89
 _MOST_TURNED = 5.0  # degrees, from the proposed pose
-SAME_PLACE = 5.0  # m, poses nearer to each other than this are of one place...
+SAME_PLACE = 5.0  # m, poses closer to each other than this are of one place...
 _SAME_HEADING = 30.0
-"""...and so little turned, degrees: in the middle of a room that looks the same from its other end, both ways fit."""
+"""...and so are headings, degrees: in the middle of a room with two similar ends, both headings fit."""
 
 
 Along = Callable[[Registration], Registration]
-"""Finds the way along the direction that the points leave open; the result itself where it cannot."""
+"""Finds the position along the direction that the points leave unconstrained; else returns the result itself."""
 
 
 class VerificationSettings(Settings):
-    """What the pose of a loop, or of a place in a search, needs to be accepted."""
+    """Criteria to accept the pose of a loop, or of a place in a search."""
 
     min_inliers: float = Field(0.6, ge=0, le=1)
     """Fraction of the points that must fit the map."""
     min_structure: float = Field(0.6, ge=0, le=1)
-    """The same for what stands above the ground: the road fits anywhere."""
+    """The same for points on objects above the ground: the road fits anywhere."""
     min_points: int = Field(150, ge=0)
-    """So many points above the ground at least; with fewer, places cannot be distinguished."""
+    """Minimum number of points above the ground; with fewer, places cannot be distinguished."""
     max_rmse: float = Field(0.2, gt=0)
-    """Largest residual of the points that fit, m."""
+    """Largest residual of the inliers, m."""
     max_sigma: float = Field(0.1, gt=0)
     """Largest standard deviation of the position in its worst direction, m: rejects loops along a tunnel."""
     max_moved: float = Field(2.0, gt=0)
-    """The points may not move the proposed pose farther than this, m, or turn it by more than 5 degrees."""
+    """The points may not move the proposed pose farther than this, m, or rotate it by more than 5 degrees."""
     range: float = Field(40.0, gt=0)
-    """Points farther than this from the sensor have no say, m: another lane sees other things behind them."""
+    """Points farther than this from the sensor are not used, m: from another lane the view behind objects differs."""
 
 
 def second_best(best: Registration, others: Sequence[Registration], assumed: float, clearly: float) -> float | None:
-    """Confidence of the place that fits nearly as well as the best one; None where the best is clear.
+    """Confidence of the place that fits nearly as well as the best one; None if the best is clear.
 
-    As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with what does
-    not fit as the distance.
+    As the ratio test of D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 2004, with the
+    unmatched fraction as the distance.
 
     Args:
         others: results at other places, also those that were not accepted.
         assumed: confidence of a place that was not tried.
-        clearly: of what does not fit at the second best place, at most so much does not at a clear one.
+        clearly: maximum ratio of the unmatched fraction at a clear best place to that at the second best.
     """
     second = max([assumed, *(other.confidence for other in others)])
     return None if max(1 - best.confidence, _LEAST) <= clearly * (1 - second) else second
 
 
 def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
-    """Why a verified pose is not believed without a prior: another place fits nearly as well; empty if none does.
+    """Why a verified pose without a prior is rejected: another place fits nearly as well; empty if none does.
 
     Args:
         others: verifications at other places, also those that were not accepted.
@@ -86,14 +86,14 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
 
 
 def looks_elsewhere(one: Array, other: Array) -> bool:
-    """Whether two poses (4, 4) are turned so far from each other that they are two answers, not one less exact."""
+    """Whether two poses (4, 4) differ so much in heading that they are two different results."""
     return se3.apart(one, other)[1] > _SAME_HEADING
 
 
 class Verifier:
     """Registers a cloud to the keyframes around a place, from a proposed pose, and checks the result.
 
-    Points are as dense as those of the odometry.
+    The point density is that of the odometry.
     """
 
     def __init__(
@@ -103,28 +103,28 @@ class Verifier:
         self._registration = GeometricRegistration(registration)
 
     def surroundings(self, clouds: Sequence[Points], poses: Array) -> LocalMap:
-        """The map of (M, 4) clouds taken at (N, 4, 4) poses, in the frame of those poses, to be verified against."""
+        """A local map of (M, 4) clouds at (N, 4, 4) poses, in the frame of those poses, to verify against."""
         local_map = LocalMap(LocalMapSettings(), self._points.map_voxel)
         parts = [se3.transform(T, cloud) for T, cloud in zip(poses, clouds, strict=True)]
         local_map.insert(np.concatenate(parts), np.eye(4), poses)
         return local_map
 
     def source(self, cloud: Points) -> Array:
-        """Those points (N, 3) of a cloud (M, 4) that are registered."""
+        """Points (N, 3) of a cloud (M, 4) that are registered."""
         return cloud[voxel_first(cloud, self._points.source_voxel, far=self._settings.range), :3].astype(np.float64)
 
     def register(self, source: Array, around: LocalMap, T_proposed: Array, widen: float) -> Registration:
-        """Points (N, 3) of `source` in a map, not verified."""
+        """Register points (N, 3) of `source` to a map, without verification."""
         return self._registration.register(source, around, T_proposed, widen)
 
     def verify(
         self, cloud: Points, around: LocalMap, T_proposed: Array, widen: float = 1.0, along: Along | None = None
     ) -> Registration:
-        """The refined pose of a cloud (M, 4) in a map; `ok` says whether it is accepted, `reason` why not.
+        """The refined pose of a cloud (M, 4) in a map; `ok`: whether it is accepted, `reason`: why not.
 
         Args:
-            widen: factor on how far from the proposed pose the points may look for theirs.
-            along: asked where the points leave a direction open.
+            widen: factor on the search range around the proposed pose.
+            along: called if the points leave a direction unconstrained.
         """
         source = self.source(cloud)
         result = self._registration.register(source, around, T_proposed, widen)
@@ -143,12 +143,12 @@ class Verifier:
         return replace(result, confidence=min(result.confidence, structure), ok=not reason, reason=reason)
 
     def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
-        """Fractions that lie on a surface of the map: of the points (N, 3), and of those that stand."""
+        """Fractions on a surface of the map: of the points (N, 3), and of those on objects."""
         fits = self._registration.fits(source, around, T)
         return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
 
     def _misfit(self, result: Registration, share: float, structure: float, points: int) -> str:
-        """Why the points, so many of them above the ground, do not confirm a pose; empty if they do."""
+        """Why the points, this number of them above the ground, do not confirm a pose; empty if they do."""
         s = self._settings
         if share < s.min_inliers:
             return f"only {share:.0%} of the points fit"
