@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes of satellites in the pose graph: the local frame east, north, up is one more node, a fix is a loop from it.
+"""Satellite fixes in the pose graph: the local frame east, north, up is one more node, and a fix is a loop from it.
 
-Such a loop states a position and no rotation. All else is as with every loop: a robust kernel weighs it, and one that
-the optimized poses are far from is left out. The node enters once the way is long enough to tell its heading.
+Such a loop constrains a position and no rotation. In all other respects it is like any loop: it has a robust kernel,
+and is left out if the optimized poses are far from it. The node is added once the trajectory is long enough to
+determine its heading.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from dpm2_core.slam.graph.graph_data import GraphData, Index
 from dpm2_core.slam.graph.lag import STRETCH, Stretch, lag_of, moved_by
 
 _FEWEST = 5
-_HEADING = np.radians(2.0)  # standard deviation from which on the heading counts as known
+_HEADING = np.radians(2.0)  # standard deviation up to which the heading counts as known
 _KERNEL = 3.0  # standard deviations beyond which a fix hardly counts for the start
-_SLACK, _DRIFT = 0.05, 0.02  # m, and m per m from the middle: the odometry errs, too
+_SLACK, _DRIFT = 0.05, 0.02  # m, and m per m from the middle: error of the odometry
 _TRIALS = 100  # headings
 _NEAR = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
 _TILT = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
-_ANY_TURN, _ANY_PLACE = 1e2, 1e6  # rad and m, standard deviations of what is not measured
-_SLOWEST = 5.0  # s between two fixes that tell a speed
-_FLAT = 100.0  # m, standard deviation of a height from which on it counts as not measured
+_ANY_TURN, _ANY_PLACE = 1e2, 1e6  # rad and m, standard deviations of values that are not measured
+_SLOWEST = 5.0  # s, maximum between two fixes that give a speed
+_FLAT = 100.0  # m, standard deviation from which on a height counts as not measured
 
 
 class Fixes:
@@ -36,46 +37,47 @@ class Fixes:
 
     Attributes:
         georeference: of the map; None before it is known.
-        uncertain: (6, 6) covariance of T_map_enu by how late the fixes may be.
+        uncertain: (6, 6) covariance of T_map_enu due to the unknown lag of the fixes.
     """
 
     def __init__(self) -> None:
         self._fixes: list[tuple[int, Fix]] = []
-        self._rows: dict[int, list[int]] = {}  # positions of the fixes of each trajectory
+        self._rows: dict[int, list[int]] = {}  # indices of the fixes of each trajectory
         self._used: list[bool] = []
         self._solved = 0  # fixes at the last optimization
         self.georeference: Georeference | None = None
         self.uncertain = np.zeros((6, 6))
-        self._lag = self._located_with = 0.0  # s that the fixes are stamped too late, as far as that is known
+        self._lag = self._located_with = 0.0  # s, lag of the stamps of the fixes, as far as it is known
 
     def __len__(self) -> int:
         return len(self._fixes)
 
     def used(self, chosen: Sequence[int]) -> int:
-        """How many of those chosen constrain the poses, by the last optimization."""
+        """Number of the chosen fixes that constrain the poses, by the last optimization."""
         return sum(self._used[k] for k in chosen)
 
     @property
     def due(self) -> int:
-        """How many have come since the last optimization."""
+        """Number of fixes since the last optimization."""
         return len(self) - self._solved
 
     def add(self, node: int, fix: Fix, trajectory: int) -> None:
-        """One that was measured near a node, which is in that trajectory."""
+        """Add a fix that was measured near a node of that trajectory."""
         self._rows.setdefault(trajectory, []).append(len(self))
         self._fixes.append((node, fix))
         self._used.append(True)
 
     def chosen(self, placed: NDArray[np.bool_]) -> list[int]:
-        """Positions of the fixes that enter, none before the georeference is known; `placed`: (N,) nodes that may."""
+        """Indices of the fixes to use, none before the georeference is known; `placed`: (N,) nodes that may have
+        some."""
         return [] if self.georeference is None else [k for k, (node, _) in enumerate(self._fixes) if placed[node]]
 
     def kept(self, chosen: Sequence[int]) -> list[bool]:
-        """Of the edges that `joined` adds, whether each constrains the poses."""
+        """For each edge that `joined` adds, whether it constrains the poses."""
         return [*(self._used[k] for k in chosen), True] if chosen else []
 
     def locate(self, poses: Array, placed: NDArray[np.bool_]) -> None:
-        """Find where the map is, unless that is known and most fixes agree.
+        """Determine the georeference, unless it is known and most fixes agree with it.
 
         `poses`: (N, 4, 4). `placed`: as in `chosen`.
         """
@@ -95,14 +97,13 @@ class Fixes:
             if np.median(apart / sigmas) < 2 * _KERNEL and self._lag == self._located_with:
                 return
         T_enu_map, self._located_with = fitted(here, _local(origin, there), sigmas), self._lag
-        if T_enu_map is None:  # if there was one most fixes deny it, as those of another robot, and no other is better
+        if T_enu_map is None:  # most fixes contradict the old one, as those of another robot; no other fits
             self.georeference = None
         else:
             self.georeference, self._solved = Georeference(origin, T_enu_map), 0
 
     def find_lag(self, odometry: Array, placed: NDArray[np.bool_]) -> None:
-        """Find how late the fixes are; `odometry`: (N, 4, 4), each trajectory as it was driven. `placed`: as in
-        `chosen`."""
+        """Estimate the lag of the fixes; `odometry`: (N, 4, 4), each trajectory as driven. `placed`: as in `chosen`."""
         assert self.georeference is not None
         T_enu_map, (here, velocities) = self.georeference.T_enu_map, self._antennas(odometry)
         here, moving = se3.transform(T_enu_map, here), velocities @ T_enu_map[:3, :3].T
@@ -121,12 +122,12 @@ class Fixes:
         self.uncertain = beyond_chance * np.outer(moves, moves)
 
     def loaded(self) -> None:
-        """The georeference is that of a map with these fixes, which was optimized."""
+        """The georeference is that of an optimized map with these fixes."""
         self._located_with, self._solved = self._lag, len(self)
 
     def _antennas(self, poses: Array) -> tuple[Array, Array]:
-        """(K, 3) m where the map has the antenna at the stamp of each fix, and (K, 3) m/s how fast it was since the fix
-        before, 0 where that is not known; `poses`: (N, 4, 4)."""
+        """(K, 3) m, antenna positions in the map at the stamps of the fixes, and (K, 3) m/s, their velocities since the
+        previous fix, 0 if unknown; `poses`: (N, 4, 4)."""
         here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in self._fixes])[:, :3]
         stamps, velocities = np.array([fix.stamp for _, fix in self._fixes], np.int64), np.zeros_like(here)
         for row in self._rows.values():
@@ -136,14 +137,14 @@ class Fixes:
         return here, velocities
 
     def _measured(self) -> tuple[Array, Array]:
-        """(K, 3) m where the fixes have the antenna on Earth, and (K,) m, their horizontal standard deviations."""
+        """(K, 3) m, antenna positions on Earth by the fixes, and (K,) m, their horizontal standard deviations."""
         sigmas = np.array([np.sqrt(np.trace(fix.covariance[:2, :2]) / 2) for _, fix in self._fixes])
         return geodesy.ecef([fix.geodetic for _, fix in self._fixes]), sigmas
 
     def joined(self, data: GraphData, places: Index, chosen: Sequence[int]) -> GraphData:
-        """The graph with the local frame as its last node, and an edge from there for each of the fixes chosen.
+        """The graph with the local frame as its last node, and an edge from it for each of the chosen fixes.
 
-        One more edge, the last, says that the map is about level. `places`: (N,) of the nodes in `data`.
+        One more edge, the last, constrains the map to be about level. `places`: (N,) of the nodes in `data`.
         """
         if not chosen:
             return data
@@ -151,14 +152,14 @@ class Fixes:
         T_map_enu, last = se3.inverse(self.georeference.T_enu_map), len(data)
         at = places[[self._fixes[k][0] for k in chosen]]
         fixes = [self._fixes[k][1] for k in chosen]
-        T = self.georeference.T_enu_map @ data.poses[at]  # with the rotations of now: theirs is not measured
+        T = self.georeference.T_enu_map @ data.poses[at]  # with the current rotations: a fix measures none
         R = T[:, :3, :3]
         arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
         if self._lag:
             arms -= self._lag * self._antennas(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
         local = _local(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
         measured = np.array([fix.covariance for fix in fixes])
-        # A residual is the logarithm of a pose: where heights are free to go far, they take up those of east and north.
+        # A residual is the logarithm of a pose: unconstrained large height errors would affect east and north.
         flat = measured[:, 2, 2] > _FLAT**2
         local[flat, 2] = (T[:, :3, 3] + arms)[flat, 2]
         measured[flat, 2], measured[flat, :, 2], measured[flat, 2, 2] = 0.0, 0.0, _FLAT**2
@@ -181,22 +182,22 @@ class Fixes:
         )
 
     def solved(self, chosen: Sequence[int], T_map_enu: Array, kept: NDArray[np.bool_]) -> None:
-        """Take in what became of the local frame (4, 4) and of the edges that `joined` added."""
+        """Apply the optimized local frame (4, 4) and the result for the edges that `joined` added."""
         assert self.georeference is not None
         self.georeference = replace(self.georeference, T_enu_map=se3.orthonormalized(se3.inverse(T_map_enu)))
         for k, used in zip(chosen, kept[:-1].tolist(), strict=True):
             self._used[k] = used
 
     def sent(self) -> None:
-        """An optimization begins with all that there are."""
+        """An optimization with all current fixes begins."""
         self._solved = len(self)
 
 
 def fitted(here: Array, there: Array, sigmas: Array) -> Array | None:
-    """T_enu_map (4, 4) of a level map by heading and translation; None while they are not certain.
+    """T_enu_map (4, 4) of a level map by heading and translation; None if they are not determined.
 
     Args:
-        here, there: (K, 3) the same places in the map and in the local frame, m; up to half of them may be wrong.
+        here, there: (K, 3) the same positions in the map and in the local frame, m; up to half may be wrong.
         sigmas: (K,) horizontal standard deviations, m.
     """
     a, b = here[:, :2] @ [1, 1j], there[:, :2] @ [1, 1j]  # as complex numbers a rotation is a factor
@@ -222,5 +223,5 @@ def fitted(here: Array, there: Array, sigmas: Array) -> Array | None:
 
 
 def _local(origin: Array, ecef: Array) -> Array:
-    """(K, 3) in the Earth's frame to east, north, up about a geodetic origin (3,)."""
+    """(K, 3) from the Earth's frame to east, north, up about a geodetic origin (3,)."""
     return np.asarray(se3.transform(se3.inverse(geodesy.enu_frame(origin)), ecef))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""g2o files, SE2 and SE3:QUAT, in and out at full precision.
+"""Reads and writes g2o files, SE2 and SE3:QUAT, at full precision.
 
 A line is `VERTEX_SE3:QUAT id x y z qx qy qz qw` or `EDGE_SE3:QUAT from to x y z qx qy qz qw` and the upper triangle of
 the information matrix, translation first and rotation in rad, as gtsam, Ceres and SE-Sync read it (g2o itself means the
@@ -26,22 +26,22 @@ from dpm2_core.slam.graph.graph_data import GraphData, components, integrate
 
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
-_MOST_STARTS = 0.1  # of the nodes: in an order that breaks more often, neighbors are tied by chance, perhaps by a loop
-_FARTHEST = 1e9  # m: from there on float64 are tenths of micrometers off, and squares of what is much farther infinite
+_MOST_STARTS = 0.1  # of the nodes: in an order with more breaks, edges between neighbors are chance, perhaps loops
+_FARTHEST = 1e9  # m: beyond, float64 is off by tenths of micrometers, and squares of much larger values are infinite
 _TANGENT = {True: np.array([3, 4, 2]), False: np.array([3, 4, 5, 0, 1, 2])}  # of the file's order, by planar
 
 
 @dataclass(frozen=True, eq=False)
 class G2o:
-    """A pose graph with what the file says beyond it.
+    """A pose graph with the additional information of the file.
 
     Attributes:
-        graph: nodes in ascending order of their ids, or as the file names them where ids do not follow the drive; each
-            that an edge ties to the one before it continues a trajectory, all other edges are loops. Without VERTEX
-            lines the poses are those of the odometry.
+        graph: nodes in ascending order of their ids, or in the file's order if ids do not follow the drive. A node with
+            an edge from the previous one continues a trajectory; all other edges are loops. Without VERTEX lines the
+            poses are those of the odometry.
         ids: (N,) of the file.
-        planar: the file is of SE2 lines: z, roll and pitch are zero and their variances arbitrary.
-        ignored: count of the lines of each tag that is not understood.
+        planar: the file has SE2 lines: z, roll and pitch are zero and their variances arbitrary.
+        ignored: number of lines of each unknown tag.
     """
 
     graph: GraphData
@@ -54,7 +54,7 @@ def read_g2o(path: Path) -> G2o:
     """Read a file.
 
     Raises:
-        UsageError: it cannot be read or is no such graph; names the file and, where there is one, the line.
+        UsageError: it cannot be read or is no such graph; names the file and, if there is one, the line.
     """
     lines, ignored, fixed_ids = _read_lines(path)
     kinds = {tag.endswith("SE2") for tag in lines}
@@ -97,7 +97,7 @@ def read_g2o(path: Path) -> G2o:
 
 
 def require_connected(path: Path, file: G2o) -> None:
-    """Raises UsageError that names a part of the graph which no edge ties to the rest."""
+    """Raises UsageError that names a part of the graph without an edge to the rest."""
     graph = file.graph
     part = components(len(graph), np.concatenate([graph.odometry_ends, graph.ends]))
     sizes = np.bincount(part)
@@ -108,7 +108,7 @@ def require_connected(path: Path, file: G2o) -> None:
 
 
 def write_g2o(path: Path, file: G2o, loops: NDArray[np.bool_] | None = None) -> None:
-    """All vertices, FIX lines, odometry and the chosen loops (default: all) with 17 digits.
+    """Write all vertices, FIX lines, odometry and the chosen loops (default: all) with 17 digits.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -132,10 +132,10 @@ def write_g2o(path: Path, file: G2o, loops: NDArray[np.bool_] | None = None) -> 
 
 
 class _Lines:
-    """The ids and numbers of all lines of one tag, and where they stand."""
+    """The ids and numbers of all lines of one tag, and their line numbers."""
 
     def __init__(self) -> None:
-        self.ids: list[list[int]] = []  # apart from the numbers: gtsam's 64-bit keys are no float64
+        self.ids: list[list[int]] = []  # separate from the numbers: gtsam's 64-bit keys do not fit into float64
         self.numbers: list[list[float]] = []
         self.at: list[int] = []
 
@@ -208,7 +208,7 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
     rows, columns = np.triu_indices(size)
     information = np.zeros((len(upper), size, size))
     information[:, rows, columns] = information[:, columns, rows] = upper
-    # By its diagonal, since units differ, and what is not measured may have 1e-15 of the weight of the rest.
+    # Scaled by the diagonal, since units differ, and unmeasured components may have 1e-15 of the weight of the rest.
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     scale = 1 / np.sqrt(np.where(diagonal > 1e-100, diagonal, 1.0))
     weights = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])
@@ -227,7 +227,7 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
 
 
 def _starts(order: NDArray[np.intp], ends: NDArray[np.intp]) -> int:
-    """How many trajectories there are where nodes come in this order."""
+    """Number of trajectories if nodes are in this order."""
     place = np.argsort(order)
     pairs = np.sort(place[ends], axis=1)
     return len(order) - len(np.unique(pairs[pairs[:, 1] - pairs[:, 0] == 1, 1]))
@@ -237,7 +237,7 @@ def _graph(poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, f
     """Separate the odometry from the loops: the first edge between two neighboring nodes is odometry."""
     count = len(poses)
     backward = ends[:, 0] - ends[:, 1] == 1
-    flipped = se3.adjoint(T)  # T_b_a's covariance is that of T_a_b, seen from the other end
+    flipped = se3.adjoint(T)  # the covariance of T_b_a is that of T_a_b, seen from the other end
     T = np.where(backward[:, None, None], se3.inverse(T), T)
     turned = flipped @ covariances @ np.swapaxes(flipped, -1, -2)
     covariances = np.where(backward[:, None, None], turned, covariances)

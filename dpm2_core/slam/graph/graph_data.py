@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pose graph as arrays, and its odometry chain in closed form: what lies between two nodes, with what covariance."""
+"""A pose graph as arrays, and its odometry chain in closed form: motion and covariance between two nodes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class GraphData:
 
     Attributes:
         poses: (N, 4, 4) T_map_node, the start of an optimization.
-        chained: (N,) whether node n is tied to n-1 by odometry. Where it is not, a trajectory begins.
-        steps: (N, 4, 4) T_before_this of the odometry; identity where there is none.
-        step_covariances: (N, 6, 6) [rotation rad, translation m] of `steps`; zero where there is none.
+        chained: (N,) whether odometry connects node n with n-1. If not, a trajectory begins.
+        steps: (N, 4, 4) T_before_this of the odometry; identity if there is none.
+        step_covariances: (N, 6, 6) [rotation rad, translation m] of `steps`; zero if there is none.
         ends: (E, 2) from and to of each loop.
         T_from_to: (E, 4, 4) of each loop.
         covariances: (E, 6, 6) of each loop.
-        fixed: nodes that keep their pose; the first of each trajectory that nothing ties to another does anyway.
-        enu: the node, if any, that is no keyframe but the local frame of fixes, which starts well where it is.
+        fixed: nodes that keep their pose; the first node of each unconnected trajectory does so anyway.
+        enu: the node, if any, of the local frame of fixes, which is no keyframe; its start is good.
     """
 
     poses: Array
@@ -53,14 +53,14 @@ class GraphData:
 
 
 def components(count: int, ends: Index) -> NDArray[np.int32]:
-    """(N,) number of the part of the graph that each of `count` nodes is in, by edges (E, 2): from 0, that of node 0,
-    in the order of their first nodes."""
+    """(N,) number of each node's part of the graph, for `count` nodes with edges (E, 2): from 0, that of node 0, in the
+    order of their first nodes."""
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
 def loop_errors(poses: Array, ends: Index, T_from_to: Array) -> Array:
-    """(E, 6) tangent from what each edge measured to what the poses say."""
+    """(E, 6) tangent from the measured pose of each edge to that of the poses."""
     return se3.log(se3.inverse(T_from_to) @ se3.inverse(poses[ends[:, 0]]) @ poses[ends[:, 1]])
 
 
@@ -70,7 +70,7 @@ def mahalanobis(errors: Array, covariances: Array) -> Array:
 
 
 def total_chi2(graph: GraphData, poses: Array, loops: NDArray[np.bool_] | slice = slice(None)) -> float:
-    """Sum over the odometry and the chosen loops."""
+    """Sum of chi2 over the odometry and the chosen loops."""
     steps = graph.odometry_ends
     nodes = steps[:, 1]
     odometry = mahalanobis(loop_errors(poses, steps, graph.steps[nodes]), graph.step_covariances[nodes])
@@ -79,26 +79,26 @@ def total_chi2(graph: GraphData, poses: Array, loops: NDArray[np.bool_] | slice 
 
 
 def trajectories(graph: GraphData) -> Index:
-    """(N,) number of the trajectory that each node belongs to, from 0."""
+    """(N,) number of each node's trajectory, from 0."""
     return np.cumsum(~graph.chained) - 1
 
 
 def integrate(graph: GraphData) -> Array:
-    """(N, 4, 4): each trajectory laid out by its odometry from the pose of its first node."""
+    """(N, 4, 4) poses of each trajectory by its odometry from the pose of its first node."""
     out = graph.poses.copy()
-    for node in np.flatnonzero(graph.chained):  # each needs the one before: a recursion, 3 us a node
+    for node in np.flatnonzero(graph.chained):  # each needs the one before: a recursion, 3 us per node
         out[node] = out[node - 1] @ graph.steps[node]
     return out
 
 
 class CondensedOdometry:
-    """The odometry between chosen nodes, compounded: a graph that is small where loops are few, with the same optimum.
+    """The odometry between chosen nodes, compounded: a graph that is small if loops are few, with the same optimum.
 
     Attributes:
         nodes: (K,) chosen nodes, ascending, with the first and the last of each trajectory.
-        T: (K, 4, 4) T_before_this between each and the one chosen before; identity where `tied` is False.
+        T: (K, 4, 4) T_before_this between each and the previous chosen one; identity where `tied` is False.
         covariances: (K, 6, 6) of `T`; identity where `tied` is False.
-        tied: (K,) whether odometry ties it to the one chosen before.
+        tied: (K,) whether odometry connects it with the previous chosen one.
     """
 
     def __init__(self, graph: GraphData, odometry: Array, chosen: Index) -> None:
@@ -122,8 +122,8 @@ class CondensedOdometry:
     def spread(self, poses: Array) -> Array:
         """(N, 4, 4) poses of all nodes from those of the chosen ones, (K, 4, 4).
 
-        What a stretch is off between two chosen nodes is shared out among its steps by their covariances, which is
-        where least squares puts it, to first order.
+        The error of the odometry between two chosen nodes is distributed to its steps by their covariances, as least
+        squares does, to first order.
         """
         k = np.flatnonzero(self.tied)
         errors = np.zeros((len(self.nodes), 6))
@@ -133,7 +133,7 @@ class CondensedOdometry:
         moved = np.cumsum(ratio, axis=0)
         moved -= (moved - ratio)[self._first][self._owner]
         ends = poses.copy()
-        ends[k] = poses[k - 1] @ self.T[k]  # where the odometry alone would put it
+        ends[k] = poses[k - 1] @ self.T[k]  # by the odometry alone
         out = ends[self._owner] @ se3.exp(moved) @ self._T_owner_node
         out[self.nodes] = poses
         return out
@@ -142,7 +142,7 @@ class CondensedOdometry:
 def chain_chi2(graph: GraphData, odometry: Array) -> Array:
     """(E,) squared distance of each loop from the odometry between its ends, in standard deviations of both together.
 
-    nan where the ends are of two trajectories. `odometry`: (N, 4, 4) of `integrate`.
+    nan if the ends are in two trajectories. `odometry`: (N, 4, 4) of `integrate`.
     """
     number = trajectories(graph)[graph.ends]
     out = np.full(len(graph.ends), np.nan)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late the fixes of satellites are stamped: many receivers stamp them when they are sent.
+"""Lag of satellite fixes: many receivers stamp a fix when they send it, not when they measure it.
 
-A late fix lies behind, by the way of that time. Where a vehicle turns or changes its speed, that is no shift of the
-map. The odometry of a few fixes alone shows it: an optimized map has been bent to them.
+A late fix lies behind the true position by the distance driven in that time. Where a vehicle turns or changes its
+speed, this differs from a shift of the map. Only the odometry over a few fixes shows the lag: an optimized map was
+already bent to fit the fixes.
 """
 
 from __future__ import annotations
@@ -16,22 +17,22 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Array
 
 STRETCH = 20
-"""Fixes in a row that are compared with the odometry."""
+"""Number of consecutive fixes that are compared with the odometry."""
 _FEWEST = 3  # stretches
-_UNKNOWN = 0.2  # s, standard deviation before the way tells
-_SURE = 4.0  # standard deviations from which on a lag counts
+_UNKNOWN = 0.2  # s, standard deviation of the lag without data
+_SURE = 4.0  # standard deviations from which on a lag is used
 _LONGEST = 2.0  # s: no receiver needs longer
-_OFF = 9.0  # squared standard deviations, on average, beyond which a stretch shows other errors than a lag
-_ROUNDS = 5  # in which turn and lag of a stretch are found
-_SLACK, _DRIFT = 0.05, 0.01  # m, and m per m from the middle of a stretch: the odometry errs, too
+_OFF = 9.0  # mean squared standard deviations above which a stretch shows errors other than a lag
+_ROUNDS = 5  # iterations for rotation and lag of a stretch
+_SLACK, _DRIFT = 0.05, 0.01  # m, and m per m from the middle of a stretch: error of the odometry
 
 
 class Stretch(NamedTuple):
-    """Some fixes in a row.
+    """Some consecutive fixes.
 
     Attributes:
-        here, there: (K, 3) m, level, where the odometry has the antenna at their stamps, and where they have it, east,
-            north, up; there may be a shift and a turn between the two.
+        here, there: (K, 3) m, level: antenna positions at their stamps by the odometry, and by the fixes, in east,
+            north, up; there may be a shift and a rotation between the two.
         velocities: (K, 3) m/s of the antenna. sigmas: (K,) m, horizontal standard deviations of the fixes.
     """
 
@@ -42,10 +43,10 @@ class Stretch(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """What fixes show.
+    """The estimated lag of fixes.
 
     Attributes:
-        seconds: how late they are. sigma: its standard deviation, s. known: whether it is beyond doubt.
+        seconds: the lag. sigma: its standard deviation, s. known: whether it is significant.
     """
 
     seconds: float
@@ -54,19 +55,19 @@ class Lag(NamedTuple):
 
 
 def lag_of(stretches: Sequence[Stretch]) -> Lag:
-    """How late the fixes of some stretches of a way are."""
+    """The lag of the fixes of some stretches of a trajectory."""
     found = np.array([_told(stretch) for stretch in stretches]).reshape(-1, 2)
     information, pull = found.sum(0)
     seconds = pull / (information + 1 / _UNKNOWN**2)
     scatter = ((found[:, 1] - found[:, 0] * seconds) ** 2).sum()
-    told = information**2 / max(information + scatter, 1e-9)  # by what is stated, and by how they differ
+    told = information**2 / max(information + scatter, 1e-9)  # by the stated errors, and by the scatter of stretches
     sigma = float(1 / np.sqrt(told + 1 / _UNKNOWN**2))
     known = len(found) >= _FEWEST and _SURE * sigma < abs(seconds) < _LONGEST
     return Lag(float(seconds), sigma, bool(known))
 
 
 def moved_by(stretches: Sequence[Stretch]) -> Array:
-    """(6,) rad, m by how much a lag of 1 s moves the local frame in the map, about and along east, north, up."""
+    """(6,) rad, m: motion of the local frame in the map by a lag of 1 s, about and along east, north, up."""
     moves = np.zeros(6)
     if stretches:
         A = _level(np.concatenate([stretch.here for stretch in stretches])[:, :2] @ [1, 1j])
@@ -76,7 +77,7 @@ def moved_by(stretches: Sequence[Stretch]) -> Array:
 
 
 def _told(stretch: Stretch) -> tuple[float, float]:
-    """Information on the lag, 1/s2, and that times the lag, 1/s, whatever the shift and the turn of the stretch."""
+    """Information on the lag, 1/s2, and that times the lag, 1/s, for any shift and rotation of the stretch."""
     parts = stretch.here - stretch.here.mean(0), stretch.there - stretch.there.mean(0), stretch.velocities
     at, to, v = (part[:, :2] @ [1, 1j] for part in parts)
     turn = np.exp(1j * np.angle(np.vdot(at, to)))
@@ -89,10 +90,10 @@ def _told(stretch: Stretch) -> tuple[float, float]:
     rest = A[:, 3:] - A[:, :3] @ np.linalg.lstsq(A[:, :3], A[:, 3:], rcond=None)[0]
     (information, pull), (_, square) = rest.T @ rest
     off = (square - pull**2 / (information + 1 / _UNKNOWN**2)) / len(A)
-    worse = max(off, 1.0)  # than stated, as many receivers are
+    worse = max(off, 1.0)  # errors larger than stated, as of many receivers
     return (information / worse, pull / worse) if off < _OFF else (0.0, 0.0)
 
 
 def _level(at: NDArray[Any]) -> NDArray[np.complex128]:
-    """(K, 3) where places (K,) go by a turn of 1 rad, and by 1 m east and north."""
+    """(K, 3) displacement of positions (K,) by a rotation of 1 rad, and by 1 m east and north."""
     return np.stack([1j * at, np.ones(len(at)), np.full(len(at), 1j)], 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph of the running system: it grows by keyframes and loops, and no wrong loop bends it."""
+"""The pose graph of the running system: it grows by keyframes and loops, and is robust against wrong loops."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from dpm2_core.slam.graph.worker import GraphWorker
 
 _log = logging.getLogger(__name__)
 SHORT = 50
-"""Loops; fewer are solved in about 20 ms, sooner than they are sent to another process."""
-_TOGETHER = 40  # pairs of nodes whose covariances are asked for at once
+"""Loops; a smaller graph is solved in about 20 ms, faster than it is sent to another process."""
+_TOGETHER = 40  # pairs of nodes whose covariances are computed at once
 _FIXES = 10, 20
-"""Fixes that may wait for an optimization: so many, or of all that there are one in so many."""
-_ATTEMPTS = 2  # processes that may die over one graph
+"""Fixes that may wait for an optimization: this number, or one in this number of all fixes."""
+_ATTEMPTS = 2  # worker processes that may fail on one graph
 
 
 class PoseGraph:
     """Keyframe poses T_map_kf, odometry edges and loop edges; node n is the n-th one added.
 
     Attributes:
-        problem: why the last optimization failed, in words; empty since one went well.
+        problem: why the last optimization failed, in words; empty after a successful one.
     """
 
     def __init__(self, settings: RobustSettings, background: bool = False) -> None:
-        """`background`: `optimize` hands a large graph to another process; what comes of it depends on its timing."""
+        """`background`: `optimize` sends a large graph to another process; the result depends on timing."""
         self._settings, self._background = settings, background
         self._poses: list[Array] = []
-        self._steps: list[Edge | None] = []  # the odometry to each node; None where a trajectory begins
+        self._steps: list[Edge | None] = []  # the odometry to each node; None at the start of a trajectory
         self._trajectories = Trajectories()
         self._loops: list[Edge] = []
         self._held: list[int] = []
         self._worker = GraphWorker()
-        self._moved = False  # a part, since a graph was sent: its solution is of no use
+        self._moved = False  # whether a part was moved since a graph was sent, so that its solution is invalid
         self._fixes, self._sent_fixes = Fixes(), list[int]()
         self._sent = 0  # loops in the graph that is being solved
         self._failures = 0
@@ -68,27 +68,27 @@ class PoseGraph:
 
     @property
     def edges(self) -> list[Edge]:
-        """Odometry edges, then the loops that are kept or not checked yet."""
+        """Odometry edges, then the loops that are accepted or not checked yet."""
         return [step for step in self._steps if step is not None] + [loop for loop in self._loops if loop.ok]
 
     @property
     def loops(self) -> list[Edge]:
-        """All in the order in which they were added; `ok` and `reason` by the last optimization."""
+        """All loops in the order in which they were added; `ok` and `reason` by the last optimization."""
         return list(self._loops)
 
     @property
     def georeference(self) -> Georeference | None:
-        """Where on Earth the map is, by its fixes; None while that is not known."""
+        """Pose of the map on Earth by its fixes; None while that is unknown."""
         return self._fixes.georeference
 
     @property
     def fixes(self) -> tuple[int, int]:
-        """How many constrain the poses, and all."""
+        """Number of fixes that constrain the poses, and of all."""
         return self._fixes.used(self._chosen()), len(self._fixes)
 
     @property
     def unsolved(self) -> bool:
-        """Whether fixes that count have come since the last optimization."""
+        """Whether relevant fixes were added since the last optimization."""
         return self._fixes.due > 0 and self._fixes.georeference is not None
 
     @property
@@ -99,11 +99,11 @@ class PoseGraph:
     def add_node(self, T_map_kf: Array, odometry: Edge | None = None) -> None:
         """Append a keyframe: with an edge from the last node of its trajectory, or as the start of another one.
 
-        A part of the graph that nothing ties to another keeps the pose of its first node.
+        A part of the graph that is not connected to another keeps the pose of its first node.
 
         Raises:
-            ValueError: the edge does not lead to the new node, or odometry goes on from its other end already.
-            Dpm2Error: the pose or the edge is not sound; nothing was appended.
+            ValueError: the edge does not lead to the new node, or its other end has an odometry successor already.
+            Dpm2Error: the pose or the edge is invalid; nothing was appended.
         """
         node = len(self)
         _check("node", node, T_map_kf)
@@ -118,25 +118,25 @@ class PoseGraph:
         self._steps.append(odometry)
 
     def add_loop(self, loop: Edge) -> None:
-        """Tie two keyframes that saw the same place.
+        """Connect two keyframes that saw the same place.
 
-        Where it is the first between two parts of the graph, the younger one is moved there as it is: from any other
-        start an optimization would take the loop for a wrong one.
+        The first loop between two parts of the graph moves the younger part rigidly to its pose: from any other start
+        an optimization would reject the loop as wrong.
 
         Raises:
-            Dpm2Error: the loop is not sound; nothing was added.
+            Dpm2Error: the loop is invalid; nothing was added.
         """
         _check("loop to node", loop.to_node, loop.T_from_to, loop.covariance)
         a, b = self.part(loop.from_node), self.part(loop.to_node)
         if a != b:
-            T_to = self._poses[loop.from_node] @ loop.T_from_to  # where the loop has that node
+            T_to = self._poses[loop.from_node] @ loop.T_from_to  # pose of that node by the loop
             T = T_to @ se3.inverse(self._poses[loop.to_node])
             self._move(max(a, b), T if b > a else se3.inverse(T))
             self._trajectories.loops_changed()
         self._loops.append(loop)
 
     def add_fix(self, node: int, fix: Fix) -> bool:
-        """A position by satellites at a node; returns whether so many have come that it is time to optimize."""
+        """Add a satellite position at a node; returns whether there are enough new ones to optimize."""
         self._fixes.add(node, fix, self._trajectories.of[node])
         if self._fixes.georeference is None:
             self._fixes.locate(self.poses, self.placed)
@@ -145,7 +145,7 @@ class PoseGraph:
         return self._fixes.due >= max(least, len(self._fixes) // share)
 
     def set_georeference(self, georeference: Georeference) -> None:
-        """Where on Earth a map is that was loaded."""
+        """Set the pose of a loaded map on Earth."""
         self._fixes.georeference = georeference
         self._find_lag()
         self._fixes.loaded()
@@ -157,17 +157,17 @@ class PoseGraph:
             self._fixes.solved(chosen, data.poses[-1], kept)
 
     def place(self, node: int, T_map_kf: Array) -> None:
-        """Put a node there (4, 4), for the next optimization to begin with."""
+        """Set the pose (4, 4) of a node, as the start of the next optimization."""
         _check("node", node, T_map_kf)
         self._poses[node] = T_map_kf
 
     def hold(self, node: int, T_map_kf: Array) -> None:
-        """Put a node there (4, 4), where it stays."""
+        """Set the pose (4, 4) of a node and keep it fixed."""
         self.place(node, T_map_kf)
         self._held.append(node)
 
     def part(self, node: int) -> int:
-        """Number of the part of the graph that a node is in: nodes of two parts have nothing to do with each other."""
+        """Number of a node's part of the graph: nodes of different parts have no constraints between them."""
         return self._trajectories.part(node, self._loops)
 
     @property
@@ -177,12 +177,12 @@ class PoseGraph:
 
     @property
     def placed(self) -> NDArray[np.bool_]:
-        """(N,) whether each node is in the part of the first: where any other is in its map, and on Earth, is not
-        known."""
+        """(N,) whether each node is in the part of the first node. The poses of other nodes in its map, and on Earth,
+        are unknown."""
         return self.parts == 0
 
     def optimize(self) -> None:
-        """Move the poses to the optimum and check the loops: here and now, or (`background`) in another process.
+        """Move the poses to the optimum and check the loops, now or (`background`) in another process.
 
         Raises:
             Dpm2Error: the graph cannot be solved.
@@ -196,12 +196,12 @@ class PoseGraph:
         self.problem = ""
 
     def collect(self, wait: bool = False) -> bool:
-        """Take in what the other process found, if it has; call it with every keyframe.
+        """Apply the result of the other process, if there is one; call it with every keyframe.
 
-        The nodes added meanwhile follow the ones before them by their odometry. Loops added meanwhile are sent off.
+        Nodes added meanwhile follow the earlier ones by their odometry. Loops added meanwhile are sent to the process.
 
         Args:
-            wait: until there is nothing more to wait for, as at the end of a drive.
+            wait: until all is solved, as at the end of a drive.
 
         Returns:
             Whether poses or results changed.
@@ -233,22 +233,22 @@ class PoseGraph:
         self._worker.close()
 
     def georeference_covariance(self) -> Array | None:
-        """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None where too few fixes tell."""
+        """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None if there are too few fixes."""
         if not self._chosen():
             return None
         data = self._data()
         try:
             return robust.joint_covariance(data, self._kept(), np.array([len(self)])) + self._fixes.uncertain
-        except RuntimeError:  # gtsam's: the system is singular, as with one fix, which says nothing of the heading
+        except RuntimeError:  # gtsam's: the system is singular, as with one fix, which does not give the heading
             return None
 
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> Array:
-        """(P, 6, 6) [rad, m] of xi in T_a_b @ Exp(xi) of each pair; small between neighbors, wherever these are.
+        """(P, 6, 6) [rad, m] of xi in T_a_b @ Exp(xi) of each pair; small between neighbors anywhere in the map.
 
-        The graph is factorized once for many.
+        The graph is factorized once for many pairs.
 
         Raises:
-            ValueError: a pair is one node.
+            ValueError: both nodes of a pair are the same.
         """
         if same := [a for a, b in pairs if a == b]:
             raise ValueError(f"covariance of node {same[0]} relative to itself")
@@ -264,20 +264,20 @@ class PoseGraph:
         return out
 
     def write_g2o(self, path: Path) -> None:
-        """All vertices, the odometry and the loops that are kept, in g2o's SE3:QUAT format at full precision.
+        """Write all vertices, the odometry and the accepted loops in g2o's SE3:QUAT format at full precision.
 
-        With fixes the frame east, north, up is the last vertex.
+        With fixes the local frame east, north, up is the last vertex.
         """
         data = self._data()
         ids = np.append(self._trajectories.order(), np.arange(len(self), len(data)))
         write_g2o(path, G2o(data, ids, planar=False), self._kept())
 
     def _kept(self) -> NDArray[np.bool_]:
-        """(E,) which loops, and then which fixes, constrain the poses."""
+        """(E,) which loops, then which fixes, constrain the poses."""
         return np.array([*(loop.ok for loop in self._loops), *self._fixes.kept(self._chosen())], np.bool_)
 
     def _chosen(self) -> list[int]:
-        """The fixes that count."""
+        """Indices of the fixes that are used."""
         return self._fixes.chosen(self.placed) if len(self._fixes) else []
 
     def _data(self) -> GraphData:
@@ -298,7 +298,7 @@ class PoseGraph:
         return self._fixes.joined(data, places, self._chosen())
 
     def _sending(self) -> GraphData:
-        """The graph that is about to be solved."""
+        """The graph for the next optimization."""
         self._find_lag()
         self._fixes.locate(self.poses, self.placed)
         self._sent, self._sent_fixes = len(self._loops), self._chosen()
@@ -306,7 +306,7 @@ class PoseGraph:
         return self._data()
 
     def _find_lag(self) -> None:
-        """Of the fixes, once it is known about where they are."""
+        """Estimate the lag of the fixes, once the georeference is known."""
         if self.georeference is None or not len(self._fixes):
             return
         odometry = self.poses
@@ -316,8 +316,8 @@ class PoseGraph:
         self._fixes.find_lag(odometry, self.placed)
 
     def _move(self, part: int, T: Array) -> None:
-        """All of a part to T @ T_map_kf."""
-        T = se3.orthonormalized(T)  # by poses of this graph: else their rounding doubles with each part that is moved
+        """Move a part: all its poses become T @ T_map_kf."""
+        T = se3.orthonormalized(T)  # from poses of this graph: else rounding errors double with each part that is moved
         for node in np.flatnonzero(self.parts == part):
             self._poses[node] = T @ self._poses[node]
         self._moved = True
@@ -342,7 +342,7 @@ class PoseGraph:
 
 
 def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
-    """One NaN would reach every pose with the next optimization."""
+    """Reject invalid values: one NaN would reach every pose in the next optimization."""
     if not se3.is_rigid(T):
         raise Dpm2Error(f"pose graph: {what} {node}: not a finite rigid transform")
     if covariance is not None and not se3.is_covariance(covariance):

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust least squares on a pose graph: the poses, and for each loop whether it can be true.
+"""Robust least squares on a pose graph: the poses, and for each loop whether it can be right.
 
-The odometry is trusted within its covariances, loops are not. A loop that the odometry between its ends flatly
-contradicts is set aside, the others are solved for under a Cauchy kernel (which hardly listens to what is far off), and
-every loop, also those set aside, is then checked by how far the optimized poses are from it; so on until the results
-stay. Only the nodes at the ends of loops are unknowns: the odometry between them is compounded, its inner nodes follow.
+The odometry is trusted within its covariances, loops are not. A loop that clearly contradicts the odometry between its
+ends is set aside at first. The others are optimized with a Cauchy kernel, which reduces the weight of large errors.
+Every loop, also those set aside, is then checked by its distance from the optimized poses. This repeats until the
+results no longer change. Only the nodes at the ends of loops are unknowns: the odometry between them is compounded, and
+the inner nodes follow.
 """
 
 from __future__ import annotations
@@ -35,38 +36,39 @@ from dpm2_core.slam.graph.graph_data import (
     trajectories,
 )
 
-_FIX_KERNEL = 1.0  # as `loop_kernel`: many fixes in a row may be wrong alike, and none may outvote the odometry
+_FIX_KERNEL = 1.0  # as `loop_kernel`: many consecutive fixes may have the same error; none may outvote the odometry
 _SHARED = 0.6
-"""Loops per place: at 0.5 no two share one, and wrong ones may have their way where all are solved at once."""
-_WORTH = 5.0  # times the error of the poses: the kernel hardly counts how far off these are. With wrong loops it is 13.
-_ROUNDS = 8  # of solving and judging, at most
-_STEPS = 50  # of Levenberg-Marquardt in each round, at most
-_FIXED = 1e-6  # rad and m, standard deviation of a pose that stays
+"""Loops per end node, above which a linear start is tried: at 0.5 no two loops share a node, and wrong ones may
+dominate where all are solved at once."""
+_WORTH = 5.0  # maximum ratio of its error to that of the given poses, which the kernel limits; 13 with wrong loops
+_ROUNDS = 8  # maximum number of rounds of solving and checking
+_STEPS = 50  # maximum number of Levenberg-Marquardt steps per round
+_FIXED = 1e-6  # rad and m, standard deviation of a fixed pose
 
 
 class RobustSettings(Settings):
     """How loops are weighted and checked."""
 
     loop_kernel: float = Field(5.0, gt=0)
-    """Width of the Cauchy kernel on loop edges, in standard deviations: what is many times farther off hardly pulls."""
+    """Width of the Cauchy kernel on loop edges, in standard deviations: loops much farther off hardly count."""
     loop_sigmas: float = Field(10.0, gt=0)
-    """A loop is kept if the optimized poses are within so many standard deviations of it. Right ones are within 5,
-    wrong ones hundreds off: the room between is for covariances that promise too much."""
+    """A loop is accepted if the optimized poses are within this many standard deviations of it. Right loops are within
+    5, wrong ones hundreds off: the margin is for covariances that are too small."""
     odometry_sigmas: float = Field(20.0, gt=0)
-    """A loop starts out set aside if the odometry between its ends is more than so many standard deviations off."""
+    """A loop is set aside at first if the odometry between its ends is more than this many standard deviations off."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The outcome.
+    """The result of an optimization.
 
     Attributes:
         poses: (N, 4, 4) optimized.
         kept: (E,) whether each loop was used.
-        sigmas: (E,) how far the optimized poses are from each loop, in standard deviations.
-        odometry_sigmas: (E,) how far the odometry alone is; nan for loops between two trajectories.
-        rounds: of solving and judging.
-        settled: whether the results stayed; else these are those of the last round that is allowed.
+        sigmas: (E,) distance of the optimized poses from each loop, in standard deviations.
+        odometry_sigmas: (E,) the same for the odometry alone; nan for loops between two trajectories.
+        rounds: of solving and checking.
+        settled: whether the results no longer changed; else they are those of the last allowed round.
     """
 
     poses: Array
@@ -86,7 +88,7 @@ class Solution:
 
 @contextmanager
 def _solvable() -> Iterator[None]:
-    """Raises Dpm2Error where the system is singular, for example because a covariance is not positive definite."""
+    """Raise Dpm2Error if the system is singular, for example because a covariance is not positive definite."""
     try:
         yield
     except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's or numpy's
@@ -100,9 +102,9 @@ def optimize(
     """Optimize and check the loops; deterministic.
 
     Args:
-        used: (E,) loops to begin with, from poses that agree with them; without it those that the odometry does not
+        used: (E,) loops to start with, from poses that agree with them; default: those that the odometry does not
             contradict.
-        steps: of the solver in each round of solving and judging, at most.
+        steps: maximum number of solver steps in each round of solving and checking.
 
     Raises:
         Dpm2Error: the system is singular.
@@ -134,7 +136,7 @@ def optimize(
 
 @_solvable()
 def least_squares(graph: GraphData, kept: NDArray[np.bool_]) -> Array:
-    """(N, 4, 4) the plain least-squares optimum over the odometry and the loops kept, every node an unknown.
+    """(N, 4, 4) the plain least-squares optimum over the odometry and the kept loops, every node an unknown.
 
     Raises:
         Dpm2Error: the system is singular.
@@ -144,11 +146,11 @@ def least_squares(graph: GraphData, kept: NDArray[np.bool_]) -> Array:
 
 
 def joint_covariance(graph: GraphData, kept: NDArray[np.bool_], nodes: Index) -> Array:
-    """(6 n, 6 n) covariance of distinct nodes' poses, which are optimized, [rotation, translation] of
-    T_map_node @ Exp(xi) each in turn; `kept`: (E,) loops to count."""
+    """(6 n, 6 n) covariance of distinct nodes' optimized poses, [rotation, translation] of T_map_node @ Exp(xi) each in
+    turn; `kept`: (E,) loops to use."""
     ends = graph.ends[kept].ravel()
     condensed = CondensedOdometry(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
-    ends = np.searchsorted(condensed.nodes, graph.ends)  # of loops not kept too, which are then not read
+    ends = np.searchsorted(condensed.nodes, graph.ends)  # wrong for loops that are not kept; these are not read
     at = graph.poses[condensed.nodes]
     marginals = gtsam.Marginals(_factors(graph, condensed, ends, at, kept, None), _values(at))
     keys = np.searchsorted(condensed.nodes, nodes)
@@ -166,7 +168,7 @@ def _factors(
     used: NDArray[np.bool_],
     kernel: float | None,
 ) -> Any:
-    """The gtsam graph of the chosen nodes; `ends` count among them, no kernel: plain least squares."""
+    """The gtsam graph of the chosen nodes; `ends` are indices among them; without a kernel: plain least squares."""
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
     by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.enu)).any(axis=1))
@@ -187,7 +189,7 @@ def _factors(
 
 
 def _anchors(graph: GraphData, condensed: CondensedOdometry, ends: Index) -> Iterator[int]:
-    """The fixed nodes, and one in each part of the graph that has none."""
+    """The fixed nodes, and one node in each part of the graph without any."""
     tied = np.flatnonzero(condensed.tied)
     part = components(len(condensed.nodes), np.concatenate([np.stack([tied - 1, tied], -1), ends]))
     fixed = np.searchsorted(condensed.nodes, graph.fixed)
@@ -204,10 +206,10 @@ def _values(poses: Array) -> Any:
 
 
 def _linear(factors: Any, poses: Array, anchor: int) -> list[Array]:
-    """The poses (N, 4, 4) that follow from all rotations at once, as a linear problem; none where they fit far worse.
+    """The poses (N, 4, 4) from a linear problem for all rotations at once; none if their error is far larger.
 
-    From far away the steps of a solver may end in a local optimum: with whole turns in it, and right loops that
-    contradict it. L. Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
+    From far away a solver may converge to a local optimum that contains whole rotations and contradicts right loops. L.
+    Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
     """
     try:
         linear = _poses(gtsam.InitializePose3.initialize(factors), len(poses))
@@ -218,7 +220,7 @@ def _linear(factors: Any, poses: Array, anchor: int) -> list[Array]:
 
 
 def _solved(factors: Any, starts: Sequence[Array], steps: int) -> Array:
-    """The best of what the starts (N, 4, 4) lead to."""
+    """The best solution of those from the starts (N, 4, 4)."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(steps)
     solvers = [gtsam.LevenbergMarquardtOptimizer(factors, _values(start), parameters) for start in starts]
@@ -231,10 +233,10 @@ def _poses(values: Any, count: int) -> Array:
 
 
 def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:
-    """Poses with each trajectory placed rigidly where most of its loops to those placed before agree that it is.
+    """The poses, with each trajectory moved rigidly to where most of its loops to those placed before agree.
 
-    Without it a trajectory whose own frame is far away or turned would have to find its place by many small steps. The
-    order is that in which the places follow: from fixed nodes on, each time the one with most loops to what is placed.
+    Otherwise a trajectory whose own frame is far away or rotated would need many small steps. Trajectories are placed
+    from fixed nodes on, each time the one with most loops to those that are placed.
     """
     number = trajectories(graph)
     if number[-1] == 0:
@@ -244,7 +246,7 @@ def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: fl
     known = np.isin(np.arange(number[-1] + 1), number[graph.fixed])
     while not known.all():
         new = used & (known[ends_number].sum(1) == 1)
-        if not new.any():  # a part of the graph begins
+        if not new.any():  # another part of the graph begins
             known[np.argmin(known)] = True
             continue
         ends = ends_number[new]
@@ -256,7 +258,7 @@ def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: fl
 
 
 def _move(graph: GraphData, poses: Array, ties: NDArray[np.intp], swap: NDArray[np.bool_], kernel: float) -> Array:
-    """(4, 4) that takes a trajectory to where most of its `ties` agree that it is; `swap`: they begin at it."""
+    """(4, 4) that moves a trajectory to where most of its `ties` agree; `swap`: ties that start in it."""
     ends, T = graph.ends[ties], graph.T_from_to[ties]
     before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
     T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which nodes of a pose graph follow each other by odometry, and which of these chains its loops tie together."""
+"""Odometry chains of nodes in a pose graph, and the parts of the graph that loops connect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Trajectories:
         self._parts: NDArray[np.int32] | None = None  # of each, until loops or trajectories change
 
     def begin(self) -> None:
-        """The next node is the start of another one."""
+        """The next node starts another trajectory."""
         self._ends.append(len(self.of))
         self.of.append(len(self._ends) - 1)
         self.loops_changed()
@@ -34,7 +34,7 @@ class Trajectories:
         """The next node follows this one.
 
         Raises:
-            ValueError: another one does already.
+            ValueError: the node is not the last of its trajectory.
         """
         number = self.of[node]
         if self._ends[number] != node:
@@ -43,12 +43,12 @@ class Trajectories:
         self.of.append(number)
 
     def loops_changed(self) -> None:
-        """Loops came, or were rejected: what is tied together is asked for anew."""
+        """Loops were added or rejected: the connected parts must be computed again."""
         self._parts = None
 
     def part(self, node: int, loops: Sequence[Edge]) -> int:
-        """The part of the graph, from 0 and the oldest first, that a node is in by the accepted loops: nodes of two
-        parts have nothing in common."""
+        """A node's part of the graph by the accepted loops, numbered from 0 with the oldest: nodes of two parts have no
+        constraints between them."""
         return int(self._tied(loops)[self.of[node]])
 
     def parts(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
@@ -63,9 +63,9 @@ class Trajectories:
         return self._parts
 
     def order(self, count: int | None = None) -> NDArray[np.intp]:
-        """(N,) the nodes, or the first so many, one trajectory after the other, so that each is a chain."""
+        """(N,) the nodes, or the first `count`, one trajectory after the other, so that each is a chain."""
         return np.argsort(self.of[:count], kind="stable")
 
     def places(self, count: int | None = None) -> NDArray[np.intp]:
-        """(N,) place of each node in that order."""
+        """(N,) index of each node in that order."""
         return np.argsort(self.order(count))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optimizes a pose graph in a process of its own: gtsam holds Python's lock while it works, and odometry must not wait.
+"""Optimizes a pose graph in its own process: gtsam holds Python's lock while it works, and odometry must not wait.
 
-The process is a fresh interpreter, never a fork (safe beside rclpy's threads and locks), in a session of its own (an
-interrupt from the terminal is for the program, not for it) and lives as long as its standard input: when the program
-ends, however it ends, it reads end of file and goes.
+The process is a fresh interpreter, never a fork, which is safe with rclpy's threads and locks. It has its own session,
+so that an interrupt from the terminal reaches only the program. It lives as long as its standard input: when the
+program ends, in whatever way, the process reads end of file and exits.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.slam.graph.graph_data import GraphData
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
-_NICE = 10  # it yields to the odometry where processors are few
+_NICE = 10  # lower priority than the odometry, for machines with few processors
 
 
 class GraphWorker:
-    """One process that solves one graph at a time; started with the first, again after it died."""
+    """A process that solves one graph at a time; started with the first graph, and again after it died."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -34,18 +34,18 @@ class GraphWorker:
 
     @property
     def busy(self) -> bool:
-        """Whether a graph was submitted whose solution has not been taken."""
+        """Whether a graph was submitted and its solution was not taken yet."""
         return self._waiter is not None
 
     def submit(self, graph: GraphData, settings: RobustSettings) -> None:
-        """Begin; returns at once. `busy` must be False."""
+        """Start solving; returns at once. `busy` must be False."""
         assert self._waiter is None, "a graph is being solved"
-        # The thread does nothing but wait for the pipes: the first write lasts until the process has imported gtsam.
+        # The thread only waits for the pipes: the first write lasts until the process has imported gtsam.
         self._waiter = threading.Thread(target=self._exchange, args=(graph, settings), daemon=True)
         self._waiter.start()
 
     def take(self, wait: bool = False) -> Solution | None:
-        """The solution, once; None while there is none.
+        """The solution, returned once; None while there is none.
 
         Raises:
             Dpm2Error: the process died, or the graph cannot be solved. The worker can be used again.
@@ -63,7 +63,7 @@ class GraphWorker:
         while self._waiter is not None:
             if (process := self._process) is not None:
                 process.kill()
-            self._waiter.join(0.1)  # at a time: it may be about to start the process
+            self._waiter.join(0.1)  # repeatedly: it may be about to start the process
             if not self._waiter.is_alive():
                 self._waiter, self._solution = None, None
         process, self._process = self._process, None
@@ -98,18 +98,18 @@ def _start() -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """Its exit status."""
+    """End the process; returns its exit status."""
     process.kill()
     status = process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
-            with suppress(OSError):  # what it had not read yet
+            with suppress(OSError):  # data that it has not read
                 pipe.close()
     return status
 
 
 def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
-    """Solve until end of file."""
+    """Solve graphs until end of file."""
     while True:
         try:
             graph, settings = pickle.load(requests)
@@ -127,8 +127,8 @@ def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
 if __name__ == "__main__":
     os.nice(_NICE)
     solutions = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever a library prints must not get between the solutions
+    os.dup2(2, 1)  # output of libraries must not get between the solutions
     try:
         _serve(sys.stdin.buffer, solutions)
-    except BrokenPipeError:  # the program has gone
+    except BrokenPipeError:  # the program has ended
         os._exit(0)

@@ -24,7 +24,7 @@ _STOREY = 2.0
 """A loop that corrects the odometry by more than this, m, may lead to another storey that looks alike..."""
 _MOST_SIGMAS = 3.0
 """...unless the correction is at most this many standard deviations of the odometry. Loops to the next storey of a car
-park have 3.7 to 5.1. The odometry's covariance is cautious: correct loops of whole drives have 0.2, real ones maybe 1."""
+park have 3.7 to 5.1. The odometry's covariance is cautious: correct loops of drives have 0.2, real ones perhaps 1."""
 _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: error of the odometry without such an edge
 _TURN = 3.0, 0.02  # degrees, and per meter of path: allowed correction of the odometry by a loop
 _CIRCLE = 0.01  # m, per meter of path: added to the allowed error of the circle of two loops
