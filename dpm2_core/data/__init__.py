@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading drives: KITTI folders and ROS bags, both as a `Source` of frames."""
+"""Reading drives: data set folders and ROS bags, each as a `Source` of frames."""

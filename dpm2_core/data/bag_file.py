@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of ROS 2 and ROS 1 without ROS: what is in them, their messages in order, and what is left of damaged ones.
+"""ROS 2 and ROS 1 bags without ROS: their contents, their messages in order, and the readable part of damaged ones.
 
-A bag defines its own message types; they are not used: a reader for them would be code made of what the file says.
-Types that ROS 2 Jazzy defines are read, and Livox' CustomMsg; others are only named. Messages of ROS 1 come as ROS 2
-has them (CDR), so that all that follows is the same.
+A bag contains its own message definitions. They are not used: their reader would be code generated from the file.
+Types that ROS 2 Jazzy defines are read, and Livox' CustomMsg; others are only named. Messages of ROS 1 are converted to
+ROS 2's serialization (CDR), so that all later steps are the same.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from dpm2_core.errors import UsageError, one_line
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_NO_SCHEMA = "__schemaless__"  # rosbags' name of a type that a file's summary does not have
+_NO_SCHEMA = "__schemaless__"  # rosbags' name of a type that is missing in a file's summary
 _LARGEST = 1 << 29  # bytes of a message: an image of 67 million pixels may have 6 bytes each
 _LATEST = 2**63 - 1  # ns; MCAP allows twice that
 
 
 @dataclass(eq=False)
 class Bag:
-    """An opened recording; it holds no file open between calls.
+    """An opened recording; it keeps no file open between calls.
 
     Attributes:
-        path: what was asked for.
+        path: the path that was opened.
         types: topic to message type, such as sensor_msgs/msg/PointCloud2.
         counts: topic to number of messages.
         notes: messages for the user (salvaged, damaged).
-        start: log time of the first message, ns; 0 where it is not known.
+        start: log time of the first message, ns; 0 if unknown.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """(topic, log time in ns, serialized message) of some topics, in order of log time.
 
-        Where a file turns out damaged its messages end, and `notes` says so.
+        If a file turns out to be damaged, its messages end there, and `notes` reports it.
         """
         requested = [topic for topic in topics if topic in self.types]
         if not requested:
@@ -79,7 +79,7 @@ class Bag:
             )
 
     def playable(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """`messages` without those of ROS 1 that cannot become one of ROS 2; `notes` has their topics."""
+        """`messages` without those of ROS 1 that cannot be converted to ROS 2; `notes` names their topics."""
         for topic, time, data in self.messages(topics):
             if data:
                 yield topic, time, data
@@ -88,10 +88,10 @@ class Bag:
             note_once(self.notes, what)
 
     def decode(self, topic: str, data: bytes) -> Any:
-        """A message object of rosbags; a Livox CustomMsg as a PointCloud2.
+        """A deserialized message of rosbags; a Livox CustomMsg as a PointCloud2.
 
         Raises:
-            MessageError: the bytes are no message of the topic's type.
+            MessageError: the bytes are not a message of the topic's type.
         """
         try:
             if self.types[topic] in LIVOX:
@@ -107,7 +107,7 @@ class Bag:
                 yield self.decode(topic, data)
 
     def first(self, topic: str) -> Any | None:
-        """The first of those; None without."""
+        """The first message of a topic that can be decoded; None without any."""
         return next(self.decoded(topic), None)
 
     def topics(self, *types: str) -> list[str]:
@@ -116,11 +116,11 @@ class Bag:
 
 
 def open_bag(path: Path) -> Bag:
-    """Open a folder of rosbag2 or of split ROS 1 bags, or a .mcap, .db3 or .bag file. A truncated MCAP file gives what
-    is whole; a file of a folder that cannot be read is left out, with a note.
+    """Open a folder of rosbag2 or of split ROS 1 bags, or a .mcap, .db3 or .bag file. From a truncated MCAP file the
+    intact messages are read; an unreadable file in a folder is left out, with a note.
 
     Raises:
-        UsageError: there is nothing that can be read, and why.
+        UsageError: nothing can be read; the message gives the reason.
     """
     if not path.is_dir():
         check_unpacked([path])
@@ -138,16 +138,16 @@ def open_bag(path: Path) -> Bag:
     if not files:
         raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
     bag = _open_files(path, files, types)
-    if missing and not bag.notes:  # a file that is damaged was not closed, and there are no metadata then
+    if missing and not bag.notes:  # a damaged file was not closed, so that metadata are missing anyway
         bag.notes.append(f"{missing}; read {', '.join(file.name for file in files)}")
     return bag
 
 
 def _open_files(path: Path, files: list[Path], types: dict[str, str]) -> Bag:
-    """Several files of one recording as one bag; what cannot be read of one of them costs nothing of the others.
+    """Several files of one recording as one bag; an unreadable file does not affect the others.
 
     Args:
-        types: topic to message type, of those that are known to have been recorded.
+        types: topic to message type, of the topics that are known to have been recorded.
     """
     parts, problems = list[Bag](), list[str]()
     for file in files:
@@ -167,7 +167,7 @@ def _open_files(path: Path, files: list[Path], types: dict[str, str]) -> Bag:
 
 
 def _read_parts(parts: list[Bag], topics: Collection[str]) -> Iterator[RawMessage]:
-    """The messages of all in order of log time; a file is opened when its first message is due."""
+    """The messages of all files in order of log time; a file is opened when its first message is due."""
     streams = (chain([("", part.start, b"")], part.messages(topics)) for part in parts)
     return (message for message in merge(*streams, key=lambda message: message[1]) if message[0])
 
@@ -201,7 +201,7 @@ def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
 def _open_indexed(file: Path) -> Bag:
     with _opened(file) as reader:
         _check_index(reader)
-        connections, start = list(reader.connections), reader.start_time  # closing forgets them
+        connections, start = list(reader.connections), reader.start_time  # closing discards them
     types = {connection.topic: connection.msgtype for connection in connections}
     counts = Counter(dict.fromkeys(types, 0))
     for connection in connections:
@@ -210,10 +210,10 @@ def _open_indexed(file: Path) -> Bag:
 
 
 def _check_index(reader: Reader | Ros1Reader) -> None:
-    """Without an index rosbags ends at a message that was written late; what an index lacks it leaves out.
+    """Check an index. Without one, rosbags ends at a message that was written late; messages not in it are skipped.
 
     Raises:
-        ReaderError: the index of an MCAP file does not lead to every message, or not to the types of all.
+        ReaderError: the index of an MCAP file does not lead to every message, or types are missing for some.
     """
     if isinstance(reader, Ros1Reader) or not isinstance(reader.storage, McapReader):
         return
@@ -232,15 +232,15 @@ def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
 
 
 def _as_ros2(data: bytes, kind: str) -> bytes:
-    """A message of ROS 1 as ROS 2 serializes it; damaged ones, and types that are not known, as no bytes."""
+    """A message of ROS 1 in ROS 2's serialization; no bytes for damaged messages and unknown types."""
     with suppress(Exception):  # SerdeError, KeyError, struct.error by the kind of damage
         return custom_of_ros1(data) if kind in LIVOX else bytes(_jazzy().ros1_to_cdr(data, kind))
     return b""
 
 
 def _unpacked(data: bytes) -> bytes:
-    """A message that was compressed by itself, or another as it is; no bytes where it is damaged or too large."""
-    if data[:4] != _ZSTD_MAGIC:  # no message of ROS 2 begins so
+    """A message, decompressed if it was compressed by itself; no bytes if it is damaged or too large."""
+    if data[:4] != _ZSTD_MAGIC:  # no message of ROS 2 begins with these bytes
         return data
     with suppress(ZstdError):
         unpacker, size = ZstdDecompressor(), get_frame_info(data).decompressed_size
@@ -251,7 +251,7 @@ def _unpacked(data: bytes) -> bytes:
 
 
 def _open_scanned(file: Path, reason: str) -> Bag:
-    """An MCAP file whose index cannot be used, and why: what can be read from its start on."""
+    """An MCAP file whose index cannot be used, for that reason: read from its start, as far as possible."""
     with file.open("rb") as stream:
         head = stream.read(len(_MCAP_MAGIC))
     if not head:
@@ -279,6 +279,6 @@ def _read_scanned(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
 
 
 def _up_to_cut(file: Path, topics: Collection[str]) -> Iterator[McapMessage]:
-    """Where the file is cut was said when it was opened."""
+    """The messages up to where the file is cut; that was reported when it was opened."""
     with suppress(Exception):
         yield from (message for message in scanned_messages(file) if message.topic in topics)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag of ROS 2 or ROS 1 as a `Source`: clouds with the image nearest in time, IMU, calibration and ground truth."""
+"""A ROS 2 or ROS 1 bag as a `Source`: clouds with the image nearest in time, IMU, calibration and ground truth."""
 
 from __future__ import annotations
 
@@ -38,23 +38,24 @@ from dpm2_core.geometry.tilt import up_of
 
 Stamps = NDArray[np.int64]
 _NO_BASE = ("map", "odom")  # frames that a base moves in
-_LOOKED_AT = 10  # clouds, for the ground
-_LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a tilt of more is said; the ground agrees with it to so much
+_LOOKED_AT = 10  # clouds, to find the ground
+_LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a larger tilt is reported; largest angle between ground and base
 
 _CLOCKS = 0.15
-"""s: drivers that stamp the start of a sweep, or its end, send clouds later than that after their stamps alike."""
+"""s: a larger difference between the delays from stamp to recording of two LiDARs suggests that their clocks differ.
+Whether a driver stamps the start or the end of a sweep makes a smaller difference."""
 
 
 class BagSource:
-    """A rosbag2 folder, or a .mcap, .db3 or .bag file. See `Source`; `Frame.index` is the message count.
+    """A rosbag2 folder, or a .mcap, .db3 or .bag file. See `Source`; `Frame.index` counts the clouds.
 
     Attributes:
-        T_base_lidar: (4, 4) how the LiDAR is mounted; None where /tf_static does not say that.
-        in_order: its clouds have been put in order of time before images and IMU joined them.
+        T_base_lidar: (4, 4) how the LiDAR is mounted; None if /tf_static does not define it.
+        in_order: the stamps of its clouds are corrected before images and IMU are associated with them.
 
     Raises:
         UsageError: it cannot be read, has no point clouds, leaves the choice of a topic open, or has a camera with
-            intrinsics but no known place.
+            intrinsics but without a known pose.
     """
 
     in_order = True
@@ -82,8 +83,8 @@ class BagSource:
         self.imu_topic = self._calibration.imu_topic = self._topics.imu()
         self._calibration.gnss_topic = self._topics.gnss()
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
-        self._delays: dict[str, list[int]] = {}  # ns from the stamp to the time of recording, of the clouds of a topic
-        self._unsound: dict[str, tuple[int, str]] = {}  # messages left out by topic, and why the first one
+        self._delays: dict[str, list[int]] = {}  # ns from stamp to time of recording, of the clouds of each topic
+        self._unsound: dict[str, tuple[int, str]] = {}  # by topic: messages left out, and why the first one was
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
         self.T_base_lidar = self._mounted(first)
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
@@ -97,9 +98,9 @@ class BagSource:
         return self._bag.counts[self.points_topic]
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 as recorded, also where their stamps repeat or go back; `notes` says so."""
+        """Frames start..stop-1 as recorded, even if their stamps repeat or go back; `notes` reports that."""
         before, recorded_before, period, count, known = None, 0, 0, 0, self._calibration
-        found, unusable = Counter[str](), Counter[str]()  # frames that have something of a topic, that is of no use
+        found, unusable = Counter[str](), Counter[str]()  # by topic: frames with a message, with an unusable message
         self._imu.clear()
         self._gnss.clear()
         self._unsound.clear()
@@ -112,7 +113,7 @@ class BagSource:
                     self.notes, "time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s"
                 )
             step, gone = (0, 0) if before is None else (stamp - before, recorded - recorded_before)
-            # By less than a second only where the cloud came when it was due: others may have been lost on the way.
+            # A step of less than a second counts only if the cloud came when it was due: else some may be lost.
             stepped = step - gone > (min(AHEAD * period, JUMP) if is_due(gone, period) else JUMP)
             period = period if stepped or step <= 0 else step
             frame = replace(self._frames.frame(stamp, cloud, index, beside), stepped=stepped)
@@ -128,8 +129,8 @@ class BagSource:
         self._note_missing(found, unusable, count)
 
     def _note_missing(self, found: Counter[str], unusable: Counter[str], count: int) -> None:
-        """Say what of the other sensors is missing, given how many of `count` frames have something of each topic, and
-        how many of these something that cannot be used."""
+        """Note what is missing from the other sensors. `found`: number of the `count` frames that have a message of
+        each topic; `unusable`: number of those whose message cannot be used."""
         known, within = self._calibration, f"within {self._settings.image_tolerance} s"
         missing = [(camera.topic, "image", within) for camera in known.cameras]
         if known.second_topic:
@@ -150,16 +151,16 @@ class BagSource:
 
     @cached_property
     def stamps(self) -> Stamps:
-        """(len,) ns: the header's stamp, or the time of recording where it is 0. Reads the clouds through once."""
+        """(len,) ns: the header's stamp, or the time of recording if the stamp is 0. Reads all clouds once."""
         clouds = self._in_order(self._bag.messages([self.points_topic]))
         return np.array([serialized_stamp(data, time) for _, time, data in clouds], np.int64)
 
     @cached_property
     def poses(self) -> Array | None:
-        """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where there is none; None without.
+        """(len, 4, 4) T_world_lidar ground truth interpolated at the stamps, NaN where unknown; None without any.
 
         Raises:
-            UsageError: a topic was asked for whose frame is not connected with the LiDAR; other topics are noted.
+            UsageError: the topic is set, but its frame is not connected with the LiDAR; for other topics this is noted.
         """
         if not self.truth:
             return None
@@ -182,7 +183,7 @@ class BagSource:
         return self._topics.truth()
 
     def _choose_cameras(self) -> Camera | None:
-        """Find the cameras; returns the first one, None if there is none."""
+        """Find the cameras; returns the first one, or None if there is none."""
         settings, known = self._settings, self._calibration
         second = self._topics.second("second_image_topic", settings.image_topic, IMAGES, "images")
         if topic := self._topics.image(second):
@@ -202,7 +203,7 @@ class BagSource:
             raise UsageError(f"{self.path}: camera {camera.topic}: {problem}") from None
 
     def _add_transforms(self) -> None:
-        """Take those of /tf_static; the invalid ones are left out, with a note."""
+        """Add the transforms of /tf_static; invalid ones are left out, with a note."""
         problems = list[str]()
         for _, _, data in self._bag.messages([naming.TF_STATIC]):
             try:
@@ -214,9 +215,9 @@ class BagSource:
             note_once(self.notes, what, f"the first: {printable(problems[0])}")
 
     def _mounted(self, first: Any) -> Array | None:
-        """T_base_lidar (4, 4), the base as for slam_node the root above the LiDAR in /tf_static.
+        """T_base_lidar (4, 4); the base is, as in slam_node, the root above the LiDAR in /tf_static.
 
-        None without one, and where the first clouds show that the root is none, as the frame of a camera.
+        None without a base, or if the first clouds show that the root is not one, such as the frame of a camera.
         """
         base = self.transforms.root(self.lidar_frame, _NO_BASE)
         if first is None or base == frame_name(self.lidar_frame):
@@ -235,8 +236,8 @@ class BagSource:
         return T_base_lidar
 
     def _ground(self) -> Points | None:
-        """Which way (3,) is up by the ground that the first cloud with some shows: drivers begin with empty ones, or in
-        mid-sweep. Rooms have ceilings, which look alike."""
+        """Up direction (3,) in the LiDAR frame, estimated from the ground in the first cloud that shows enough of it.
+        The first clouds of a driver may be empty or part of a sweep. Indoor clouds are skipped: ceilings look alike."""
         for cloud in islice(self._bag.decoded(self.points_topic), _LOOKED_AT):
             with suppress(MessageError):
                 points, _ = decode_points(cloud)
@@ -250,14 +251,14 @@ class BagSource:
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
     def _pairs(self) -> Iterator[tuple[int, int, bytes, dict[str, tuple[int, bytes]]]]:
-        """(stamp, time of recording, cloud, what goes with it: topic to stamp and message), serialized; the IMU's
-        samples before it are in the buffer then."""
+        """(stamp, time of recording, cloud, topic to stamp and message associated with it), messages serialized. The
+        IMU samples before the cloud are in the buffer by then."""
         known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
         others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
         more = ((known.second_topic, 0), (self.imu_topic, -SWEEP))
         others |= {topic: ahead for topic, ahead in more if topic}
         beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
-        gnss = known.gnss_topic  # nobody waits for fixes: a late one has its place on the way, too
+        gnss = known.gnss_topic  # clouds do not wait for fixes: a late fix can still be placed on the trajectory
         messages = self._in_order(self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])]))
         waiting: deque[tuple[int, RawMessage]] = deque()
         delays = self._delays = {topic: [] for topic in (self.points_topic, known.second_topic)}
@@ -277,18 +278,18 @@ class BagSource:
                     known.check_sensor(topic, sample.header.frame_id, stamp)
                     (self._imu if topic == self.imu_topic else self._gnss).add(stamp, sample)
                 else:
-                    if topic != known.second_topic:  # whose clouds are moved each by its own frame
+                    if topic != known.second_topic:  # whose clouds are each transformed from their own frame
                         known.check_sensor(topic, serialized_frame(data), stamp)
                     beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
 
     def _in_order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
-        """With those stamps of clouds corrected that are not between their neighbors', which is noted."""
+        """The messages, with corrected stamps where a cloud's stamp is not between its neighbors'; this is noted."""
         topic = self.points_topic
         return in_order(messages, topic, partial(note_corrected, self.notes, whose=f"{topic}: "))
 
     @contextmanager
     def _or_left_out(self, topic: str) -> Iterator[None]:
-        """Inside, a message of a sensor beside the LiDAR is taken; one that cannot be is left out, and counted."""
+        """Guards the handling of a message of a sensor other than the LiDAR; an invalid one is skipped and counted."""
         try:
             yield
         except MessageError as error:
@@ -296,11 +297,11 @@ class BagSource:
             self._unsound[topic] = left_out + 1, why
 
     def _truth(self, topic: str) -> tuple[Stamps, Array]:
-        """Stamps (M,) ns and T_world_lidar (M, 4, 4); of several Path messages the last, the most complete, counts.
-        What cannot be decoded, or is no rigid transform, is left out, with a note.
+        """Stamps (M,) ns and T_world_lidar (M, 4, 4). Of several Path messages the last, the most complete, counts.
+        Poses that cannot be decoded, or are no rigid transforms, are left out, with a note.
 
         Raises:
-            UsageError: they are of a frame that is not connected with the LiDAR.
+            UsageError: the poses are in a frame that is not connected with the LiDAR.
         """
         decoded, stamps, T, problems = list[tuple[int, Any]](), list[int](), list[Array](), list[str]()
         for _, time, data in self._bag.messages([topic]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages that belong together to a `Frame`. What cannot be used is reported once, never replaced by a guess."""
+"""Builds a `Frame` from associated messages. Unusable data is reported once, and never replaced by a guess."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import NO_POINTS, Array, Camera, Fix, Frame, Image, Inertial, Points, Up
 from dpm2_core.geometry import se3
 
-_MOST_REPORTED = 20  # damaged data may be damaged in endless ways
+_MOST_REPORTED = 20  # damaged data may produce any number of different messages
 _LENGTH = 300  # characters of a problem, whatever is in the message
-_SILENT = 2_000_000_000  # ns by its stamps after which another sensor may take the place of one
+_SILENT = 2_000_000_000  # ns, by the stamps: after a silence of this length another sensor may use the topic
 
 
 @dataclass(eq=False)
 class CameraTopic:
-    """A camera by its messages: the full topic of its images, and what its CameraInfo says of them (`info_of`), None as
-    long as there is none."""
+    """A camera by its messages: the full topic of its images, and the CameraInfo of these images (`info_of`), None
+    until there is one."""
 
     topic: str
     info: Any = None
@@ -39,15 +39,15 @@ class CameraTopic:
 
 @dataclass(eq=False)
 class Calibration:
-    """What is known of the sensors: of a recording from the start, of topics as it comes in.
+    """What is known about the sensors: for a recording from the start, for live topics as messages arrive.
 
     Attributes:
-        points_topic, second_topic, imu_topic, gnss_topic: full names; empty where there is none.
-        camera, second_camera: None where there is none, or none is wanted.
-        lidar_frame: that of the drive's clouds: one in another frame cannot be used. Empty: any can.
-        transforms: of /tf_static.
-        angle_correction_deg: what the recording says of its vertical angles; None if it says nothing.
-        heard: topic of a sensor beside the LiDAR to its frame, and the stamp (ns) of its last message.
+        points_topic, second_topic, imu_topic, gnss_topic: full names; empty if there is none.
+        camera, second_camera: None if there is none, or it is not used.
+        lidar_frame: frame of the drive's clouds; a cloud in another frame cannot be used. Empty: any frame.
+        transforms: from /tf_static.
+        angle_correction_deg: vertical angle correction from the recording; None if it has none.
+        heard: for each topic of a sensor other than the LiDAR: its frame, and the stamp (ns) of its last message.
     """
 
     points_topic: str
@@ -62,11 +62,11 @@ class Calibration:
     heard: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def check_sensor(self, topic: str, frame: str, stamp: int) -> None:
-        """Take note of a message with its frame and stamp (ns); on each topic the sensor that was heard first counts.
+        """Record the frame and stamp (ns) of a message; on each topic, the sensor that was received first counts.
 
         Raises:
-            MessageError: it is of another one, as where drivers are remapped to one topic: two IMUs would be taken for
-                one that turns, two cameras for one that jumps. One that names no frame may be of any.
+            MessageError: the message is from another sensor, as when drivers are remapped to one topic. Two IMUs would
+                look like one that rotates, two cameras like one that jumps. A message without a frame is accepted.
         """
         known, last = self.heard.get(topic, ("", stamp))
         frame = frame_name(frame) or known
@@ -76,29 +76,29 @@ class Calibration:
         self.heard[topic] = frame, stamp
 
     def frame_of(self, camera: CameraTopic) -> str:
-        """The frame of a camera's images; empty where it is not known yet, or they name none."""
+        """The frame of a camera's images; empty if it is not known yet, or the images name none."""
         return self.heard.get(camera.topic, ("", 0))[0]
 
     @property
     def cameras(self) -> list[CameraTopic]:
-        """Those that there are, the first one first."""
+        """The cameras that exist, the first one first."""
         return [camera for camera in (self.camera, self.second_camera) if camera is not None]
 
 
 class FrameBuilder:
-    """Makes frames of messages.
+    """Builds frames from messages.
 
     Args:
         settings: how to read the messages.
-        calibration: looked at anew for each frame.
-        complain: called once with each different problem.
-        decode: makes a message of a topic's bytes, or raises MessageError; the default takes messages as they are.
-        imu, gnss: where their messages come in; None where none are wanted.
+        calibration: read again for each frame.
+        complain: called once for each different problem.
+        decode: deserializes a message of a topic, or raises MessageError; the default takes messages as they are.
+        imu, gnss: buffers of their messages; None if the sensor is not used.
 
     Attributes:
-        up: that of each `Frame`, and of its `Inertial`.
-        problems: topic of a sensor beside the LiDAR to why its last message could not be used; only where that is so.
-        time_problem: why the last cloud cannot be de-skewed; empty if it can, or needs not.
+        up: `up` of each `Frame`, and of its `Inertial`.
+        problems: topic of a sensor other than the LiDAR to why its last message could not be used, if so.
+        time_problem: why the last cloud cannot be de-skewed; empty if it can be, or need not be.
     """
 
     def __init__(
@@ -118,10 +118,10 @@ class FrameBuilder:
         self.up: Up | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, index: int, beside: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
-        """A cloud with its stamp (ns), and what goes with it; an unreadable cloud comes with `problem` set.
+        """The frame of a cloud with its stamp (ns) and the associated messages; `problem` is set if it is unreadable.
 
         Args:
-            beside: stamp (ns) and message of each camera, and of a second LiDAR, by its topic; where there is one.
+            beside: stamp (ns) and message of each camera and of a second LiDAR, by topic, if available.
         """
         beside, topic = beside or {}, self._calibration.points_topic
         try:
@@ -145,27 +145,27 @@ class FrameBuilder:
         return Frame(stamp, points, offset, images, index, up=self.up, imu=imu, fix=fix)
 
     def _check_frame(self, frame: str) -> None:
-        """Raises MessageError for that of another LiDAR: poses of two would be taken for the motion of one."""
+        """Raise MessageError for a cloud of another LiDAR: poses of two LiDARs would look like the motion of one."""
         of_drive = self._calibration.lidar_frame
         if of_drive and frame_name(frame) != frame_name(of_drive):
             found = f"a cloud in frame {frame[:80]!r}, the drive's are in {of_drive!r}"
             raise MessageError(f"{found}: one drive has one LiDAR")
 
     def _points(self, cloud: Any) -> tuple[Points, Points | None]:
-        """(N, 4), and (N,) s after the stamp, of a decoded message."""
+        """Points (N, 4) and their times (N,), s after the stamp, of a decoded message."""
         settings = self._settings
         return decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
 
     def _joined(
         self, points: Points, offset: Points | None, lidar_frame: str, late: float, second: Any
     ) -> tuple[Points, Points | None]:
-        """Points (N, 4) with those that a second LiDAR has measured, `late` s after them; their times (N,) with its."""
+        """Points (N, 4) and times (N,) merged with those of a second LiDAR, whose stamp is `late` s after the first."""
         topic = self._calibration.second_topic
         with self._or_else(topic, "going on without the second LiDAR"):
             second = self._decode(topic, second)
             others, other_offset = self._points(second)
             T = self._calibration.transforms.between(lidar_frame, second.header.frame_id)
-            seen = returned(others)  # moved, the zeros of a missing return would be a point
+            seen = returned(others)  # once transformed, the zeros of a missing return would look like a point
             others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
             if offset is not None or other_offset is not None or late:
                 first = np.zeros(len(points), np.float32) if offset is None else offset
@@ -175,10 +175,10 @@ class FrameBuilder:
         return points, offset
 
     def camera(self, camera: CameraTopic, lidar_frame: str, image_frame: str) -> Camera:
-        """A camera by what is known now, named by its topic; `image_frame` counts where its CameraInfo names no frame.
+        """A camera from current calibration, named by its topic; `image_frame` is used if its CameraInfo has no frame.
 
         Raises:
-            UsageError: CameraInfo or extrinsics are missing, or cannot be used.
+            UsageError: CameraInfo or extrinsics are missing or unusable.
         """
         first, T_lidar_cam = self._calibration.camera, None
         if camera.info is None:
@@ -198,20 +198,20 @@ class FrameBuilder:
 
     @property
     def angle_correction_deg(self) -> float:
-        """Added to the elevation of each point: what is set, else what the recording says, else KITTI's for KITTI."""
+        """Degrees added to each elevation: the value set, else the recording's value, else KITTI's for KITTI topics."""
         known = self._calibration.angle_correction_deg
         usual = HDL64_CORRECTION_DEG if self._calibration.points_topic.startswith("/kitti/") else 0.0
         return self._settings.angle_correction(usual if known is None else known)
 
     def _inertial(self, buffer: ImuBuffer, lidar_frame: str, stamp: int, offset: Points | None) -> Inertial | None:
-        """The samples up to the last point of a scan, along the LiDAR's axes."""
+        """The samples up to the last point of a scan, rotated into the LiDAR frame."""
         if buffer.last == -float("inf"):
             return None
         found = buffer.take(stamp, stamp + last_point(offset))
         with self._or_else(self._calibration.imu_topic, "going on without the IMU"):
             if found is None:
                 raise UsageError("no samples at the time of the scan")
-            if not found.rates.any() and np.isnan(found.forces).all():  # no gyroscope is so still
+            if not found.rates.any() and np.isnan(found.forces).all():  # no real gyroscope measures exactly 0
                 raise UsageError("its rates and forces are all 0: it measures neither")
             R = self._imu_rotation(lidar_frame, buffer.frame)
             return replace(found, rates=found.rates @ R.T, forces=found.forces @ R.T, up=self.up)
@@ -228,7 +228,7 @@ class FrameBuilder:
             raise UsageError(f"{error}; set input.q_lidar_imu, or publish it on /tf_static") from None
 
     def _fix(self, buffer: FixBuffer, lidar_frame: str, stamp: int) -> Fix | None:
-        """The last fix before a scan, with the place of its antenna."""
+        """The last fix before a scan, with the position of its antenna."""
         if (fix := buffer.take(stamp)) is None:
             return None
         with self._or_else(self._calibration.gnss_topic, "the antenna is taken for the LiDAR"):
@@ -248,7 +248,7 @@ class FrameBuilder:
 
     @contextmanager
     def _or_else(self, topic: str, without: str) -> Iterator[None]:
-        """Inside, a sensor beside the LiDAR is read; where it cannot be used that is its problem, and told."""
+        """Guards the reading of a sensor other than the LiDAR; an error is stored as its problem, and reported."""
         try:
             yield
         except (UsageError, ValueError) as error:
@@ -257,9 +257,9 @@ class FrameBuilder:
             self.problems.pop(topic, None)
 
     def _tell(self, topic: str, error: Exception, more: str = "") -> str:
-        """Complain unless it is known already; returns the problem as one line."""
+        """Report a problem unless it was reported already; returns it as one line."""
         problem = printable(str(error)[:_LENGTH])
-        text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{more}"  # a message that is damaged names its topic
+        text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{more}"  # errors of damaged messages name the topic too
         if text not in self._told and len(self._told) < _MOST_REPORTED:
             self._told.add(text)
             self._complain(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions by satellites (sensor_msgs/NavSatFix) as they come in, until a scan is there."""
+"""Buffers GNSS positions (sensor_msgs/NavSatFix) until a scan arrives."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.data.pairing import JUMP
 from dpm2_core.frame import Fix
 
-_NO_FIX = -1  # -2, Jazzy's default, says that the driver sets no status at all
-_MOST = 1000  # fixes kept; bounds memory where no cloud comes
-_LEAST = 0.01  # m, added to every standard deviation: no antenna's place and no clock is known better
-_ASSUMED = np.array([5.0, 5.0, 10.0])  # m east, north, up where none is stated: that of a plain receiver, open sky
-_UNKNOWN = 1e4  # m, of an altitude that is not known
+_NO_FIX = -1  # -2, Jazzy's default, means that the driver sets no status at all
+_MOST = 1000  # fixes kept; bounds memory if no cloud arrives
+_LEAST = 0.01  # m, its square is added to every variance: antenna position and clock are not known better
+_ASSUMED = np.array([5.0, 5.0, 10.0])  # m east, north, up if none is stated: those of a plain receiver, open sky
+_UNKNOWN = 1e4  # m, of an unknown altitude
 
 
 def decode_fix(message: Any, stamp: int) -> Fix | None:
-    """The position that a sensor_msgs/NavSatFix with that stamp (ns) states, its antenna at the LiDAR; None: no fix.
+    """The fix of a sensor_msgs/NavSatFix with that stamp (ns), its antenna at the LiDAR; None without a fix.
 
-    A variance that is unknown, or 0, is taken to be that of a plain receiver; an altitude of NaN is unknown, as the
-    message's definition has it.
+    A variance that is unknown, or 0, is taken to be that of a plain receiver; an altitude of NaN is unknown, as in the
+    message's definition.
 
     Raises:
-        MessageError: no place on Earth, or no covariance.
+        MessageError: it is no position on Earth, or has no valid covariance.
     """
     if message.status.status == _NO_FIX:
         return None
@@ -48,10 +48,10 @@ def decode_fix(message: Any, stamp: int) -> Fix | None:
 
 
 class FixBuffer:
-    """The latest fixes; any thread may add or take.
+    """The latest fixes; thread-safe.
 
     Attributes:
-        frame: of the antenna, as the last message names it.
+        frame: frame of the antenna, from the last message.
     """
 
     def __init__(self) -> None:
@@ -60,12 +60,12 @@ class FixBuffer:
         self._fixes: deque[Fix] = deque(maxlen=_MOST)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all fixes."""
         with self._lock:
             self._fixes.clear()
 
     def add(self, stamp: int, message: Any) -> bool:
-        """Take a sensor_msgs/NavSatFix with its stamp (ns); returns whether the receiver has a fix.
+        """Add a sensor_msgs/NavSatFix with its stamp (ns); returns whether the receiver has a fix.
 
         Raises:
             MessageError: see `decode_fix`.
@@ -78,7 +78,7 @@ class FixBuffer:
         return True
 
     def take(self, stamp: int) -> Fix | None:
-        """The latest of those up to a scan's stamp (ns) that were not taken before; None if there is none."""
+        """The latest fix up to a scan's stamp (ns) that was not taken before; None if there is none."""
         with self._lock:
             found = max((fix for fix in self._fixes if fix.stamp <= stamp), key=lambda fix: fix.stamp, default=None)
             later = [fix for fix in self._fixes if stamp < fix.stamp < stamp + JUMP]

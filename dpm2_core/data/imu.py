@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of an IMU as they come in, until the scan that they belong to is there."""
+"""Buffers IMU samples until the scan that they are associated with arrives."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from dpm2_core.data.pairing import JUMP, SetBack
 from dpm2_core.frame import Array, Inertial
 
 KEPT = 11_000_000_000
-"""ns before a scan of which samples are of use: they tell the turn across a pause of up to 10 s."""
-_LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any sensor that is sold measures
+"""ns before a scan in which samples are used: they give the rotation across a pause of up to 10 s."""
+_LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any commercial sensor measures
 _CLOSEST = 400_000  # ns: no IMU is faster than 2500 Hz
-_MOST = 10_000  # samples kept; bounds memory where no cloud comes
+_MOST = 10_000  # samples kept; bounds memory if no cloud arrives
 
 
 def decode_imu(message: Any) -> tuple[Array, Array]:
-    """Rates (3,) rad/s and forces (3,) m/s2, NaN where it has none, of a sensor_msgs/Imu.
+    """Rates (3,) rad/s and forces (3,) m/s2 of a sensor_msgs/Imu; forces are NaN if it has none.
 
     Raises:
-        MessageError: it measures no rates, or numbers that cannot be.
+        MessageError: it has no rates, or impossible numbers.
     """
     rates, forces = message.angular_velocity, message.linear_acceleration
     values = np.array([rates.x, rates.y, rates.z, forces.x, forces.y, forces.z])
     if message.angular_velocity_covariance[0] == -1:
         raise MessageError("an IMU without angular velocities")
     if message.linear_acceleration_covariance[0] == -1 or not values[3:].any():
-        values[3:] = np.nan  # as REP-145 has it; a gyroscope's driver may send zeros instead
+        values[3:] = np.nan  # as defined by REP-145; a gyroscope's driver may send zeros instead
     wrong = ~(np.abs(values) <= _LARGEST)
     if wrong[:3].any() or (wrong[3:].any() and not np.isnan(values[3:]).all()):
         raise MessageError(f"angular velocity {values[:3].tolist()} rad/s, acceleration {values[3:].tolist()} m/s2")
@@ -39,10 +39,10 @@ def decode_imu(message: Any) -> tuple[Array, Array]:
 
 
 class ImuBuffer:
-    """The latest samples in order of their stamps; any thread may add or take.
+    """The latest samples in order of their stamps; thread-safe.
 
     Attributes:
-        last: stamp of the newest, ns; -inf before there is one. frame: that they are measured in.
+        last: stamp of the newest sample, ns; -inf before the first. frame: frame of the measurements.
     """
 
     def __init__(self) -> None:
@@ -52,17 +52,17 @@ class ImuBuffer:
         self._set_back = SetBack()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all samples."""
         with self._lock:
             self.last = -float("inf")
             self._samples.clear()
 
     def add(self, stamp: int, message: Any) -> None:
-        """Take a sensor_msgs/Imu with its stamp (ns); one that jumps by more than a second begins
-        anew, and so do those of a clock that was set back by less.
+        """Add a sensor_msgs/Imu with its stamp (ns). A stamp that jumps by more than a second starts a new series, and
+        so do the stamps of a clock that was set back by less.
 
         Raises:
-            MessageError: see `decode_imu`; or it is not newer than the last one, or follows too soon.
+            MessageError: see `decode_imu`; or the sample is not newer than the last one, or follows it too closely.
         """
         rates, forces = decode_imu(message)
         with self._lock:
@@ -78,8 +78,8 @@ class ImuBuffer:
             self._samples.extend(samples)
 
     def take(self, stamp: int, until: int) -> Inertial | None:
-        """Those up to `until` (ns) that were not taken before, for a scan with that stamp (ns); None if there are none
-        of the last `KEPT`."""
+        """Samples up to `until` (ns) that were not taken before, for a scan with that stamp (ns); None if there are
+        none within the last `KEPT`."""
         with self._lock:
             taken = []
             while self._samples and self._samples[0][0] <= until:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt; with an IMU beside
-it imu.txt (a line for each sample: s, then rad/s and m/s2 along its axes) and Tr_imu_to_velo in calib.txt; with fixes
-of satellites gnss.txt (s, latitude and longitude, deg, altitude, m, standard deviations to the east, north, up, m) and
+"""The KITTI odometry layout: sequences/NN/{velodyne,image_2,calib.txt,times.txt} and poses/NN.txt. With an IMU also
+imu.txt (one line per sample: s, then rad/s and m/s2 along its axes) and Tr_imu_to_velo in calib.txt. With GNSS fixes
+also gnss.txt (s, latitude and longitude, deg, altitude, m, standard deviations to the east, north, up, m) and
 Tr_gnss_to_velo, of the antenna.
 
 A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
@@ -31,14 +31,14 @@ from dpm2_core.frame import Array, Camera, Fix, Frame, Inertial
 from dpm2_core.geometry import se3
 
 ROUNDED = 0.01
-"""By so much a rotation in a calibration file may be off, as its numbers are rounded."""
+"""Tolerance for a rotation in a calibration file, whose numbers are rounded."""
 
 
 class KittiSource(VelodyneDrive):
-    """A sequence folder, or the root above it with `sequences/NN`. See `Source` for what it offers.
+    """A sequence folder, or the root above it with `sequences/NN`. See `Source` for its attributes and methods.
 
-    Scans need not start at 0 nor follow each other. Images and poses are optional. A scan or image that cannot be read
-    costs its frame alone.
+    Scan numbers need not start at 0 nor be consecutive. Images and poses are optional. A scan or image that cannot be
+    read affects only its own frame.
 
     Raises:
         UsageError: there are no scans, or a text file is damaged; the message names file and line.
@@ -63,7 +63,7 @@ class KittiSource(VelodyneDrive):
         self.fixes = self._fixes(calib)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position, with what IMU and receiver measured since the one before."""
+        """Frames start..stop-1 by position, with the IMU samples and the fix measured since the frame before."""
         before, fixes = None, deque(self.fixes)
         for frame in super().frames(start, stop):
             imu, fix = self._samples(before, frame.stamp), None
@@ -73,7 +73,7 @@ class KittiSource(VelodyneDrive):
             yield replace(frame, imu=imu, fix=fix)
 
     def _imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
-        """All samples along the IMU's axes, and R_lidar_imu (3, 3); no samples where there are none to use."""
+        """All samples along the IMU's axes (None if there are none to use), and R_lidar_imu (3, 3)."""
         path, R = self.path / "imu.txt", self._settings.imu_rotation()
         rows = read_numbers(path, 7) if self._settings.imu else np.zeros((0, 7))
         if R is None and "Tr_imu_to_velo" in calib:
@@ -87,7 +87,7 @@ class KittiSource(VelodyneDrive):
         return Inertial(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:]), R
 
     def _samples(self, before: int | None, stamp: int) -> Inertial | None:
-        """Those after the scan before (ns), those of the last `KEPT` alone, along the LiDAR's axes."""
+        """Samples since the scan before (ns), at most those of the last `KEPT`, rotated into the LiDAR frame."""
         s, R = self.imu, self.R_lidar_imu
         if s is None:
             return None
@@ -109,7 +109,7 @@ class KittiSource(VelodyneDrive):
         return sorted(found, key=lambda fix: fix.stamp)
 
     def _known_correction(self) -> float:
-        note = self.path / "dpm2_sim.json"  # a simulated sensor has no such error, and says so
+        note = self.path / "dpm2_sim.json"  # the simulated sensor has no such error; this file states it
         try:
             message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
@@ -119,7 +119,7 @@ class KittiSource(VelodyneDrive):
         return checked_correction(message, str(note))
 
     def _stamps(self) -> NDArray[np.int64]:
-        """(len,) ns by times.txt, continued at a steady pace where it ends early; else by the names of the scans where
+        """(len,) ns from times.txt, continued at a constant rate if it ends early; else from the names of the scans if
         those are times since 1970."""
         path, n = self.path / "times.txt", len(self)
         times = read_numbers(path, 1)
@@ -145,7 +145,7 @@ class KittiSource(VelodyneDrive):
         return np.round(seconds * 1e9).astype(np.int64)
 
     def _poses(self) -> Array | None:
-        """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without."""
+        """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without either."""
         beside, above = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
         requested = {"auto": (beside, above), "kitti": (above,), "semantic_kitti": (beside,)}[
             self._settings.kitti_poses
@@ -168,15 +168,15 @@ class KittiSource(VelodyneDrive):
             self.notes.append(f"{path}: {wrong.sum()} poses are no rigid transforms and left out, that of scan {first}")
             known = np.logical_and(known, rigid)
         T_world_cam = np.full((len(self), 4, 4), np.nan)
-        # Rounded to 7 digits in the files, which a quaternion on the way through a bag would not keep.
+        # Rounded to 7 digits in the files; a quaternion, as in a bag, would not keep the error of the rotation.
         T_world_cam[known] = se3.from_rows(rows[known])
         return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
 
     def _of_each_scan(self, rows: Array) -> Array:
         """The row of each scan, NaN where there is none.
 
-        By frame number where there are enough rows or the scans begin at 0, else one after the other where they are as
-        many. Of others nothing says which is whose.
+        In order if there are as many rows as scans, but not as many as the frame numbers require. Else by frame number
+        if there are enough rows or the scans begin at 0. Else nothing shows which row is of which scan.
         """
         out = np.full((len(self), rows.shape[1]), np.nan)
         if len(rows) == len(self) <= self.numbers[-1]:
@@ -189,7 +189,7 @@ class KittiSource(VelodyneDrive):
         return out
 
     def _camera(self, calib: dict[str, Array]) -> Camera | None:
-        """The left color camera, its size that of the first image that can be read; None without images."""
+        """The left color camera, with the size of the first readable image; None without images."""
         size = self._image_size()
         if size is None:
             return None
@@ -202,7 +202,7 @@ class KittiSource(VelodyneDrive):
 
 
 def left_color_camera(P2: Array, T_cam_lidar: Array, size: tuple[int, int]) -> Camera:
-    """KITTI's camera 2, of its projection matrix (3, 4) and the transform (4, 4) to the rectified gray camera 0."""
+    """KITTI's camera 2, from its projection matrix (3, 4) and the transform (4, 4) to the rectified gray camera 0."""
     K, offset = P2[:, :3], P2[:, 3]
     # P2 = K [I | t] with t from the left gray camera 0, which the poses and Tr refer to.
     T_cam2_cam0 = se3.make(np.eye(3), np.linalg.solve(K, offset))
@@ -210,17 +210,17 @@ def left_color_camera(P2: Array, T_cam_lidar: Array, size: tuple[int, int]) -> C
 
 
 def read_calib(path: Path) -> dict[str, Array]:
-    """P0..P3 (3, 4), Tr (4, 4, LiDAR to left gray camera), Tr_imu_to_velo and Tr_gnss_to_velo (4, 4), those that a
-    calib.txt has; nothing if there is none.
+    """The matrices in a calib.txt: P0..P3 (3, 4), Tr (4, 4, LiDAR to left gray camera), Tr_imu_to_velo and
+    Tr_gnss_to_velo (4, 4); empty if there is no such file.
 
     Raises:
-        UsageError: a line is damaged; the message names it.
+        UsageError: a line is damaged; the message names file and line.
     """
     calib: dict[str, Array] = {}
     for number, line in enumerate(read_lines(path), 1):
         key, colon, text = line.partition(":")
         if not colon or key.strip() not in ("P0", "P1", "P2", "P3", "Tr", "Tr_imu_to_velo", "Tr_gnss_to_velo"):
-            continue  # raw and object calibrations have many more
+            continue  # calibrations of raw drives and of the object data set have many more
         row, name = parse_row(text, 12, f"{path}:{number}: {key}"), key.strip()
         matrix = row.reshape(3, 4)
         if name.startswith("Tr"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS sensor messages to numpy and back, by duck typing: rclpy's (array.array data) and rosbags' (numpy data) alike.
+"""ROS sensor messages to numpy and back, duck-typed: for rclpy (array.array data) and rosbags (numpy data) alike.
 
 Nothing here imports ROS. Message fields are those of sensor_msgs; `transforms.TransformTree` reads tf2_msgs likewise.
 """
@@ -26,7 +26,7 @@ _LARGEST_POINT = 1 << 16
 
 
 class MessageError(UsageError):
-    """A message that cannot be understood, in one line naming the field or encoding."""
+    """A message that cannot be decoded; one line that names the field or encoding."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -49,7 +49,7 @@ def rigid_parts(transform: Any) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 STAMP_END = 2**31 * 1_000_000_000
-"""ns before which the stamp of a header is: in 2038."""
+"""Upper bound of a header's stamp, ns: in 2038."""
 
 
 def serialized_stamp(data: bytes, time: int) -> int:
@@ -69,12 +69,12 @@ def serialized_frame(data: bytes) -> str:
 
 
 def restamped(data: bytes, stamp: int) -> bytes:
-    """A serialized message that begins with a header, with another stamp, ns."""
+    """A serialized message that begins with a header, with its stamp replaced by `stamp`, ns."""
     return data[:4] + struct.pack(_stamp_format(data), *divmod(stamp, 1_000_000_000)) + data[12:]
 
 
 def _stamp_format(data: bytes) -> str:
-    """Of the stamp, which comes after the 4 bytes that name the byte order."""
+    """Struct format of the stamp, which follows the 4 bytes with the byte order."""
     return "<iI" if data[1] & 1 else ">iI"
 
 
@@ -84,8 +84,8 @@ def cloud_view(msg: Any, names: Collection[str]) -> NDArray[np.void]:
     A view of the message's data unless rows are padded. A field with count > 1 becomes a sub-array.
 
     Args:
-        msg: any byte order, field order, padding.
-        names: the fields wanted. Unknown ones are left out.
+        msg: in any byte order, field order and padding.
+        names: the requested fields. Unknown ones are left out.
 
     Raises:
         MessageError: the data is shorter than declared, or the layout contradicts itself.
@@ -125,7 +125,7 @@ def cloud_view(msg: Any, names: Collection[str]) -> NDArray[np.void]:
 
 
 def check_cloud(msg: Any) -> None:
-    """Raises MessageError unless a sensor_msgs/PointCloud2 has points that can be read; takes microseconds."""
+    """Raise MessageError unless a sensor_msgs/PointCloud2 has readable points; takes microseconds."""
     available = [field.name for field in msg.fields]
     if missing := [name for name in _XYZ if name not in available]:
         named = ", ".join(available[:20]) or "none"
@@ -136,26 +136,26 @@ def check_cloud(msg: Any) -> None:
 def decode_points(
     msg: Any, time_field: str | None = None, time_unit: TimeUnit = "auto", intensity_max: float | None = None
 ) -> tuple[Points, Points | None]:
-    """sensor_msgs/PointCloud2 to points and their capture times. Invalid points stay where they are, as NaN or zeros.
+    """sensor_msgs/PointCloud2 to points and their capture times. Invalid points keep their index, as NaN or zeros.
 
-    Intensity becomes 0..1 as `scale_intensity` says, and is 0 where the cloud has none.
+    Intensity is scaled to 0..1 as in `scale_intensity`, and is 0 if the cloud has none.
 
-    Time is looked for under its usual names. The unit is the one that the name ends in (time_offset_ns), else the one
-    in which the points span 2 ms to 2 s (integers: us or ns). Values beyond 2 s are absolute and become relative to
-    `msg.header.stamp`, or to the earliest point if that is another clock's.
+    The time field is found by its usual names. Its unit is the one that the name ends in (time_offset_ns), else the one
+    in which the points span 2 ms to 2 s (integers: us or ns). Values beyond 2 s are absolute: they are made relative to
+    `msg.header.stamp`, or to the earliest point if they are of another clock.
 
     Args:
         msg: the message.
         time_field: field with the time of each point; None looks for a usual name, "" takes none.
         time_unit: unit of that field.
-        intensity_max: intensity that becomes 1, as in `scale_intensity`.
+        intensity_max: intensity that is scaled to 1, as in `scale_intensity`.
 
     Returns:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1]; a view of the message where its layout allows.
-        time_offset: (N,) float32 s relative to the header's stamp; None without the field or where it is constant.
+        time_offset: (N,) float32 s relative to the header's stamp; None without the field or if it is constant.
 
     Raises:
-        MessageError: x, y or z, or the time field asked for, is missing (the message lists the fields there are), or
+        MessageError: x, y or z, or the requested time field, is missing (the message lists the available fields), or
             `cloud_view` rejected the layout.
     """
     check_cloud(msg)
@@ -174,13 +174,13 @@ def decode_points(
 
 
 def why_untimed(msg: Any) -> str:
-    """Why `decode_points` found no times in a PointCloud2, in words."""
+    """Reason, in words, why `decode_points` found no times in a PointCloud2."""
     time, _ = time_field_of([field.name for field in msg.fields])
     if time is None:
         return "no time field"
     values = _first(cloud_view(msg, [time])[time])
     known = values[np.isfinite(values) & (values != 0)]
-    constant = bool((known == known[:1]).all())  # of none too
+    constant = bool((known == known[:1]).all())  # also true if there are none
     return f"all points have the same {time}" if constant else f"{time} is no possible time of most points"
 
 
@@ -210,16 +210,16 @@ def _points(view: NDArray[np.void], intensity: str | None, intensity_max: float 
 
 
 def scale_intensity(points: Points, intensity_max: float | None, integer: bool = False) -> Points:
-    """(N, 4) points with intensity in 0..1: the same array if it is already, else a copy. Unknown (NaN) becomes 0.
+    """(N, 4) points with intensity in 0..1: the same array if it is so already, else a copy. Unknown (NaN) becomes 0.
 
     Args:
-        intensity_max: value that becomes 1; None takes the first of 1 (unless `integer`), 255 and 65535 that is not
-            below the largest value here.
-        integer: whether 1 is the least value above 0.
+        intensity_max: value that is scaled to 1; None takes the first of 1 (unless `integer`), 255 and 65535 that is
+            not below the largest value here.
+        integer: whether the values are integers: then 1 is not taken for the largest possible value.
     """
     value = points[:, 3]
     if not len(points) or (intensity_max is None and not integer and value.min() >= 0 and value.max() <= 1):
-        return points  # as NaN compares false, these are clean
+        return points  # a NaN would compare false, so there is none
     value = np.nan_to_num(value, nan=0.0, posinf=0.0, neginf=0.0)
     limits = (255.0,) if integer else (1.0, 255.0)
     scale = intensity_max or next((limit for limit in limits if value.max() <= limit), 65535.0)
@@ -229,7 +229,7 @@ def scale_intensity(points: Points, intensity_max: float | None, integer: bool =
 
 
 def returned(points: Points) -> NDArray[np.bool_]:
-    """(N,) which of (N, 4) points the LiDAR has measured: where nothing came back drivers put NaN, or zeros."""
+    """(N,) which of (N, 4) points the LiDAR has measured: drivers put NaN or zeros for a missing return."""
     return np.asarray(np.isfinite(points[:, :3]).all(1) & points[:, :3].any(1))
 
 
@@ -237,7 +237,7 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
     """Everything but the header of a sensor_msgs/PointCloud2, as keyword arguments for its constructor.
 
     Args:
-        columns: field name to (N,) or (N, count) array, in order, of a type that PointField has.
+        columns: field name to (N,) or (N, count) array, in order, of a type that PointField supports.
         point_field: the PointField class, called with name, offset, datatype and count.
 
     Returns:
@@ -265,7 +265,7 @@ def cloud_fields(columns: Mapping[str, NDArray[Any]], point_field: Callable[...,
 
 
 def point_cloud(columns: Mapping[str, NDArray[Any]], stamp: int, frame: str = "") -> Any:
-    """As a sensor_msgs/PointCloud2 of a stamp, ns: what is not a message becomes points as messages do."""
+    """An object like a sensor_msgs/PointCloud2 with a stamp, ns: other formats are then decoded like messages."""
     time = SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
     header = SimpleNamespace(stamp=time, frame_id=frame)
     return SimpleNamespace(header=header, **cloud_fields(columns, SimpleNamespace))

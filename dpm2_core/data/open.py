@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the loader of a recording."""
+"""Selects the loader for a recording."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _OUSTER = (".pcap", ".osf")
 
 
 def sequences_below(path: Path | str) -> list[str]:
-    """What `input.sequence` may be in a folder of KITTI odometry, raw, -360 or -CARLA with several drives.
+    """Possible values of `input.sequence` for a folder of KITTI odometry, raw, -360 or -CARLA with several drives.
 
     Raises:
-        UsageError: there is no such folder, or it holds none.
+        UsageError: there is no such folder, or it contains no drive.
     """
     path = Path(path)
     if not path.is_dir():
@@ -33,29 +33,29 @@ def sequences_below(path: Path | str) -> list[str]:
 
 
 def is_drive(path: Path) -> bool:
-    """A folder, or a file of a name that drives have: a bag, or what an Ouster LiDAR has sent."""
+    """Whether this is a folder, or a file with a drive's file name: a bag, or a recording of an Ouster LiDAR."""
     return path.is_dir() or (path.is_file() and (path.suffix in (".bag", *_OUSTER) or is_rosbag2(path)))
 
 
 def is_rosbag2(path: Path) -> bool:
-    """A .mcap or .db3 file, also a compressed one, or a folder with one or with the metadata of one."""
+    """Whether this is a .mcap or .db3 file, compressed or not, or a folder that contains one or its metadata."""
     files = [path] if path.is_file() else path.iterdir()
     return any(file.name.endswith((*STORAGES, *PACKED)) or file.name == "metadata.yaml" for file in files)
 
 
 def _is_kitti_raw(path: Path) -> bool:
-    """A drive, or the folder of a date; KITTI-360 has the same in data_3d_raw."""
+    """Whether this is a KITTI raw drive, or the folder of a date; KITTI-360 has the same layout in data_3d_raw."""
     if (path / "velodyne_points").is_dir():
         return path.parent.name != "data_3d_raw"
     return path.name != "data_3d_raw" and bool(drives_below(path, KITTI_RAW))
 
 
 def open_source(path: Path | str, settings: InputSettings | None = None) -> Source:
-    """Open whatever `path` is: a folder of KITTI odometry, raw, -360 or -CARLA or of PCD or PLY files, a bag, or what
-    an Ouster LiDAR has sent.
+    """Open a recording: a folder of KITTI odometry, raw, -360 or -CARLA, a folder of PCD or PLY files, a bag, or a
+    recording of an Ouster LiDAR.
 
     Raises:
-        UsageError: there is nothing, or nothing that can be read; the message says what was found.
+        UsageError: `path` does not exist or cannot be read; the message names what was found.
     """
     path, settings = Path(path), settings or InputSettings()
     if not path.exists():
@@ -68,8 +68,8 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.ouster import OusterSource
 
         return OusterSource(path, settings)
-    is_kitti = (path / "velodyne").is_dir() or (path / "sequences").is_dir()  # whatever lies beside the scans
-    # rosbags and its type store are slow to import, and of no use for a KITTI folder.
+    is_kitti = (path / "velodyne").is_dir() or (path / "sequences").is_dir()  # whatever else the folder contains
+    # rosbags and its type store are slow to import, and are not needed for a KITTI folder.
     if path.is_file() or (not is_kitti and is_rosbag2(path)):
         from dpm2_core.data.bags import BagSource
 

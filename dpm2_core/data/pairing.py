@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes with which cloud, of a recording as of topics. Pure rules: no ROS, no clock, no thread.
+"""Which messages are associated with which cloud, for recordings and live topics. Pure rules: no ROS, clock or thread.
 
-The cloud leads: every cloud leaves once, with that image, and that cloud of a second LiDAR, which is nearest in time of
-those that came before it left.
+The cloud leads: every cloud is released once. It is released with the image, and the cloud of a second LiDAR, that is
+nearest in time among the messages received before the release.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ import numpy as np
 from dpm2_core.data.messages import serialized_stamp
 
 JUMP = 1_000_000_000
-"""ns by which a stamp goes back, or ahead beyond the time that has passed, only if it is wrong or time itself has
-jumped: a looped bag, a clock that was set, a recording with a gap."""
+"""ns. A stamp that goes back, or ahead of the elapsed time, by more than this is wrong, or time itself has jumped: a
+looped bag, a clock that was set, a recording with a gap."""
 AHEAD = 3
-"""Periods of the LiDAR by which a stamp may exceed the last one and the time that has passed since; `JUMP` at most. If
-the stamp of one cloud is wrong by less than that, the next ones may have to catch up with it."""
+"""LiDAR periods by which a stamp may exceed the last stamp plus the time elapsed since then; `JUMP` at most. If the
+stamp of one cloud is wrong by less than that, the next ones may have to catch up with it."""
 FEW = 3
-"""Stamps in a row that may be off; more are of a clock that was set."""
+"""Largest number of consecutive stamps that may be wrong; more mean that the clock was set."""
 LATE = 500_000_000
-"""ns of log time that a cloud of a recording waits for what goes with it."""
+"""Longest time that a cloud of a recording is held back for other messages, ns of log time."""
 SWEEP = 250_000_000
-"""ns: so far beyond its stamp may the last point of a cloud be, up to which the IMU is wanted."""
+"""Longest time from a cloud's stamp to its last point, ns. IMU samples are needed up to that time."""
 BUFFER = 32
-"""Messages kept beside those that waiting clouds need; bounds memory where no cloud comes, or the stamps are of no use.
-"""
+"""Messages kept in addition to those that waiting clouds need. Bounds memory if no cloud arrives, or if stamps are
+unusable."""
 
 RawMessage = tuple[str, int, bytes]
 """Topic, log time (ns) and serialized message of a recording."""
 
 
 class Beside:
-    """Messages of one sensor beside the LiDAR that may belong to a cloud, in the order in which they came.
+    """Messages of one sensor other than the LiDAR that may be associated with a cloud, in the order received.
 
     Args:
-        tolerance: greatest difference of stamps that belong together, s.
+        tolerance: largest difference of associated stamps, s.
 
     Attributes:
-        last: stamp of the last one, ns.
+        last: stamp of the last message, ns.
     """
 
     def __init__(self, tolerance: float) -> None:
@@ -51,7 +51,7 @@ class Beside:
         self._messages: deque[tuple[int, Any]] = deque()
 
     def add(self, stamp: int, message: Any, waiting: Sequence[int] = ()) -> None:
-        """Take one with its stamp (ns); `waiting`: stamps (ns) of the clouds that have come, and not left."""
+        """Add a message with its stamp (ns); `waiting`: stamps (ns) of clouds that are not released yet."""
         self.last = stamp
         self._messages.append((stamp, message))
         if len(self._messages) > BUFFER:
@@ -62,25 +62,25 @@ class Beside:
                 del self._messages[int(others[0])]
 
     def nearest(self, stamp: int) -> tuple[int, Any] | None:
-        """Stamp (ns) and message for a cloud with that stamp (ns); None if none is within the tolerance."""
+        """Stamp (ns) and message nearest to a cloud's stamp (ns); None if none is within the tolerance."""
         found = min(self._messages, key=lambda message: abs(message[0] - stamp), default=None)
         return found if found is not None and abs(found[0] - stamp) <= self.tolerance else None
 
     def forget(self, stamp: int) -> None:
-        """A cloud with that stamp (ns) has left: drop what is too old for the next, or from before time went back."""
+        """Drop messages too old for the clouds after the released one (stamp in ns), or from before a jump back."""
         while self._messages and not -self.tolerance <= self._messages[0][0] - stamp < JUMP:
             self._messages.popleft()
 
 
 class SetBack:
-    """What has come with an earlier stamp than what came before, until it shows that the clock was set back: more than
-    `FEW` in a row, each stamped later than the one before."""
+    """Items with an earlier stamp than the item before, kept until they show that the clock was set back. That is so
+    after more than `FEW` in a row, each stamped later than the one before."""
 
     def __init__(self) -> None:
         self._late: list[tuple[int, Any]] = []
 
     def add(self, stamp: int, item: Any) -> list[Any]:
-        """Take one with its stamp (ns); returns all of them once they show that, else none."""
+        """Add an item with its stamp (ns); returns all kept items once the clock is known to be set back, else none."""
         if self._late and stamp <= self._late[-1][0]:
             self._late.clear()
         self._late.append((stamp, item))
@@ -89,18 +89,18 @@ class SetBack:
         return self.end()
 
     def end(self) -> list[Any]:
-        """One has come in order; returns what has come late before it."""
+        """Called when an item arrives in order; returns the late items received before it."""
         items, self._late = [item for _, item in self._late], []
         return items
 
 
 def is_due(passed: float, period: float) -> bool:
-    """Whether a cloud comes about one period after the last, when so much has passed (ns), whatever its stamp says."""
+    """Whether the time passed since the last cloud (ns) is about one period, whatever the cloud's stamp is."""
     return 0.5 * period < passed < 1.5 * period
 
 
 def passed(last: float, cloud: int) -> bool:
-    """Whether a sensor whose last message has that stamp (ns) has none to come that is nearer to the cloud's (ns)."""
+    """Whether a sensor with that last stamp (ns) will send no message closer to the cloud's stamp (ns)."""
     return cloud <= last < cloud + JUMP
 
 
@@ -110,13 +110,13 @@ def clouds_after_others(
     others: Mapping[str, int],
     waiting: deque[tuple[int, RawMessage]] | None = None,
 ) -> Iterator[RawMessage]:
-    """The messages of a recording, each cloud held back until every other sensor has passed it, or it has waited too
-    long.
+    """The messages of a recording; each cloud is held back until all other sensors have passed its stamp, or for `LATE`
+    at most.
 
     Args:
         messages: in recorded order.
-        clouds: topics. others: topics of the other sensors, with what is added to their stamps, ns.
-        waiting: where the clouds that are held back are kept, with their stamps (ns).
+        clouds: topics. others: topics of the other sensors, and the offset added to their stamps, ns.
+        waiting: filled with the clouds that are held back, and their stamps (ns).
     """
     latest = dict.fromkeys(others, -float("inf"))
     waiting = deque() if waiting is None else waiting

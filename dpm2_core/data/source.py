@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every loader offers: a drive as lazily read frames in time order."""
+"""The interface of every loader: a drive as frames in time order, read lazily."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame
 
 Span = tuple[int, int | None]
-"""Positions of the first frame and of the one after the last; None: to the end."""
+"""Position of the first frame, and of the one after the last; None: to the end."""
 
 
 class Source(Protocol):
     """A drive.
 
     Attributes:
-        name: what reports call it, such as "04" or the bag's file name.
-        notes: messages for the user, each once (a missing Tr, topics chosen), in words. Reading frames may add to it.
-        truth: what `poses` are read from, a file below the data set's root or a topic; empty without any.
+        name: name of the drive in reports, such as "04" or the bag's file name.
+        notes: messages for the user, each once (a missing Tr, the chosen topics). Reading frames may add some.
+        truth: origin of `poses`: a file, relative to the data set's root, or a topic; empty without ground truth.
     """
 
     name: str
@@ -35,12 +35,12 @@ class Source(Protocol):
 
     @property
     def poses(self) -> Array | None:
-        """(len, 4, 4) float64 T_world_lidar ground truth, one a frame, NaN where unknown; None without any."""
+        """(len, 4, 4) float64 T_world_lidar ground truth, one per frame, NaN where unknown; None without any."""
         ...
 
     @property
     def T_cam_lidar(self) -> Array | None:
-        """(4, 4) LiDAR to left camera 0 (KITTI's Tr), None when the calibration has none."""
+        """(4, 4) LiDAR to left camera 0 (KITTI's Tr); None if the calibration has none."""
         ...
 
     def __len__(self) -> int:
@@ -48,12 +48,12 @@ class Source(Protocol):
         ...
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position, read one at a time; an unreadable one comes with `problem` set."""
+        """Frames start..stop-1 by position, read one at a time; an unreadable frame has `problem` set."""
         ...
 
 
 class IndexedSource(ABC):
-    """A `Source` of frames that can be read in any order. What is None or empty here its kinds find, or do without."""
+    """A `Source` of frames that can be read in any order. Subclasses set the attributes that they have values for."""
 
     truth = ""
     poses: Array | None = None
@@ -67,32 +67,32 @@ class IndexedSource(ABC):
 
     @abstractmethod
     def frame(self, position: int) -> Frame:
-        """The frame at a position, the same whenever it is asked for; an unreadable one comes with `problem` set."""
+        """The frame at a position, the same at every call; an unreadable frame has `problem` set."""
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, read one at a time."""
         return map(self.frame, range(len(self))[start:stop])
 
     def _note_unposed(self, where: object, known: NDArray[np.bool_]) -> None:
-        """Say of how many frames there is no pose; `known` (len,)."""
+        """Add a note with the number of frames that have no pose; `known` (len,): which frames have one."""
         if not known.all():
             self.notes.append(f"{where}: {(~known).sum()} of {len(self)} frames have no pose")
 
 
 def frame_at(source: Source, position: int) -> Frame:
-    """The frame at a position of a drive; of a bag that reads all before it."""
+    """The frame at a position of a drive; for a bag this reads all frames before it."""
     return next(iter(source.frames(position, position + 1)))
 
 
 def note_once(notes: list[str], what: str, detail: str = "") -> None:
-    """Add to the notes of a drive what is to be said of it, with a detail, unless it is there with any."""
+    """Add a note to those of a drive, with a detail, unless a note that begins with `what` is there already."""
     if not any(note.startswith(what) for note in notes):
         notes.append(f"{what} ({detail})" if detail else what)
 
 
 def digest_of(source: Source) -> str:
-    """What a drive holds, in 16 characters: how many frames, their true poses, the calibration, and the points and
-    images of the first: more frames that were downloaded since, or another truth, make another one."""
+    """Digest of a drive, 16 characters: number of frames, true poses, calibration, and points and images of the first
+    frame. It changes if more frames are downloaded later, or if the ground truth is replaced."""
     poses, T = (b"" if array is None else array.tobytes() for array in (source.poses, source.T_cam_lidar))
     digest = hashlib.sha256(str(len(source)).encode() + poses + T)
     for frame in source.frames(0, 1):
@@ -106,7 +106,7 @@ def parse_range(text: str) -> Span:
     """`a:b`, `a:`, `:b` or `:` to (a, b or None).
 
     Raises:
-        UsageError: it is something else.
+        UsageError: the text has another form.
     """
     first, colon, last = text.partition(":")
     if not colon or not all(part.isdecimal() or not part for part in (first, last)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory files, KITTI and TUM, and which pose of one belongs to which of the other."""
+"""Trajectory files, KITTI and TUM, and the association of the poses of two trajectories."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from dpm2_core.geometry import se3
 
 Keys = NDArray[np.int64]
 
-_TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers a line
-_GAP = 1_000_000_000  # ns between two poses beyond which nothing is known in between
+_TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers per line
+_GAP = 1_000_000_000  # ns between two poses beyond which no pose is interpolated
 FRAME_PERIOD = 0.1
-"""Of KITTI's scans, s."""
-_SAME_TIME = 100_000  # ns between the stamps of one frame in two files: one of four decimals; 3 mm at 30 m/s
-_CLEARLY = 0.75  # one period to the other where the rates are not the same: a frame lost here and there, jitter
+"""Period of KITTI's scans, s."""
+_SAME_TIME = 100_000  # ns between the stamps of one frame in two files: a stamp with four decimals; 3 mm at 30 m/s
+_CLEARLY = 0.75  # ratio of two periods; below it the rates differ by more than single lost frames and jitter
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class Trajectory:
 
     Attributes:
         poses: (N, 4, 4) float64 T_world_sensor, m.
-        keys: (N,) int64: stamps in ns (TUM) or frame numbers (KITTI; the line number from 0 where no index is given).
-        kind: "tum", "kitti", or "kitti-indexed" where the first of 13 columns is the frame number.
+        keys: (N,) int64: stamps in ns (TUM) or frame numbers (KITTI; the line number from 0 if no index is given).
+        kind: "tum", "kitti", or "kitti-indexed" if the first of 13 columns is the frame number.
     """
 
     poses: Array
@@ -47,18 +47,18 @@ class Trajectory:
 
     @property
     def period(self) -> float:
-        """Median time from one pose to the next, s; that of KITTI's frames where there are no stamps."""
+        """Median time between consecutive poses, s; that of KITTI's frames if there are no stamps."""
         return frame_period(self.keys) if self.kind == "tum" else FRAME_PERIOD
 
 
 def write_kitti(path: Path | str, poses: Array) -> None:
-    """(N, 4, 4) poses as 12 numbers a line, row-major."""
+    """Write (N, 4, 4) poses as 12 numbers per line, row-major."""
     with atomic_write(path) as file:
         np.savetxt(file, np.asarray(poses, np.float64)[:, :3].reshape(-1, 12), "%.12e")
 
 
 def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> None:
-    """`stamp x y z qx qy qz qw` a line; stamps in ns become seconds with nine decimals, which a float loses."""
+    """Write `stamp x y z qx qy qz qw` per line; stamps in ns become seconds with nine decimals, which a float loses."""
     poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
     numbers = np.hstack([poses[:, :3, 3], se3.quaternion(poses)])
     with atomic_write(path) as file:
@@ -69,13 +69,13 @@ def write_tum(path: Path | str, stamps: Sequence[int] | Keys, poses: Array) -> N
 
 
 def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
-    """Read KITTI (12 numbers a line, or 13 with the frame number first), KITTI-360 (also 17) or TUM (8).
+    """Read KITTI (12 numbers per line, or 13 with the frame number first), KITTI-360 (also 17) or TUM (8).
 
     Args:
-        allow_empty: a file without a pose is a TUM trajectory of none.
+        allow_empty: a file without a pose is read as an empty TUM trajectory.
 
     Raises:
-        UsageError: no such file, or a line that is no pose; it names file and line.
+        UsageError: no such file, or a line that is not a pose; the message names file and line.
     """
     lines = [(number, line.split()) for number, line in enumerate(read_lines(Path(path), missing_ok=False), 1)]
     lines = [(number, fields) for number, fields in lines if fields and not fields[0].startswith("#")]
@@ -97,7 +97,7 @@ def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
     numbers = np.array(rows)
-    if columns == _KITTI_360:  # the frame number and all 16 of a 4 x 4 matrix
+    if columns == _KITTI_360:  # the frame number and all 16 numbers of a 4 x 4 matrix
         numbers, columns = numbers[:, :_KITTI_INDEXED], _KITTI_INDEXED
     poses, good = _poses(numbers, columns)
     if not good.all():
@@ -117,7 +117,7 @@ def _key(field: str, columns: int) -> int:
 
 
 def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
-    """(N, columns) numbers to (N, 4, 4) poses and which of them are finite rigid transforms."""
+    """(N, columns) numbers to (N, 4, 4) poses, and which of them are finite rigid transforms."""
     finite = np.logical_and.reduce(np.isfinite(rows), axis=1)
     rows = np.where(finite[:, None], rows, 0.0)
     if columns == _TUM:
@@ -127,26 +127,26 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
         return se3.make(Rotation.from_quat(quaternions).as_matrix(), rows[:, 1:4]), good
     matrices = rows[:, -12:].reshape(-1, 3, 4)
     R = matrices[:, :, :3]
-    # Published files hold 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.
+    # Published files have 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.
     skew = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2))
     return se3.make(R, matrices[:, :, 3]), finite & (skew < 0.01) & (np.linalg.det(R) > 0)
 
 
 def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
-    """Ground truth and estimate (N, 4, 4) of the same frames, NaN where either has none, and the keys (N,) of these:
-    stamps, ns, where one of the two is TUM, else frame numbers.
+    """Ground truth and estimate (N, 4, 4) of the same frames, NaN where either has none, and their keys (N,): stamps,
+    ns, if one of the two is TUM, else frame numbers.
 
-    If both are TUM and their stamps are not the same, one is interpolated: the ground truth at the stamps of the
-    estimate, or the estimate where the ground truth is clearly slower. Else by stamp, by frame number if one carries it
-    and the other has a line for each number, else line by line.
+    If both are TUM and their stamps differ, one is interpolated: the ground truth at the stamps of the estimate, or the
+    estimate if the ground truth has a clearly lower rate. Else poses are associated by stamp, by frame number if one
+    has it and the other has a line for each number, else line by line.
 
     Raises:
-        UsageError: nothing says which pose belongs to which, or none belong together.
+        UsageError: the association of the poses is not defined, or no poses match.
     """
     stamped = gt.kind == est.kind == "tum"
     numbered = "tum" not in (gt.kind, est.kind) and "kitti-indexed" in (gt.kind, est.kind)
     for lines, other in ((est, gt), (gt, est)):
-        if numbered and lines.kind == "kitti" and len(lines) <= other.keys.max():  # of some frames: no line is a number
+        if numbered and lines.kind == "kitti" and len(lines) <= other.keys.max():  # only some frames: no line numbers
             numbered = False
     if not stamped and not numbered:
         if len(gt) == len(est):
@@ -167,8 +167,8 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
 
 
 def placed(trajectory: Trajectory, keys: Keys) -> Array:
-    """Poses (N, 4, 4) at `keys` (N,), NaN where there is none of that frame number, or of a stamp nearer than a quarter
-    of a period: one that differs by more than its rounding, as of another clock, is moved along the way to the next."""
+    """Poses (N, 4, 4) at `keys` (N,); NaN if there is none with that frame number, or with a stamp within a quarter of
+    a period. A pose whose stamp differs by more than rounding, as from another clock, is moved along the trajectory."""
     trajectory = _ordered(trajectory)
     rows, apart = _nearest(trajectory.keys, keys)
     near = apart <= (_SAME_TIME if trajectory.kind == "tum" else 0)
@@ -177,7 +177,7 @@ def placed(trajectory: Trajectory, keys: Keys) -> Array:
     if trajectory.kind == "tum" and len(trajectory) > 1:
         beside = ~near & (apart < 0.25e9 * min(trajectory.period, frame_period(np.sort(keys))))
         left = np.clip(np.searchsorted(trajectory.keys, keys[beside]) - 1, 0, len(trajectory) - 2)
-        gap = trajectory.keys[left + 1] - trajectory.keys[left] > _GAP  # beside one: the way on its other side
+        gap = trajectory.keys[left + 1] - trajectory.keys[left] > _GAP  # next to a gap: use the segment before or after
         left = np.where(gap, np.clip(2 * rows[beside] - left - 1, 0, len(trajectory) - 2), left)
         begin, end = trajectory.keys[left], trajectory.keys[left + 1]
         part = (keys[beside] - begin) / (end - begin)
@@ -186,20 +186,20 @@ def placed(trajectory: Trajectory, keys: Keys) -> Array:
 
 
 def same_stamps(a: Keys, b: Keys) -> bool:
-    """Whether (N,) and (M,) stamps, ns, are those of the same frames: most of the fewer are among the others."""
+    """Whether (N,) and (M,) stamps, ns, are of the same frames: most of the smaller set are also in the other."""
     few, many = sorted((np.unique(a), np.unique(b)), key=len)
     return bool(2 * np.count_nonzero(_nearest(many, few)[1] <= _SAME_TIME) > len(few))
 
 
 def _ordered(trajectory: Trajectory) -> Trajectory:
-    """Ascending keys, of equal ones (a loop) the first."""
+    """The trajectory with ascending keys; of equal keys (a loop) the first is kept."""
     keys, first = np.unique(trajectory.keys, return_index=True)
     return Trajectory(trajectory.poses[first], keys, trajectory.kind)
 
 
 def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
-    """Both at the stamps of the estimate, or of the ground truth where that is clearly slower: a second of a bend, of
-    which nothing is known in between, is no line."""
+    """Both at the stamps of the estimate, or of the ground truth if that has a clearly lower rate: interpolating across
+    a second of a curve would be inaccurate."""
     at = gt.keys if est.period < _CLEARLY * gt.period else est.keys
     true, estimated = (interpolate(each.keys, each.poses, at) for each in (gt, est))
     if not np.isfinite(true + estimated).any():
@@ -211,8 +211,8 @@ def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
 
 
 def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
-    """Poses (M, 4, 4) known at `stamps` (M,) ns to `at` (N,): exact where known, else along the screw between the
-    neighbors; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
+    """Interpolate poses (M, 4, 4) with `stamps` (M,) ns at the times `at` (N,): exact at a stamp, else along the screw
+    motion between the neighbors; NaN outside and in gaps beyond 1 s. Returns (N, 4, 4)."""
     out = np.full((len(at), 4, 4), np.nan)
     stamps, order = np.unique(stamps, return_index=True)
     if not len(stamps):
@@ -230,22 +230,22 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
 
 
 def stamps_of(numbers: Keys) -> Keys:
-    """Stamps (N,) ns of KITTI's frames of these numbers (N,)."""
+    """Stamps (N,) ns of KITTI frames with these numbers (N,)."""
     return numbers * round(FRAME_PERIOD * 1e9)
 
 
 def arc_lengths(positions: Array) -> Array:
-    """(N,) m along a line of positions (N, 2+), from its first."""
+    """(N,) m: distance travelled along positions (N, 2+), from the first one."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
 
 
 def frame_period(stamps: Keys | Sequence[int]) -> float:
-    """Median time from one of these stamps (N,) ns to the next, s; that of KITTI's frames where there are too few."""
+    """Median time between consecutive stamps (N,) ns, s; the period of KITTI's frames if there are too few."""
     return float(np.median(np.diff(np.asarray(stamps)))) * 1e-9 if len(stamps) > 1 else FRAME_PERIOD
 
 
 def _nearest(keys: Keys, requested: Keys) -> tuple[NDArray[np.intp], Keys]:
-    """Row of the nearest of ascending `keys` for each wanted one, and how far it is."""
+    """Index of the nearest of ascending `keys` for each requested one, and its distance."""
     right = np.clip(np.searchsorted(keys, requested), 0, len(keys) - 1)
     left = np.maximum(right - 1, 0)
     rows = np.where(np.abs(keys[left] - requested) <= np.abs(keys[right] - requested), left, right)
