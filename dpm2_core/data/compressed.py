@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JPEG and PNG, whose size is read from their first bytes before anything is decoded: 100 kB can be 3 GB of pixels."""
+"""Decodes JPEG and PNG. The size is read from the header first: 100 kB of data can decode to 3 GB of pixels."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 26
-"""Of an image whose camera is not known: 67 million."""
+"""Limit for an image whose camera is not known: 67 million."""
 _SENSOR_BITS = (10, 12, 14, 16)
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that give the size
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that contain the size
 _SCAN, _END = b"\xff\xda", b"\xff\xd9"  # both are escaped within the data of a scan
-_BARE = {0x01, *range(0xD0, 0xD8)}  # and those without a length
+_BARE = {0x01, *range(0xD0, 0xD8)}  # segments without a length
 
 
 def compressed_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a JPEG or PNG; None for anything else, and where it is cut off before them."""
+    """Width and height of a JPEG or PNG; None for other formats, and if the data is cut off before the size."""
     if data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) >= 24:
         width, height = struct.unpack_from(">II", data, 16)
         return int(width), int(height)
@@ -30,7 +30,7 @@ def compressed_size(data: bytes) -> tuple[int, int] | None:
         if kind in _FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
             return int(width), int(height)
-        if kind == 0xFF:  # filling
+        if kind == 0xFF:  # fill byte
             at += 1
         else:
             at += 2 + (0 if kind in _BARE else struct.unpack_from(">H", data, at + 2)[0])
@@ -41,7 +41,7 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
     """A JPEG or PNG to (H, W, 3) uint8 RGB.
 
     Args:
-        size: width and height that it must have; None takes any up to `MAX_PIXELS`.
+        size: required width and height; None accepts any size up to `MAX_PIXELS`.
 
     Raises:
         ValueError: another format, another size, too large, or damaged.
@@ -53,7 +53,7 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
         raise ValueError(f"{found[0]} x {found[1]} pixels, the camera has {size[0]} x {size[1]}")
     if not 0 < found[0] * found[1] <= MAX_PIXELS:
         raise ValueError(f"{found[0]} x {found[1]} pixels, at most {MAX_PIXELS} are decoded")
-    if data.startswith(_JPEG) and data.rfind(_END) < data.rfind(_SCAN):  # OpenCV 4 makes the rest of it gray
+    if data.startswith(_JPEG) and data.rfind(_END) < data.rfind(_SCAN):  # OpenCV 4 fills the missing part with gray
         raise ValueError("cut off")
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
@@ -68,6 +68,6 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
 
 
 def upper_eight(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Of the bits that an image uses: a camera of 10, 12 or 14 leaves the upper ones of its 16 zero."""
+    """The upper 8 of the bits in use: a camera of 10, 12 or 14 bits leaves the upper bits of its 16 zero."""
     used = int(pixels.max()).bit_length()
     return (pixels >> (next(bits for bits in _SENSOR_BITS if used <= bits) - 8)).astype(np.uint8)

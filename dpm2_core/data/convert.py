@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any recording as a rosbag2 MCAP recording that `ros2 bag play`, Foxglove and dpm2 read alike."""
+"""Converts any recording to a rosbag2 MCAP recording, readable by `ros2 bag play`, Foxglove and dpm2."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from dpm2_core.frame import Array, Frame, Image, Inertial
 from dpm2_core.geometry import se3
 
 EPOCH_NS = 1_316_995_200_000_000_000
-"""Added to stamps that are no times since 1970, as KITTI's: 26 September 2011, its first day. ROS takes a stamp near 0
-for none."""
+"""Added to stamps that are no times since 1970, such as KITTI's: 26 September 2011, its first day. ROS takes a stamp
+near 0 for a missing one."""
 _EARLIEST = 10**17  # ns, in 1973
-_PERIOD = 100_000_000  # ns, between two clouds where the clock was set
+_PERIOD = 100_000_000  # ns, between the two clouds before and after the clock was set
 
-# The odometry set has no such calibration: kitti2bag's base_link, the middle of the wheelbase at ground level.
+# The odometry data set has no such calibration: kitti2bag's base_link, at mid-wheelbase and ground level.
 _T_BASE_LIDAR = se3.make(np.eye(3), [-0.59, 0.0, 1.73])
 
 
@@ -43,25 +43,25 @@ def convert(
     overwrite: bool = False,
     progress: Advance = untold,
 ) -> list[str]:
-    """Write frames of a drive to the new folder `out`; it appears whole or not at all.
+    """Write frames of a drive to the new folder `out`, which appears complete or not at all.
 
-    KITTI odometry has the topics and frames of kitti2bag, which the nodes listen to without being told; its points are
-    written as they are, and the vertical angle correction that they need is recorded beside them. Other drives have
-    those of `naming.OTHER`.
+    KITTI odometry is written with the topics and frames of kitti2bag, which are the nodes' defaults. Its points are
+    written unchanged; the vertical angle correction that they need is recorded on its own topic. Other drives have the
+    names in `naming.OTHER`.
 
     Args:
-        source: with its images, as rgb8.
-        frames: positions of the first and of the one to stop before.
+        source: drive to convert, with its images, as rgb8.
+        frames: position of the first frame, and of the one after the last.
         zstd: compress the chunks of the file.
         overwrite: replace a bag at `out`.
-        progress: called with frames written and frames in all.
+        progress: called with the number of frames written and the total.
 
     Returns:
-        What the user should know, in words.
+        Notes for the user, in words.
 
     Raises:
-        UsageError: no such frames, or `out` is taken.
-        Dpm2Error: it could not be written (disk full); nothing is left behind.
+        UsageError: no such frames, or `out` exists and may not be replaced.
+        Dpm2Error: it could not be written (disk full); nothing incomplete remains.
     """
     start, end = frames
     positions = range(len(source))[start:end]
@@ -69,7 +69,7 @@ def convert(
         raise UsageError(f"{source.name}: no frames {start}:{'' if end is None else end}; it has {len(source)}")
     _check_place(out.resolve(), overwrite)
     with new_folder(out, replace=True) as part:
-        folder = part / out.resolve().name  # the recording's file carries the folder's name
+        folder = part / out.resolve().name  # the file in a recording is named after the folder
         writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         if zstd:
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -95,20 +95,20 @@ class _Bag:
         self._connections: dict[str, Any] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._first: int | None = None  # ns
-        self._last = 0  # ns, when the last cloud would have been recorded at its stamp
-        self._later = self._shift = 0  # ns, added to stamps, and besides to the times of recording
-        self._recorded: dict[str, int] = {}  # ns, of the last message of each topic
+        self._last = 0  # ns, time of recording of the last cloud, if recorded at its stamp
+        self._later = self._shift = 0  # ns: added to stamps; and added to times of recording in addition
+        self._recorded: dict[str, int] = {}  # ns, time of recording of the last message of each topic
         self._names = naming.OTHER
         self._correction_deg: float | None = None
         self._links: dict[str, tuple[str, Array]] = {}  # frame to its parent and T_parent_frame
-        camera = getattr(source, "camera", None)  # the first one, also where its images come late
+        camera = getattr(source, "camera", None)  # stays the first one even if its images start late
         self._cameras: list[str] = [] if camera is None else [camera.name]
         self._path: list[tuple[int, Array]] = []
         self._R_lidar_imu = np.eye(3)
         T_base_lidar = getattr(source, "T_base_lidar", None)
         if isinstance(source, KittiSource):
             self.source = copy(source)
-            self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by who reads
+            self.source.vertical_angle_correction_deg = 0.0  # recorded here, applied by the reader
             self._names, self._correction_deg = naming.KITTI, source.vertical_angle_correction_deg
             self._R_lidar_imu = source.R_lidar_imu
             T_base_lidar = _T_BASE_LIDAR
@@ -118,8 +118,8 @@ class _Bag:
             self._links[naming.GRAY_CAMERA] = (self._names.lidar, se3.inverse(source.T_cam_lidar))
 
     def write(self, frame: Frame, position: int) -> None:
-        """IMU, fix and image first: who waits for the cloud then has them already. The cloud is recorded when its last
-        point was measured, as drivers send it: who plays the bag has the samples of the sweep by then."""
+        """Write a frame. IMU, fix and image come first, so that a reader has them when it receives the cloud. The cloud
+        is recorded at the time of its last point, as drivers send it: the IMU samples of the sweep come before it."""
         stamp = self._begin(frame)
         self._link(stamp, frame)
         if frame.imu is not None:
@@ -135,18 +135,18 @@ class _Bag:
             self._path.append((stamp, T))
             self._put(f"{self._names.truth}/odom", stamp, bag_messages.odometry(stamp, self._names.lidar, T))
         points, end = self._names.points, stamp + min(last_point(frame.time_offset), SWEEP)
-        end = max(end, self._recorded.get(points, end) - self._shift)  # in their order, whatever a point says
+        end = max(end, self._recorded.get(points, end) - self._shift)  # keeps the clouds' order, whatever the times are
         self._put(points, end, bag_messages.cloud(stamp, self._names.lidar, frame))
 
     def write_path(self) -> None:
-        """In the place of the first message, where players look for it."""
+        """Write the path at the time of the first message, where players look for it."""
         if self._first is not None and self.source.poses is not None:
             path = bag_messages.path(self._first, self._path)
             self._put(f"{self._names.truth}/path", self._first, path, latched=True)
 
     def _begin(self, frame: Frame) -> int:
-        """The stamp to write, ns. Readers go by the time of recording, which goes on evenly where the clock was set."""
-        self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0  # of each, since a clock may be set during a drive
+        """The stamp to write, ns. Readers use the time of recording, which continues evenly where the clock was set."""
+        self._later = EPOCH_NS if frame.stamp < _EARLIEST else 0  # per frame: a clock may be set during a drive
         stamp = frame.stamp + self._later
         if self._first is None:
             self._first = self._last = stamp
@@ -155,18 +155,18 @@ class _Bag:
                 self._put(naming.VERTICAL_ANGLE_CORRECTION, stamp, correction, latched=True)
         if frame.stepped or stamp + self._shift < self._last:
             self._shift = self._last + _PERIOD - stamp
-            if frame.imu and naming.IMU in self._recorded:  # the sweep may take longer than that
+            if frame.imu and naming.IMU in self._recorded:  # the sweep may be longer than _PERIOD
                 first = int(frame.imu.stamps[0]) + self._later
                 self._shift = max(self._shift, self._recorded[naming.IMU] + 1 - first)
         self._last = stamp + self._shift
         return stamp
 
     def _is_new(self, topic: str, stamp: int) -> bool:
-        """Whether a message is newer than the last of its topic: frames may share what came between them."""
+        """Whether a message is newer than the last one on its topic: frames may share messages."""
         return topic not in self._recorded or stamp + self._shift > self._recorded[topic]
 
     def _link(self, stamp: int, frame: Frame) -> None:
-        """All frames so far, where there is a new one: who comes late is sent the last message alone."""
+        """Write all transforms again if there is a new one: late subscribers receive only the last message."""
         links, lidar = dict(self._links), self._names.lidar
         for image in frame.images:
             if image.camera.name not in self._cameras:
@@ -181,7 +181,7 @@ class _Bag:
             self._put(naming.TF_STATIC, stamp, bag_messages.transforms(stamp, links), latched=True)
 
     def _number(self, image: Image) -> str:
-        """Of its camera, behind its name."""
+        """Suffix of the names of its camera."""
         number = self._cameras.index(image.camera.name)
         return f"_{number + 1}" if number else ""
 
@@ -195,7 +195,7 @@ class _Bag:
             self._put(f"{topic}/image_raw", stamp, bag_messages.image(stamp, frame, image.pixels))
 
     def _write_imu(self, imu: Inertial) -> None:
-        R = self._R_lidar_imu  # back along its own axes
+        R = self._R_lidar_imu  # rotates back into the IMU frame
         for time, rates, forces in zip(imu.stamps.tolist(), imu.rates @ R, imu.forces @ R, strict=True):
             if self._is_new(naming.IMU, time + self._later):
                 self._put(naming.IMU, time + self._later, bag_messages.imu(time + self._later, rates, forces))
@@ -211,7 +211,7 @@ class _Bag:
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
-    """Raise UsageError where no recording can be written, or what is there is not to be replaced."""
+    """Raise UsageError if no recording can be written to `out`, or if existing data there must not be replaced."""
     if out.suffix in (".mcap", ".db3", ".bag"):
         raise UsageError(f"{out}: a rosbag2 recording is a folder; leave out the {out.suffix}")
     if out.exists() and not (overwrite and (out / "metadata.yaml").is_file()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive with failing sensors, for experiments: the same failures for the same seed, whatever else is corrupted."""
+"""A drive with simulated sensor failures. A seed always gives the same failures, whatever else is corrupted."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Ratio = Annotated[float, Field(ge=0, le=1)]
 
 
 class CorruptionSettings(Settings):
-    """What fails, and how often. The frames hit at a fraction of 0.3 are among those hit at 0.5 with the same seed."""
+    """Failures and their rates. With one seed, the frames hit at a fraction of 0.3 are among those hit at 0.5."""
 
     seed: int = Field(0, ge=0)
-    """Of everything random."""
+    """Seed of all random numbers."""
     camera: Ratio = 0.0
     """Fraction of frames with black images."""
     no_image: Ratio = 0.0
@@ -36,27 +36,28 @@ class CorruptionSettings(Settings):
     underexposed: Ratio = 0.0
     """Fraction of frames whose images are too dark."""
     stops: float = Field(3.0, ge=0, le=16)
-    """By how much: each stop doubles or halves the light."""
+    """Over- and underexposure in stops: each stop doubles or halves the light."""
     obstruction: Ratio = 0.0
-    """Fraction of frames in which a random box near the LiDAR hides all that is behind it."""
+    """Fraction of frames in which a random box near the LiDAR occludes everything behind it."""
     beams: Ratio = 0.0
-    """Fraction of the LiDAR's beams that are dead all the time; a beam is a band of 0.4 deg of elevation."""
+    """Fraction of the LiDAR's beams that are always dead; a beam is a band of 0.4 deg of elevation."""
     dust: Ratio = 0.0
-    """Fraction of pulses that return from the air within 6 m, if from nothing before (fog, dust, smoke, snow)."""
+    """Fraction of pulses that return from the air within 6 m, unless an object is closer (fog, dust, smoke, snow)."""
     sight: float | None = Field(None, gt=0)
     """Returns from farther away are lost, m."""
     extrinsic_deg: float = Field(0.0, ge=0, le=180)
-    """The calibration of every camera is turned by that much about a random axis, degrees."""
+    """Rotation error of every camera's extrinsics, about a random axis, degrees."""
     extrinsic_m: float = Field(0.0, ge=0)
-    """And shifted by that much in a random direction, m."""
+    """Translation error of every camera's extrinsics, in a random direction, m."""
     time_offset: float = Field(0.0, ge=0)
-    """Images come late: a frame has those of the last frame at least that old, s; none while there is none."""
+    """Delay of images: a frame has the images of the last frame at least this old, s; none if there is no such frame.
+    """
 
 
 _BAND = np.radians(0.4)  # the spacing of an HDL-64
 _OF_FRAMES = ("camera", "no_image", "overexposed", "underexposed", "obstruction")
-_STREAMS = (*_OF_FRAMES, "beams", "extrinsic", "box", "dust")  # of random numbers, so that none changes another
-_DUSTY = (0.4, 6.0)  # m, evenly along a pulse
+_STREAMS = (*_OF_FRAMES, "beams", "extrinsic", "box", "dust")  # independent streams of random numbers
+_DUSTY = (0.4, 6.0)  # m, uniform along a pulse
 
 
 class Box(NamedTuple):
@@ -67,7 +68,7 @@ class Box(NamedTuple):
 
 
 def random_box(rng: np.random.Generator) -> Box:
-    """A box of 0.5 to 3 m an edge at any angle, its surface at least 0.5 m and its center at most 8.1 m away."""
+    """A box with edges of 0.5 to 3 m at any angle, its surface at least 0.5 m and its center at most 8.1 m away."""
     half = rng.uniform(0.25, 1.5, 3)
     distance = np.linalg.norm(half) + rng.uniform(0.5, 5.5)
     azimuth, elevation = rng.uniform(-np.pi, np.pi), rng.uniform(-0.3, 0.1)
@@ -76,7 +77,7 @@ def random_box(rng: np.random.Generator) -> Box:
 
 
 def hidden_by(box: Box, points: Points) -> NDArray[np.bool_]:
-    """Which of (N, 3+) points in the LiDAR frame cannot be seen from the origin because the box is in the way.
+    """Which of (N, 3+) points in the LiDAR frame are occluded by the box, seen from the origin.
 
     That is, the segment from the origin to the point meets the box (A. Kay, J. Kajiya, "Ray tracing complex scenes",
     SIGGRAPH 1986: slabs). False for NaN.
@@ -92,9 +93,9 @@ def hidden_by(box: Box, points: Points) -> NDArray[np.bool_]:
 
 
 def in_dust(points: Points, fraction: float, rng: np.random.Generator) -> Points:
-    """(N, 4) in the LiDAR frame, of which that fraction returns from the air, if from nothing before; intensities stay.
+    """(N, 4) in the LiDAR frame; that fraction returns from the air unless an object is closer. Intensities stay.
 
-    The points that a fraction of 0.3 moves are among those that one of 0.5 moves.
+    The points moved at a fraction of 0.3 are among those moved at 0.5.
     """
     away = np.linalg.norm(points[:, :3], axis=1)
     chance, at = rng.random(len(points)), rng.uniform(*_DUSTY, len(points))
@@ -105,13 +106,13 @@ def in_dust(points: Points, fraction: float, rng: np.random.Generator) -> Points
 
 
 def in_fog(points: Points, dust: float, sight: float, rng: np.random.Generator) -> tuple[Points, NDArray[np.bool_]]:
-    """(N, 4) in dust, see `in_dust`, and which of them (N,) are within `sight`, m, or no measurement."""
+    """(N, 4) in dust, see `in_dust`, and which of them (N,) are within `sight`, m, or are no measurement."""
     points = in_dust(points, dust, rng) if dust else points
     return points, ~(np.linalg.norm(points[:, :3], axis=1) > sight)
 
 
 class CorruptedSource:
-    """A `Source` whose frames are corrupted as they are read; poses and calibration in files stay true."""
+    """A `Source` whose frames are corrupted as they are read; its poses and calibration stay correct."""
 
     def __init__(self, source: Source, settings: CorruptionSettings) -> None:
         self._source = source
@@ -138,10 +139,10 @@ class CorruptedSource:
         return len(self._source)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """The frames start..stop-1, the same ones whether or not those before are read."""
+        """Frames start..stop-1; they do not depend on whether the frames before are read."""
         late = self._settings.time_offset
         before: deque[Frame] = deque()
-        first = max(0, start - int(np.ceil(late * 20)))  # at 5 Hz or more as many as the images are late
+        first = max(0, start - int(np.ceil(late * 20)))  # enough frames for the delay, at up to 20 Hz
         for position, frame in enumerate(self._source.frames(first, stop), first):
             before.append(frame)
             while len(before) > 1 and frame.stamp - before[1].stamp >= round(late * 1e9):
@@ -171,7 +172,7 @@ class CorruptedSource:
 
     @staticmethod
     def _bands(points: Points) -> NDArray[np.intp]:
-        """(N,) number of the beam, by elevation; points that are no measurement count as level."""
+        """(N,) number of the beam, by elevation; points that are no measurement count as horizontal."""
         x, y, z = points[:, :3].T
         with np.errstate(invalid="ignore", over="ignore"):
             elevation = np.arctan2(z, np.hypot(x, y))
@@ -190,7 +191,7 @@ class CorruptedSource:
 
 
 def exposed(pixels: NDArray[np.uint8], stops: float) -> NDArray[np.uint8]:
-    """Pixels under 2**stops times the light, at a gamma of 2.2, clipped."""
+    """Pixels with 2**stops times the light, at a gamma of 2.2, clipped."""
     table = np.arange(256) * 2 ** (stops / 2.2)
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[pixels]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CustomMsg of Livox' drivers without their packages: its serialized points are those of a PointCloud2.
+"""CustomMsg of Livox' drivers without their packages: its serialized points have the layout of a PointCloud2.
 
-livox_ros_driver2/msg/CustomMsg.msg and CustomPoint.msg, and those of livox_ros_driver, which are alike:
+livox_ros_driver2/msg/CustomMsg.msg and CustomPoint.msg, and the identical ones of livox_ros_driver:
 
     std_msgs/Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points
     CustomPoint: uint32 offset_time (ns); float32 x, y, z (m); uint8 reflectivity, tag, line
@@ -18,18 +18,18 @@ import numpy as np
 from dpm2_core.data.messages import MessageError
 
 LIVOX = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
-"""Types of messages."""
+"""Message types."""
 
-_POINT, _STEP = 19, 20  # bytes of a point, and from one to the next where ROS 2 aligns them
+_POINT, _STEP = 19, 20  # bytes of a point, and from one point to the next as ROS 2 aligns them
 _FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7), ("reflectivity", 16, 2), ("tag", 17, 2),
            ("line", 18, 2))  # fmt: skip
 
 
 def cloud_of_custom(data: bytes | memoryview) -> Any:
-    """A CustomMsg, serialized (CDR), as a sensor_msgs/PointCloud2: header, layout, and the bytes of its points.
+    """A serialized CustomMsg (CDR) as a sensor_msgs/PointCloud2: header, layout, and the bytes of its points.
 
     Raises:
-        MessageError: it ends before its points do, or is no such message.
+        MessageError: the data ends before its points do, or is no such message.
     """
     data = bytes(data)
     try:
@@ -55,10 +55,10 @@ def cloud_of_custom(data: bytes | memoryview) -> Any:
 
 
 def custom_of_ros1(data: bytes | memoryview) -> bytes:
-    """A CustomMsg as ROS 1 serializes it, without gaps, to one of ROS 2 (CDR).
+    """Convert a CustomMsg from ROS 1's serialization, which has no padding, to ROS 2's (CDR).
 
     Raises:
-        struct.error, ValueError: it ends before its points do.
+        struct.error, ValueError: the data ends before its points do.
     """
     _, sec, nanosec, length = struct.unpack_from("<IIII", data)
     frame, at = bytes(data[16 : 16 + length]) + b"\0", 16 + length

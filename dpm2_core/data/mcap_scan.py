@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of an MCAP file from its start on, without the index at its end, which may lack some or be cut off."""
+"""Reads an MCAP file from its start, without the index at its end, which may be incomplete or missing."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class McapMessage(NamedTuple):
     """A message of a file.
 
     Attributes:
-        kind: its type as ROS 2 writes it, such as sensor_msgs/msg/PointCloud2; empty where there is no schema.
-        ros1: whether `data` is serialized as ROS 1 does.
-        time: of recording, ns.
+        kind: its type in ROS 2's notation, such as sensor_msgs/msg/PointCloud2; empty without a schema.
+        ros1: whether `data` is in ROS 1's serialization.
+        time: time of recording, ns.
     """
 
     topic: str
@@ -32,7 +32,7 @@ class McapMessage(NamedTuple):
 
 
 def scanned_messages(file: Path) -> Iterator[McapMessage]:
-    """All messages in the order of the file.
+    """All messages in file order.
 
     Raises:
         Exception: the file is cut or damaged; anything from EOFError to the decompressor's own errors.
@@ -52,7 +52,7 @@ def scanned_messages(file: Path) -> Iterator[McapMessage]:
 
 
 def by_log_time(messages: Iterable[McapMessage]) -> Iterator[McapMessage]:
-    """Messages in order of log time; one that stands more than 0.5 s too late in the file comes late."""
+    """Messages in order of log time; a message more than 0.5 s too late in the file is returned late."""
     held, latest = list[tuple[int, int, McapMessage]](), 0
     for number, message in enumerate(messages):
         heappush(held, (message.time, number, message))
@@ -64,7 +64,7 @@ def by_log_time(messages: Iterable[McapMessage]) -> Iterator[McapMessage]:
 
 
 class _WholeReads(BufferedReader):
-    """The mcap package takes a short read at the end of the file for the whole record."""
+    """Raises EOFError for a short read at the end of the file, which the mcap package takes for a whole record."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)

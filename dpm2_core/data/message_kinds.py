@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types of the messages that a bag is read for. Apart: a player knows them without the loops that read the messages."""
+"""Message types read from a bag. In a module of its own, so that a player can import them without the readers."""
 
 from __future__ import annotations
 

@@ -17,13 +17,13 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import new_folder
 from dpm2_core.frame import Array, Camera, Image
 
-QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times as much
+QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times larger
 FORMAT = 1
 _VIEWS = ("pixels", "K", "T_lidar_cam")  # files of a drive with images
 
 
 class Sample(NamedTuple):
-    """One frame: cloud (N, 3) float32 m, cropped; T_world_lidar (4, 4); images."""
+    """One frame: cloud (N, 3) float32, m, cropped; T_world_lidar (4, 4); images."""
 
     cloud: NDArray[np.float32]
     pose: Array
@@ -31,12 +31,12 @@ class Sample(NamedTuple):
 
 
 class PackedWriter:
-    """Writes a drive frame by frame: what is in memory does not grow with it but for poses and calibration."""
+    """Writes a drive frame by frame; only poses and calibration are kept in memory until the end."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder`: an empty one, see `packed_writer`."""
+        """`folder`: an empty folder, see `packed_writer`."""
         self.folder = folder
-        self.images: int | None = None  # of each frame, once there is one
+        self.images: int | None = None  # per frame, once there is a frame
         self._offsets, self._poses = [0], list[Array]()
         self._K, self._T_lidar_cam = list[list[Array]](), list[list[Array]]()
         self._files: dict[str, _GrowingArray] = {}
@@ -45,10 +45,10 @@ class PackedWriter:
         return len(self._poses)
 
     def add(self, sample: Sample) -> None:
-        """The next frame.
+        """Add the next frame.
 
         Raises:
-            UsageError: it has more or fewer images, or of another size, than those before.
+            UsageError: it has another number of images than the frames before, or images of another size.
         """
         pixels = np.array([image.pixels for image in sample.images], np.uint8)
         if self.images is None:
@@ -70,7 +70,7 @@ class PackedWriter:
             self._T_lidar_cam.append([image.camera.T_lidar_cam for image in sample.images])
 
     def finish(self, about: dict[str, object]) -> None:
-        """The drive is complete; `about` says where it is from."""
+        """Complete the drive; `about` describes its origin."""
         for file in self._files.values():
             file.close()
         np.save(self.folder / "offsets.npy", np.array(self._offsets))
@@ -81,15 +81,15 @@ class PackedWriter:
         (self.folder / "about.json").write_text(json.dumps({"format": FORMAT, **about}, indent=1))
 
     def close(self) -> None:
-        """Whether or not the drive is complete."""
+        """Close the files, whether or not the drive is complete."""
         for file in self._files.values():
-            with suppress(OSError):  # a full disk: what is left is removed
+            with suppress(OSError):  # a full disk: the incomplete folder is removed
                 file.close()
 
 
 @contextmanager
 def packed_writer(folder: Path) -> Iterator[PackedWriter]:
-    """A writer whose folder appears when the block ends well; a killed run leaves nothing that looks whole.
+    """A writer whose folder appears only when the block ends without error; a killed run leaves no incomplete drive.
 
     Raises:
         Dpm2Error: files could not be written.
@@ -103,7 +103,7 @@ def packed_writer(folder: Path) -> Iterator[PackedWriter]:
 
 
 class _GrowingArray:
-    """A .npy file whose first axis grows: numpy leaves room for it in the header."""
+    """A .npy file whose first axis grows: numpy reserves space for it in the header."""
 
     def __init__(self, path: Path, dtype: type, row: tuple[int, ...]) -> None:
         self.row, self._dtype, self._count = row, np.dtype(dtype), 0
@@ -111,12 +111,12 @@ class _GrowingArray:
         self._header()
 
     def append(self, rows: NDArray) -> None:
-        """(n, *row) more."""
+        """Append (n, *row) rows."""
         np.ascontiguousarray(rows, self._dtype).tofile(self._file)
         self._count += len(rows)
 
     def close(self) -> None:
-        """Write how many there are; nothing, the second time."""
+        """Write the number of rows and close the file; a second call does nothing."""
         if not self._file.closed:
             self._file.seek(0)
             self._header()
@@ -140,11 +140,11 @@ class PackedDrive:
     """A packed drive, opened lazily: `poses` (n, 4, 4) in memory, the rest memory-mapped.
 
     Attributes:
-        has_images: whether its frames have some. image_size: height and width of these, pixels; None without.
-        preset: of the synthetic city; empty where it is from elsewhere.
+        has_images: whether its frames have images. image_size: their height and width, pixels; None without images.
+        preset: preset of the synthetic city; empty for drives from elsewhere.
 
     Raises:
-        UsageError: it is none, or is damaged.
+        UsageError: the folder is not a packed drive, or is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -218,15 +218,15 @@ def open_packed(root: Path) -> list[PackedDrive]:
 
 
 def scans_of(drives: Iterable[PackedDrive]) -> set[bytes]:
-    """What tells each scan from all others, also where a part of the drive is packed again: where it was taken, and how
-    many points it has. Those at the origin do not count, at which many drives begin."""
+    """Identifiers of all scans: position of the scan and its number of points. They are the same if a part of the drive
+    is packed again. Scans at the origin are left out, since many drives begin there."""
     scans = ((t, n) for d in drives for t, n in zip(d.poses[:, :3, 3], np.diff(d.offsets), strict=True))
     return {t.tobytes() + n.tobytes() for t, n in scans if t.any()}
 
 
 def packed_digest(drives: Iterable[PackedDrive]) -> str:
-    """What drives hold, in 16 characters: how many points each frame has, where it is, and the images of the first and
-    the last: the same world in other weather has the same points."""
+    """Digest of drives, 16 characters: number of points and pose of each frame, and the images of the first and last.
+    The images count because the same world in other weather has the same points."""
     digest = hashlib.sha256()
     for drive in drives:
         digest.update(drive.offsets.tobytes() + drive.poses.tobytes())

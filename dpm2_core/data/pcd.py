@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds as binary PCD 0.7, the format of the Point Cloud Library, and as LAS, that of surveyors."""
+"""Writes point clouds as binary PCD 0.7, the format of the Point Cloud Library, and as LAS, the surveyors' format."""
 
 from __future__ import annotations
 

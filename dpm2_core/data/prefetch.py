@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read ahead in a thread, so that the disk and the PNG decoder (which let go of the GIL) work beside the algorithm."""
+"""Reads ahead in a thread, so that disk and PNG decoder (which release the GIL) run in parallel with the algorithm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _END = object()
 
 
 def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
-    """The same items in the same order, up to `depth` of them read before they are asked for, and one more in hand.
+    """The same items in the same order, up to `depth` of them read ahead, and one more being read.
 
     An exception of `items` is raised here, after the items before it. Closing the iterator ends the thread.
     """

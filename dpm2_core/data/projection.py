@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud painted into the image of the same time: whether the extrinsics are right shows at every edge."""
+"""Draws a cloud onto the image of the same time: wrong extrinsics are visible at every edge."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Image, Points
 from dpm2_core.geometry import se3
 
-_NEAREST, _FARTHEST = 0.5, 60.0  # m ahead of the camera
-_BESIDE = 0.2  # of the image's size: what lies farther outside of it would be folded back by the distortion
+_NEAREST, _FARTHEST = 0.5, 60.0  # m in front of the camera
+_BESIDE = 0.2  # of the image's size: the distortion model would fold points farther outside back into the image
 
 
 def painted(image: Image, points: Points) -> NDArray[np.uint8]:
-    """The pixels (H, W, 3) with the points (N, 4) of the LiDAR frame on them, red near by to blue at 60 m, near ones
-    over far ones. Points are where they were measured: the motion during a sweep is not undone."""
+    """The pixels (H, W, 3) with the points (N, 4), in the LiDAR frame, drawn on them: red for near to blue for 60 m,
+    near points over far ones. Points are drawn where they were measured, without de-skewing."""
     camera, pixels = image.camera, image.pixels.copy()
     width, height = camera.size
     xyz = points[np.isfinite(points[:, :3]).all(1), :3].astype(np.float64)
@@ -31,7 +31,7 @@ def painted(image: Image, points: Points) -> NDArray[np.uint8]:
     u, v = np.round(uv[:, 0]).astype(np.int64).T
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     depth = np.log(xyz[inside, 2] / _NEAREST) / np.log(_FARTHEST / _NEAREST)
-    near = np.zeros((height, width), np.uint8)  # 0: no point; the nearest has 255, and covers what is behind it
+    near = np.zeros((height, width), np.uint8)  # 0: no point; 255: the nearest, which covers those behind it
     np.maximum.at(near, (v[inside], u[inside]), (255 * (1 - depth)).clip(1, 255).astype(np.uint8))
     side = 2 * (max(0, round(width / 640) - 1) + (width >= 320)) + 1  # pixels of a point
     near = np.asarray(cv2.dilate(near, np.ones((side, side), np.uint8)), np.uint8)

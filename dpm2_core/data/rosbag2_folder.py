@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files of a rosbag2 folder are its recording, by its metadata.yaml."""
+"""Finds the files of a recording in a rosbag2 folder from its metadata.yaml."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ PACKED = tuple(f"{storage}.zstd" for storage in STORAGES)
 
 
 def recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
-    """The files that metadata.yaml names, and topic to message type, also of topics without a message.
+    """The files named in metadata.yaml, and topic to message type, including topics without messages.
 
     Raises:
-        UsageError: it does not say, or they are not there.
+        UsageError: metadata.yaml is unusable, or files are missing.
     """
     try:
         text = (folder / "metadata.yaml").read_text(encoding="utf-8")
@@ -39,10 +39,10 @@ def recorded(folder: Path) -> tuple[list[Path], dict[str, str]]:
 
 
 def check_unpacked(files: Iterable[Path]) -> None:
-    """They are not unpacked here: a megabyte may be a terabyte, and whether there is room is for the user to say.
+    """Reject compressed files. They are not decompressed here, because the result may be huge: the user decides.
 
     Raises:
-        UsageError: one is compressed as a whole; with the command that unpacks it.
+        UsageError: a file is compressed as a whole; the message has the command to decompress it.
     """
     for file in files:
         if file.name.endswith(PACKED) and not file.with_suffix("").is_file():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correction of the elevation of LiDAR points, such as KITTI's scans need."""
+"""Correction of the elevation of LiDAR points, needed for KITTI's scans."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 
 HDL64_CORRECTION_DEG = 0.205
-"""What KITTI's scans lack in elevation: the intrinsic calibration of its HDL-64 (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
+"""Elevation error of KITTI's scans, from its HDL-64's intrinsic calibration (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
-_HIGHEST = 5.0  # degrees above level: 1.7 more than any of its points is that is...
-_FAR = 10.0  # ...so far away, m, in the drives 00 and 04
-_FEW = 100, 0.005  # points, and of the far ones, at most
+_HIGHEST = 5.0  # degrees above horizontal: 1.7 more than any point beyond _FAR...
+_FAR = 10.0  # ...m, in the drives 00 and 04
+_FEW = 100, 0.005  # largest number, and largest share of the far points, above _HIGHEST
 
 
 def may_be_hdl64(points: Points) -> bool:
-    """Whether (N, 4) points can be of KITTI's LiDAR, whose highest beam is 2 degrees above level: most other ones look
-    up by 10 degrees or more."""
+    """Whether (N, 4) points can be of KITTI's LiDAR, whose highest beam is 2 degrees above horizontal. Most other
+    LiDARs have beams at 10 degrees or more."""
     level = np.hypot(points[:, 0], points[:, 1])
     far = level > _FAR  # False for NaN
     high = points[far, 2] > level[far] * np.float32(np.tan(np.radians(_HIGHEST)))
@@ -26,10 +26,10 @@ def may_be_hdl64(points: Points) -> bool:
 
 
 def checked_correction(value: float, where: str) -> float:
-    """A correction from a file or a message, within the bounds of the setting.
+    """A correction from a file or a message, checked against the bounds of the setting.
 
     Raises:
-        UsageError: it is not; the message begins with `where`.
+        UsageError: it is out of bounds; the message begins with `where`.
     """
     if not abs(value) <= 5:
         raise UsageError(f"{where}: want a vertical angle correction of -5 to 5 degrees, got {value}")
@@ -44,7 +44,7 @@ def correct_vertical_angle(points: Points, degrees: float) -> Points:
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     rho = np.sqrt(x * x + y * y)
     out = np.empty_like(points)
-    with np.errstate(invalid="ignore"):  # infinite points become NaN, no less invalid
+    with np.errstate(invalid="ignore"):  # infinite points become NaN, which is also invalid
         scale = cos - sin * z / np.maximum(rho, np.float32(1e-6))
         np.multiply(x, scale, out=out[:, 0])
         np.multiply(y, scale, out=out[:, 1])
