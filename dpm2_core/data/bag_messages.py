@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages as rosbags writes them, of what frames hold: the way back from `messages`."""
+"""Builds ROS messages for rosbags from a frame's data: the inverse of `messages`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
 
 def header(stamp: int, frame: str) -> Any:
-    """std_msgs/Header of a stamp, ns."""
+    """std_msgs/Header with a stamp, ns."""
     time = _TYPES["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
     return _TYPES["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
@@ -49,7 +49,7 @@ def _pose_stamped(stamp: int, T: Array) -> Any:
 
 
 def odometry(stamp: int, child: str, T: Array) -> Any:
-    """T_map_lidar (4, 4), nothing known of its speed and uncertainty."""
+    """nav_msgs/Odometry of T_map_lidar (4, 4), with unknown velocity and uncertainty."""
     zero = _TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     twist = _TYPES["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
     return _TYPES["nav_msgs/msg/Odometry"](
@@ -61,9 +61,9 @@ def odometry(stamp: int, child: str, T: Array) -> Any:
 
 
 def imu(stamp: int, rates: Array, forces: Array) -> Any:
-    """(3,) rad/s and m/s2."""
+    """sensor_msgs/Imu of (3,) rad/s and (3,) m/s2."""
     vector, unknown = _TYPES["geometry_msgs/msg/Vector3"], np.zeros(9)  # covariances
-    no_orientation = np.array([-1.0, *np.zeros(8)])  # as REP-145 has it
+    no_orientation = np.array([-1.0, *np.zeros(8)])  # as defined by REP-145
     return _TYPES["sensor_msgs/msg/Imu"](
         header=header(stamp, naming.IMU_LINK), orientation=_TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
         orientation_covariance=no_orientation, angular_velocity=vector(*rates.tolist()),
@@ -73,17 +73,17 @@ def imu(stamp: int, rates: Array, forces: Array) -> Any:
 
 
 def nav_sat_fix(stamp: int, fix: Fix) -> Any:
-    """Of an antenna in GNSS_LINK."""
+    """sensor_msgs/NavSatFix of an antenna in the frame GNSS_LINK."""
     latitude, longitude, altitude = fix.geodetic.tolist()
     return _TYPES["sensor_msgs/msg/NavSatFix"](
         header=header(stamp, naming.GNSS_LINK), status=_TYPES["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
         latitude=latitude, longitude=longitude, altitude=altitude, position_covariance=fix.covariance.ravel(),
-        position_covariance_type=2,  # of the diagonal
+        position_covariance_type=2,  # DIAGONAL_KNOWN
     )  # fmt: skip
 
 
 def image(stamp: int, frame: str, pixels: NDArray[np.uint8]) -> Any:
-    """(H, W, 3) RGB."""
+    """sensor_msgs/Image of (H, W, 3) RGB pixels."""
     height, width = pixels.shape[:2]
     return _TYPES["sensor_msgs/msg/Image"](
         header=header(stamp, frame), height=height, width=width, encoding="rgb8", is_bigendian=0,
@@ -92,7 +92,7 @@ def image(stamp: int, frame: str, pixels: NDArray[np.uint8]) -> Any:
 
 
 def camera_info(stamp: int, frame: str, camera: Camera) -> Any:
-    """Of the pixels as they are: P is K."""
+    """sensor_msgs/CameraInfo of the pixels as they are, without rectification: P is K."""
     D = np.zeros(max(5, len(camera.distortion)))
     D[: len(camera.distortion)] = camera.distortion
     model = "plumb_bob" if len(D) == 5 else "rational_polynomial"
@@ -105,7 +105,7 @@ def camera_info(stamp: int, frame: str, camera: Camera) -> Any:
 
 
 def cloud(stamp: int, lidar: str, frame: Frame) -> Any:
-    """In the frame `lidar`, with the field `time`, s after the stamp, where the points have times."""
+    """sensor_msgs/PointCloud2 in the frame `lidar`; with the field `time`, s after the stamp, if points have times."""
     columns = point_columns(frame.points)
     if frame.time_offset is not None:
         columns["time"] = frame.time_offset
@@ -114,7 +114,7 @@ def cloud(stamp: int, lidar: str, frame: Frame) -> Any:
 
 
 def path(stamp: int, poses: list[tuple[int, Array]]) -> Any:
-    """Stamps, ns, and T_map_lidar (4, 4)."""
+    """nav_msgs/Path of stamps, ns, and T_map_lidar (4, 4)."""
     stamped = [_pose_stamped(at, T) for at, T in poses]
     return _TYPES["nav_msgs/msg/Path"](header=header(stamp, naming.MAP), poses=stamped)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data sets that KISS-ICP reads, as a `Source`: MulRan, Newer College, NCLT, HeLiPR, Boreas, ...
+"""Data sets that KISS-ICP reads, as a `Source`: MulRan, Newer College, NCLT, HeLiPR, Boreas, ...
 
 I. Vizzo et al., "KISS-ICP", RA-L 2023; its package `kiss_icp.datasets` (MIT) has the loaders.
 """
@@ -20,22 +20,22 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Array, Frame
 
-_SWEEP = 0.1  # s, a turn of the LiDAR
-_OWN = ("generic", "mcap", "ouster", "rosbag")  # read without it, with times and intensities
+_SWEEP = 0.1  # s, one revolution of the LiDAR
+_OWN = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
 
 
 class KissSource(IndexedSource):
-    """A drive by the loader `input.dataset` of KISS-ICP. See `Source`; there are no images and no intensities.
+    """A drive read by KISS-ICP's loader `input.dataset`. See `Source`; there are no images and no intensities.
 
-    The times of the points are, as KISS-ICP takes them, fractions of the sweep, whose end is the stamp.
+    Point times are taken as in KISS-ICP: fractions of the sweep, whose end is the stamp.
 
     Raises:
-        UsageError: no such loader, a package that it needs is missing, or it cannot read the folder.
+        UsageError: no such loader, it lacks a package, or it cannot read the folder.
     """
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings, self.path = settings or InputSettings(), Path(path)
-        self._printed = ""  # by the loader when it was made, perhaps what it lacks
+        self._printed = ""  # output of the loader's constructor, which may name what is missing
         kind = self._settings.dataset
         with needs("datasets", f"input.dataset={kind}"):
             from kiss_icp.datasets import available_dataloaders, dataset_factory
@@ -51,7 +51,7 @@ class KissSource(IndexedSource):
         self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`."""
+        """See `IndexedSource`."""
         stamp = int(self.stamps[position])
         try:
             xyz, times = self._asked(lambda: self._set[position])
@@ -63,7 +63,7 @@ class KissSource(IndexedSource):
         return Frame(stamp, points, offset, index=position)
 
     def _asked(self, what: Any) -> Any:
-        """What the loader answers; it prints, exits and asserts where something is missing."""
+        """Result of a call of the loader, which prints, exits and asserts if something is missing."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -86,7 +86,7 @@ class KissSource(IndexedSource):
         return None
 
     def _times(self) -> Array:
-        """(len,) ns: what the loader says, else the names of the scans where they are times, else 10 per second."""
+        """(len,) ns: the loader's times, else the scans' names if they are times, else at constant `input.period`."""
         known = getattr(self._set, "get_frames_timestamps", None)
         if known is not None:
             found = np.asarray(self._asked(known), np.float64).ravel()
@@ -99,7 +99,7 @@ class KissSource(IndexedSource):
         return np.asarray(self._settings.steady_stamps(np.arange(self._count), why, self.notes))
 
     def _offsets(self, times: Array, count: int) -> Any:
-        """(count,) s relative to the end of the sweep; None where the points have no times."""
+        """(count,) s relative to the end of the sweep; None if the points have no times."""
         if len(times) != count or not count or np.ptp(times) == 0:
             note_once(self.notes, f"{self.path}: no time field: not de-skewed")
             return None

@@ -23,9 +23,9 @@ from dpm2_core.geometry import se3
 class Kitti360Source(VelodyneDrive):
     """One drive, by the root and `input.sequence` (such as 0009), or by its folder in data_3d_raw.
 
-    Poses were published for a part of the frames only, those where the car had moved; the others are NaN. They are of
-    the moment when the LiDAR faces forward. Scans are as measured: each point has a time offset by its azimuth, see
-    `azimuth_time`. Images are those of the rectified left camera, image_00.
+    Poses are published only for frames in which the car had moved; the others are NaN. A pose is of the time when the
+    LiDAR faces forward. Scans are not de-skewed: each point has a time offset from its azimuth, see `azimuth_time`.
+    Images are from the rectified left camera, image_00.
 
     Raises:
         UsageError: no scans or no calibration, or a text file is damaged; the message names file and line.
@@ -50,7 +50,7 @@ class Kitti360Source(VelodyneDrive):
         self.camera = self._camera()
 
     def _poses(self) -> Array | None:
-        """(len, 4, 4) T_world_lidar, from poses.txt (of the IMU) or else cam0_to_world.txt; None without either."""
+        """(len, 4, 4) T_world_lidar, from poses.txt (of the IMU), else cam0_to_world.txt; None without either."""
         folder = self.root / "data_poses" / self.drive
         of_imu, of_camera = folder / "poses.txt", folder / "cam0_to_world.txt"
         if of_imu.is_file():

@@ -29,8 +29,8 @@ _OXTS = 30  # numbers in a file of oxts
 class KittiRawSource(VelodyneDrive):
     """A synchronized and rectified drive, by its folder, or by the folder of its date and `input.sequence` (0009).
 
-    The stamp is when the LiDAR faced forward. Numbers may be missing. Images are those of the left color camera,
-    image_02; ground truth is what the car's OXTS measured.
+    The stamp is the time when the LiDAR faced forward. Scan numbers may be missing. Images are from the left color
+    camera, image_02; ground truth is measured by the car's OXTS.
 
     Raises:
         UsageError: no scans, or a text file is missing or damaged; the message names file and line.
@@ -58,7 +58,7 @@ class KittiRawSource(VelodyneDrive):
         self.poses = self._poses(date / "calib_imu_to_velo.txt")
 
     def _poses(self, mounting: Path) -> Array | None:
-        """(len, 4, 4) T_world_lidar, x to the east and z up, from the first scan's place; None without oxts."""
+        """(len, 4, 4) T_world_lidar, x to the east, z up, origin at the first scan; None without oxts."""
         folder = self.path / "oxts" / "data"
         rows = [read_numbers(folder / f"{scan.stem}.txt", _OXTS)[:1] for scan in self._scans]
         known = np.array([len(row) == 1 for row in rows])
@@ -72,7 +72,7 @@ class KittiRawSource(VelodyneDrive):
 
 
 def _poses_of(oxts: Array) -> Array:
-    """(N, 4, 4) T_world_imu of (N, 30) rows of oxts: a Mercator projection that is true to scale at the first."""
+    """(N, 4, 4) T_world_imu from (N, 30) rows of oxts: a Mercator projection with true scale at the first row."""
     latitude, longitude = np.radians(oxts[:, 0]), np.radians(oxts[:, 1])
     scale = np.cos(latitude[0]) * _EARTH
     poses = np.tile(np.eye(4), (len(oxts), 1, 1))
@@ -83,10 +83,10 @@ def _poses_of(oxts: Array) -> Array:
 
 
 def _rigid(path: Path) -> Array:
-    """(4, 4) of a file with the lines R and T.
+    """(4, 4) transform from a file with the lines R and T.
 
     Raises:
-        UsageError: there is no such file, or it holds something else.
+        UsageError: there is no such file, or it contains something else.
     """
     rows = read_keyed(path)
     R, t = rows.get("R"), rows.get("T")

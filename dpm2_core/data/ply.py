@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds as PLY, which CloudCompare, MeshLab, Open3D and Blender open: written as binary, read as any."""
+"""PLY point clouds, as used by CloudCompare, MeshLab, Open3D and Blender: writes binary, reads binary and ASCII."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _CODINGS = ("binary_little_endian", "binary_big_endian", "ascii")
 
 
 def read_ply(path: Path | str, names: Sequence[str]) -> Array:
-    """(N, len(names)) float64 of these properties of the vertices, as of `read_vertices`.
+    """(N, len(names)) float64: these properties of the vertices, see `read_vertices`.
 
     Raises:
-        UsageError: not such a file, cut short, or without one of the properties.
+        UsageError: no such file, or it is not PLY, is cut short, or lacks one of the properties.
     """
     vertices = read_vertices(path)
     if missing := [name for name in names if name not in vertices]:
@@ -61,10 +61,10 @@ def read_ply(path: Path | str, names: Sequence[str]) -> Array:
 
 
 def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
-    """Every property (N,) of the vertices, the first element of a PLY, binary or ASCII, by its name.
+    """Properties of the vertices (the first element) of a PLY, binary or ASCII: name to (N,) values.
 
     Raises:
-        UsageError: not such a file, or cut short.
+        UsageError: no such file, or it is not PLY, or is cut short.
     """
     try:
         data = Path(path).read_bytes()
@@ -84,7 +84,7 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
     except (IndexError, ValueError, KeyError) as error:
         raise UsageError(f"{path}: header of the PLY is damaged ({error})") from None
     names = layout.names or ()
-    least = len(names) if coding == "ascii" else layout.itemsize  # bytes of a vertex
+    least = len(names) if coding == "ascii" else layout.itemsize  # bytes per vertex
     if count < 0 or len(data) - start < count * least:
         raise UsageError(f"{path}: ends before its {count} points do")
     if not count or not names:
@@ -98,7 +98,7 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
 
 
 def _from_text(path: Path | str, data: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
-    """(count,) of this layout, a line each."""
+    """(count,) vertices with this layout, one per line."""
     try:
         vertices = np.loadtxt(BytesIO(data), layout, comments=None, max_rows=count, ndmin=1, encoding="ascii")
     except ValueError as error:

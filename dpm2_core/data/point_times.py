@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When each point of a cloud was measured: which field says so, in which unit, and by which clock."""
+"""Capture time of each point of a cloud: its field, its unit and its clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.frame import Points
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
-# Without underscores and unit: time_stamp is timestamp, time_offset_ns is timeoffset.
+# Without underscores and unit: time_stamp becomes timestamp, time_offset_ns becomes timeoffset.
 _TIME_NAMES = (
     "t",
     "time",
@@ -33,12 +33,12 @@ _TIME_NAMES = (
 )
 _TIME_NAME = re.compile(r"(?P<name>[a-z_]+?)(?:_?(?P<unit>ns|us|ms|s)|_(?P<long>nsec|usec|msec|sec))?")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# No sweep is longer, no useful one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
+# No sweep is longer, no usable one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
 _LONGEST_SCAN = 2.0
 
 
 def time_field_of(available: list[str]) -> tuple[str | None, TimeUnit]:
-    """The field with the time of each point, of those there are, and the unit that its name ends in; else None."""
+    """The field with the time of each point, among the available ones, and the unit in its name, if any."""
     found: dict[str, tuple[str, TimeUnit]] = {}
     for field in available:
         name = field.lower()
@@ -51,10 +51,10 @@ def time_field_of(available: list[str]) -> tuple[str | None, TimeUnit]:
 
 
 def time_offsets(time: NDArray[Any], returned: NDArray[np.bool_], stamp: int, unit: TimeUnit) -> Points | None:
-    """(N,) float32 s relative to a stamp, ns, of the values of a time field; None where they say nothing.
+    """(N,) float32 s relative to a stamp, ns, from the values of a time field; None if the values are unusable.
 
     Args:
-        time: (N,) of each point. returned: (N,) which points there are: drivers often zero the time of a missing one.
+        time: (N,) of each point. returned: (N,) which points were measured: drivers often zero the time of the others.
     """
     value = time.astype(np.float64)
     seen = returned & np.isfinite(value)
@@ -62,48 +62,48 @@ def time_offsets(time: NDArray[Any], returned: NDArray[np.bool_], stamp: int, un
     if not (seen & ~zero).any():
         return None
     first, last = _span(value[seen & ~zero])
-    if 0 < 10 * (last - first) < first:  # by a clock that began long before the scan
-        seen &= ~zero  # of a missing return, although its point may have been moved into another frame since
+    if 0 < 10 * (last - first) < first:  # the clock started long before the scan
+        seen &= ~zero  # 0 marks a missing return, even if its point was transformed to another frame since
     elif (seen & zero).any():
         first, last = min(first, 0.0), max(last, 0.0)
     if first == last:
         return None
     scale = _SECONDS[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
     origin, clock = 0.0, stamp * 1e-9 / scale
-    # Of a clock that has begun within 2 s, as in a simulation, absolute times look like relative ones.
+    # If the clock started less than 2 s ago, as in a simulation, absolute times look like relative ones.
     by_clock = _away(first, last, clock) + (last - first) / 10 < _away(first, last, 0.0)
     if by_clock or max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
         origin = clock
         if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
-            # The sensor's clock is not that of the stamps: the first point is all that can be known.
+            # The sensor's clock differs from the clock of the stamps: only times since the first point are known.
             known = value[seen]
-            middle = np.partition(known, len(known) // 2)[len(known) // 2]  # unlike a median always one of them
+            middle = np.partition(known, len(known) // 2)[len(known) // 2]  # unlike a median always one of the values
             origin = known[np.abs(known - middle) * scale <= _LONGEST_SCAN].min()
     with np.errstate(invalid="ignore", over="ignore"):
         offset = (value - origin) * scale
-    valid = seen & (np.abs(offset) <= _LONGEST_SCAN)  # else it means nothing
+    valid = seen & (np.abs(offset) <= _LONGEST_SCAN)  # others are invalid
     return np.where(valid, offset, 0.0).astype(np.float32) if 2 * valid.sum() > seen.sum() else None
 
 
 def last_point(offset: Points | None) -> int:
-    """ns from the stamp of a cloud to its last point, by (N,) s after it; 0 where that is not known, or before it."""
+    """ns from the stamp of a cloud to its last point, from (N,) s after it; 0 if unknown, or if it is not later."""
     return 0 if offset is None else round(float(offset.max(initial=0.0)) * 1e9)
 
 
 def _away(first: float, last: float, time: float) -> float:
-    """How far a time is from the times of a scan."""
+    """Distance of a time from the interval first..last of a scan."""
     return max(first - time, time - last, 0.0)
 
 
 def _span(times: NDArray[np.float64]) -> tuple[float, float]:
-    """The earliest and the latest of times (N,) but for one in a hundred at either end: a few may be anything."""
+    """The earliest and the latest of times (N,), without one percent at either end, which may be outliers."""
     few = len(times) // 100
     ordered = np.partition(times, (few, len(times) - 1 - few))
     return float(ordered[few]), float(ordered[-1 - few])
 
 
 def _time_scale(first: float, last: float, floating: bool) -> float:
-    """Seconds per unit: by the span, else (a few points only) by size as an epoch, else by type."""
+    """Seconds per unit: from the span, else (very few points) from the size as an epoch time, else from the type."""
     for scale in [_SECONDS[unit] for unit in (("s", "ms") if floating else ()) + ("us", "ns")]:
         if _LONGEST_SCAN / 1000 < (last - first) * scale <= _LONGEST_SCAN:
             return scale

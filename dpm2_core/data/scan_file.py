@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans and images of one file each, and which of several sequences is meant."""
+"""Reads scans and images stored as one file each, and selects one of several sequences."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dpm2_core.frame import NO_POINTS, Camera, Image, Points
 
 KITTI, KITTI_RAW = "*/velodyne", "*_drive_*/velodyne_points"
 KITTI_360, KITTI_CARLA = "data_3d_raw/*/velodyne_points", "*/generated/frames"
-"""Layouts of several drives in one folder: what each has below it, whose name stands for the first *."""
+"""Layouts of several drives in one folder: a glob pattern whose first * is the name of the drive."""
 
 
 def numbered_scans(folder: Path) -> list[Path]:
-    """NNNNNN.bin, in the order of their numbers; other files are left out."""
+    """The files NNNNNN.bin, ordered by number; other files are left out."""
     scans = (scan for scan in folder.glob("*.bin") if scan.stem.isdecimal())
     return sorted(scans, key=lambda scan: (int(scan.stem), scan.name))
 
 
 def read_scan(path: Path) -> tuple[Points, str | None]:
-    """A velodyne file to (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and what is wrong."""
+    """A velodyne file as (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and the problem."""
     try:
         values, size = np.fromfile(path, "<f4"), path.stat().st_size
     except OSError as error:
@@ -41,14 +41,14 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
 
 
 def _are_none(points: Points) -> bool:
-    """Whether most of (N, 4) are no places that a LiDAR measures, as integers of another layout read as floats."""
+    """Whether most of (N, 4) points are no plausible measurements, such as integers that are read as floats."""
     with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.abs(points[::16, :3]).max(1, initial=0)  # all of 120,000 would take 4 ms of each scan
+        distance = np.abs(points[::16, :3]).max(1, initial=0)  # all of 120,000 would take 4 ms per scan
     return len(points) > 0 and bool(np.mean((distance > 0) & ~((distance > 1e-3) & (distance < 1e5))) > 0.5)
 
 
 def _are_rings(values: NDArray[np.float32]) -> bool:
-    """Whether all are whole numbers, not all the same, of so many beams as a LiDAR has."""
+    """Whether all values are integers, not all equal, in the range of a LiDAR's beam numbers."""
     whole = (values >= 0) & (values < 256) & (values == np.floor(values))
     return len(values) > 0 and bool(whole.all()) and bool(np.ptp(values) > 0)
 
@@ -62,7 +62,7 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
 
 
 def image_size(paths: Iterable[Path], notes: list[str]) -> tuple[int, int] | None:
-    """Width and height of the first image that can be read; None without, which is noted where there are images."""
+    """Width and height of the first readable image; None without any, with a note if there are unreadable images."""
     path = None
     for path in paths:
         if (pixels := read_image(path)) is not None:
@@ -73,13 +73,13 @@ def image_size(paths: Iterable[Path], notes: list[str]) -> tuple[int, int] | Non
 
 
 def image_of(scan: Path, folder: Path) -> Path | None:
-    """The image of a scan, by its number: PNG, or JPEG as smaller copies of data sets have."""
+    """The image of a scan, by its number: PNG, or JPEG as in smaller copies of data sets."""
     paths = (folder / f"{scan.stem}{suffix}" for suffix in (".png", ".jpg"))
     return next((path for path in paths if path.is_file()), None)
 
 
 def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tuple[Image, ...]:
-    """The image of a frame, if it has one and there is a camera; a note says why one is left out."""
+    """The image of a frame, if it has one and there is a camera; a note gives the reason if one is left out."""
     if camera is None or path is None or not path.is_file():
         return ()
     pixels = read_image(path)
@@ -91,17 +91,16 @@ def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tup
 
 
 def drives_below(path: Path, layout: str) -> list[str]:
-    """The names of those that lie so, in order."""
+    """Names of the drives below `path` with that layout, sorted."""
     place = layout.partition("*")[0].count("/")
     return sorted(found.relative_to(path).parts[place] for found in path.glob(layout) if found.is_dir())
 
 
 def chosen(path: Path, sequence: str, layout: str) -> str:
-    """The name of the drive below a folder that is meant: the one asked for, also by its four digits (0009), or the
-    only one.
+    """Name of the selected drive below a folder: `sequence`, which may be its four digits (0009), or the only one.
 
     Raises:
-        UsageError: none or several.
+        UsageError: no drive matches, or several do.
     """
     if not (found := drives_below(path, layout)):
         raise UsageError(f"{path}: no drive ({layout}) in or below it")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers and times in text files, with errors that name file and line."""
+"""Reads numbers and times from text files, with errors that name file and line."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 
-_LARGEST = 9e9  # s, of a stamp in ns as an integer: the year 2255; no place or focal length is as large
+_LARGEST = 9e9  # s, of a stamp in ns as an integer: the year 2255; no position or focal length is as large
 _DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
 
 
 def read_numbers(path: Path, columns: int) -> Array:
-    """(lines, columns) float64 of a text file, without lines that begin with #; no rows if there is no such file.
+    """(lines, columns) float64 of a text file without its lines that begin with #; no rows if the file is missing.
 
     Raises:
-        UsageError: a line has another number of numbers, or something else; the message names it.
+        UsageError: a line has another count of numbers, or other text; the message names the line.
     """
     rows = [
         parse_row(line, columns, f"{path}:{i}")
@@ -31,7 +31,7 @@ def read_numbers(path: Path, columns: int) -> Array:
 
 
 def read_keyed(path: Path) -> dict[str, Array]:
-    """The `name: numbers` lines of a calibration file, as float64 of any length; other lines are left out.
+    """The `name: numbers` lines of a calibration file, as float64 of any length; other lines are skipped.
 
     Raises:
         UsageError: there is no such file.
@@ -45,17 +45,17 @@ def read_keyed(path: Path) -> dict[str, Array]:
         try:
             values = [float(word) for word in words]
         except ValueError:
-            continue  # dates
+            continue  # such as dates
         if colon and values:
             found[name.strip()] = parse_row(text, len(words), f"{path}:{number}: {name}")
     return found
 
 
 def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array:
-    """(count,) numbers of a name in a file that `read_keyed` has read.
+    """(count,) numbers stored under a name in a file that was read by `read_keyed`.
 
     Raises:
-        UsageError: they are missing.
+        UsageError: they are missing, or there are more or fewer.
     """
     row = rows.get(name)
     if row is None or len(row) != count:
@@ -64,7 +64,7 @@ def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array
 
 
 def read_lines(path: Path, missing_ok: bool = True) -> list[str]:
-    """Lines of a text file; none if there is no such file, or that is an error."""
+    """Lines of a text file; for a missing file an empty list, or an error."""
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -74,7 +74,7 @@ def read_lines(path: Path, missing_ok: bool = True) -> list[str]:
 
 
 def parse_row(text: str, count: int, where: str) -> Array:
-    """(count,) finite numbers of a line, none beyond 9e9; the UsageError of any other line begins with `where`."""
+    """(count,) finite numbers of a line, none beyond 9e9; for any other line a UsageError that begins with `where`."""
     try:
         row = np.array([float(word) for word in text.split()])
     except ValueError as error:
@@ -87,8 +87,8 @@ def parse_row(text: str, count: int, where: str) -> Array:
 
 
 def date_ns(text: str) -> int | None:
-    """ns since 1970 of a text that ends in a date in UTC, as 2023-11-14_22-13-20_750 or 20231114_221320.750; None of
-    any other, and of a day that there is not."""
+    """ns since 1970 of a text that ends in a UTC date, such as 2023-11-14_22-13-20_750 or 20231114_221320.750; None for
+    other texts and for dates that do not exist."""
     if (match := _DATE.fullmatch(text)) is None:
         return None
     year, month, day, hour, minute, second = (int(match[i]) for i in range(1, 7))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small image of a keyframe: a JPEG that anybody can show, with its camera in the JPEG's comment."""
+"""A small image of a keyframe: a plain JPEG that any viewer shows, with its camera in the JPEG's comment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dpm2_core.data.image_messages import DISTORTIONS
 from dpm2_core.frame import Array, Camera, Image
 
 PLACE_WIDTH = 320
-"""Of a picture by which a place is found, pixels: 6 to 10 kB."""
+"""Width of an image for place recognition, pixels: 6 to 10 kB."""
 _START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
 _QUALITY = 80
 _KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
@@ -31,7 +31,7 @@ def thumbnail(image: Image, width: int) -> bytes:
 
 
 def within(jpeg: bytes, most: int) -> bytes | None:
-    """A `thumbnail`, made smaller until it has so many bytes at most; None for a larger JPEG without a camera."""
+    """A `thumbnail`, reduced to at most `most` bytes; None for a larger JPEG without a camera."""
     if len(jpeg) <= most:
         return jpeg
     if (image := usable_image(jpeg)) is None:
@@ -44,24 +44,24 @@ def within(jpeg: bytes, most: int) -> bytes | None:
 
 
 def moved_thumbnail(jpeg: bytes, T_new_old: Array) -> bytes:
-    """A `thumbnail` with its camera placed in another frame than the LiDAR's, by (4, 4) T_new_old."""
+    """A `thumbnail` whose camera pose is changed from the LiDAR frame to another frame, by (4, 4) T_new_old."""
     (length,) = struct.unpack_from(">H", jpeg, 4)
     camera = _camera(json.loads(jpeg[6 : 4 + length]))
     return _with_camera(replace(camera, T_lidar_cam=T_new_old @ camera.T_lidar_cam), jpeg[4 + length :])
 
 
 def _with_camera(camera: Camera, rest: bytes) -> bytes:
-    """A JPEG with a comment in front of the rest of it."""
+    """A JPEG with the camera in a comment before the rest of it."""
     fields = {key: np.asarray(value).tolist() for key, value in vars(camera).items()}
     comment = json.dumps(fields).encode()
     return _START + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + rest
 
 
 def image_of(jpeg: bytes) -> Image | None:
-    """The image of such a JPEG; None for one without a camera.
+    """The image of such a JPEG; None if it has no camera.
 
     Raises:
-        ValueError: it is damaged, or what it says is no camera.
+        ValueError: it is damaged, or its camera is invalid.
     """
     if jpeg[:4] != _START + _COMMENT or len(jpeg) < 6:
         return None
@@ -80,7 +80,7 @@ def image_of(jpeg: bytes) -> Image | None:
 
 
 def usable_image(jpeg: bytes | None) -> Image | None:
-    """As `image_of`; None also without a JPEG, and for a damaged one."""
+    """Like `image_of`, but None also without a JPEG, and for a damaged one."""
     try:
         return None if jpeg is None else image_of(jpeg)
     except ValueError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tree of static transforms from /tf_static messages or configuration, free of ROS. Never identity by default."""
+"""A tree of static transforms from /tf_static or configuration, without ROS. Missing ones are never identity."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_LISTED = 20  # frames that an error names
+_LISTED = 20  # largest number of frames named in an error
 
 
 def transform_matrix(transform: Any) -> Array:
@@ -30,13 +30,13 @@ def transform_matrix(transform: Any) -> Array:
 
 
 class TransformTree:
-    """Frames by name, each with its parent."""
+    """Frames by name, each with its parent frame."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Array]] = {}
 
     def add(self, tf_message: Any) -> list[str]:
-        """Take every rigid transform of a tf2_msgs/TFMessage; returns what is wrong with the others."""
+        """Add every rigid transform of a tf2_msgs/TFMessage; returns the problems of the others."""
         problems = []
         for stamped in tf_message.transforms:
             parent, child = stamped.header.frame_id, stamped.child_frame_id
@@ -47,7 +47,7 @@ class TransformTree:
         return problems
 
     def copy(self) -> TransformTree:
-        """Another tree, of the same frames now."""
+        """A copy of the tree that later changes do not affect."""
         tree = TransformTree()
         tree._parents = dict(self._parents)
         return tree
@@ -56,18 +56,18 @@ class TransformTree:
         return len(self._parents)
 
     def parent(self, frame: str) -> tuple[str, Array] | None:
-        """What the frame is placed in, and T_parent_frame (4, 4); None where it is not."""
+        """Parent frame and T_parent_frame (4, 4); None if the frame has no parent."""
         return self._parents.get(frame_name(frame))
 
     def set(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Place `child` in `parent`; a later call replaces an earlier one."""
+        """Set the transform of `child` in `parent`; a later call replaces an earlier one."""
         self._parents[frame_name(child)] = (frame_name(parent), np.asarray(T_parent_child, np.float64))
 
     def lookup(self, target_frame: str, source_frame: str) -> Array:
         """T_target_source (4, 4).
 
         Raises:
-            UsageError: the two are not connected; the message names both and every frame known.
+            UsageError: the two are not connected; the message names both, and the known frames.
         """
         target, source = frame_name(target_frame), frame_name(source_frame)
         up_target, up_source = self._ancestors(target), self._ancestors(source)
@@ -80,9 +80,9 @@ class TransformTree:
         return se3.inverse(up_target[common]) @ up_source[common]
 
     def between(self, target_frame: str, source_frame: str) -> Array:
-        """T_target_source (4, 4) as by `lookup`; of one frame that has a name the identity, also where it is not known.
+        """T_target_source (4, 4) like `lookup`, but the identity for equal, non-empty names, even of unknown frames.
 
-        Not for cameras: their axes are not those of a LiDAR whose frame they name.
+        Not for cameras: if an image names the LiDAR's frame, its axes are still not those of the LiDAR.
 
         Raises:
             UsageError: the two are not connected.
@@ -92,7 +92,7 @@ class TransformTree:
         return self.lookup(target_frame, source_frame)
 
     def root(self, frame: str, below: Collection[str] = ()) -> str:
-        """The topmost frame above `frame`, `below` none of those named; itself where nothing is."""
+        """The topmost ancestor of `frame` before any frame named in `below`; `frame` itself if it has none."""
         first, *above = self._ancestors(frame_name(frame))
         return [first, *takewhile(lambda name: name not in below, above)][-1]
 
@@ -102,12 +102,12 @@ class TransformTree:
         return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
 
     def _ancestors(self, frame: str) -> dict[str, Array]:
-        """The frame itself and everything above it, nearest first, each with T_ancestor_frame."""
+        """The frame itself and all its ancestors, nearest first, each with T_ancestor_frame."""
         out, T = {frame: np.eye(4)}, np.eye(4)
         while frame in self._parents:
             frame, T_parent_frame = self._parents[frame]
             if frame in out:
-                break  # a cycle: broken input, but no reason to hang
+                break  # a cycle: invalid input must not cause an endless loop
             T = T_parent_frame @ T
             out[frame] = T
         return out

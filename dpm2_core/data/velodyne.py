@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives of KITTI's kind: a scan of the HDL-64E a file, and an image of the same number."""
+"""Drives in KITTI's format: one file per scan of the HDL-64E, and an image with the same number."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Camera, Frame, Points
 
-_PERIOD = 0.1  # s, a turn of the LiDAR
+_PERIOD = 0.1  # s, one revolution of the LiDAR
 
 
 class VelodyneDrive(IndexedSource):
-    """What KITTI odometry, raw and KITTI-360 have in common. `Frame.index` is the number in the file name.
+    """Common base of KITTI odometry, raw and KITTI-360. `Frame.index` is the number in the file name.
 
     Attributes:
-        numbers: (len,) those in the file names. stamps: (len,) ns; who derives from it finds them.
-        camera: of its images; None where there are none, or none are wanted.
+        numbers: (len,) numbers in the file names. stamps: (len,) ns, set by the subclass.
+        camera: camera of the images; None if there are none, or if images are not used.
         vertical_angle_correction_deg: added to the elevation of each point.
-        swept: whether scans are as measured: each point then has a time offset by its azimuth, see `azimuth_time`.
+        swept: whether scans are not de-skewed: each point then has a time offset from its azimuth, see `azimuth_time`.
     """
 
     numbers: NDArray[np.int64]
@@ -37,7 +37,7 @@ class VelodyneDrive(IndexedSource):
     swept = True
 
     def __init__(self, name: str, scans: Path, images: Path, settings: InputSettings) -> None:
-        """Find the scans, NNNNNN.bin, in a folder.
+        """Find the scans NNNNNN.bin in a folder.
 
         Raises:
             UsageError: there are none.
@@ -50,20 +50,20 @@ class VelodyneDrive(IndexedSource):
         self.numbers = np.array([int(scan.stem) for scan in self._scans])
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`."""
+        """See `IndexedSource`."""
         scan, stamp = self._scans[position], int(self.stamps[position])
         points, problem = read_scan(scan)
-        points = scale_intensity(points, self._settings.intensity_max)  # KITTI's are in 0..1, not everyone's are
+        points = scale_intensity(points, self._settings.intensity_max)  # KITTI has 0..1, other recordings may not
         points = correct_vertical_angle(points, self.vertical_angle_correction_deg)
         images = images_of(image_of(scan, self._images), self.camera, self.notes)
         offset = azimuth_time(points) if self.swept else None
         return Frame(stamp, points, offset, images, index=int(scan.stem), problem=problem)
 
     def _read_stamps(self, path: Path) -> NDArray[np.int64]:
-        """(len,) ns by a file whose line k is the time of scan k; at a steady pace where it is missing or too short.
+        """(len,) ns from a file whose line k is the time of scan k; at a constant rate if it is missing or too short.
 
         Raises:
-            UsageError: a line is no time.
+            UsageError: a line is not a time.
         """
         lines = read_lines(path)
         if len(lines) <= self.numbers[-1]:
@@ -75,12 +75,12 @@ class VelodyneDrive(IndexedSource):
         return np.array(stamps, np.int64)
 
     def _correction(self) -> float:
-        """Degrees to add to the elevation of each point: what is set, else what is known of the recording."""
+        """Degrees to add to the elevation of each point: the value set, else that of the recording."""
         requested = self._settings.vertical_angle_correction_deg
         return self._known_correction() if requested == "auto" else requested
 
     def _known_correction(self) -> float:
-        """KITTI's, unless scans show that another LiDAR made them."""
+        """KITTI's correction, unless scans show that they are from another LiDAR."""
         for position in {0, len(self) // 2, len(self) - 1}:
             if not may_be_hdl64(read_scan(self._scans[position])[0]):
                 self.notes.append(
@@ -91,17 +91,17 @@ class VelodyneDrive(IndexedSource):
         return HDL64_CORRECTION_DEG
 
     def _image_size(self) -> tuple[int, int] | None:
-        """None without images, or where none are wanted."""
+        """Size of the images; None without images, or if they are not used."""
         if not self._settings.images:
             return None
         return image_size((path for scan in self._scans if (path := image_of(scan, self._images))), self.notes)
 
 
 def azimuth_time(points: Points) -> Points:
-    """(N,) s from facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that turns clockwise, seen from above.
+    """(N,) s relative to facing forward, -0.05..0.05, of points (N, 4) of a LiDAR that rotates clockwise (from above).
 
-    What is on the left was measured before what is on the right: so it is in KITTI-360's devkit (kitti360Scripts,
-    `curl_velodyne_data`) and in KISS-ICP's reader of KITTI raw, and so scans of KITTI odometry, of the same sensor,
-    agree best with each other. Other converters call the rotation counter-clockwise.
+    Points on the left were measured before points on the right. KITTI-360's devkit (kitti360Scripts,
+    `curl_velodyne_data`) and KISS-ICP's reader of KITTI raw assume this, and with it scans of KITTI odometry, from the
+    same sensor, agree best with each other. Other converters assume counter-clockwise rotation.
     """
     return (-np.arctan2(points[:, 1], points[:, 0]) * (_PERIOD / (2 * np.pi))).astype(np.float32)
