@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are read: those that the settings name, else the usual ones, else the only ones."""
+"""Selects the topics of a bag: those in the settings, else the usual ones, else the only ones."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from dpm2_core.data.naming import frame_name
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
-_LOOKED_AT = 20  # CameraInfo, for one in the frame of the images
+_LOOKED_AT = 20  # CameraInfo messages, to find one in the frame of the images
 
 
 class TopicChoice:
-    """Chooses the topics of one bag; the bag's `notes` say where there were others.
+    """Selects the topics of one bag; the bag's `notes` name the alternatives.
 
     Raises:
-        UsageError: by its methods: what the settings ask for is not there, or the choice is the user's.
+        UsageError: from its methods: a topic in the settings is missing, or the user must choose one.
     """
 
     def __init__(self, bag: Bag, path: Path, settings: InputSettings) -> None:
@@ -50,14 +50,14 @@ class TopicChoice:
         return found[0]
 
     def second(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
-        """The topic of a second sensor that a setting names, empty for none."""
+        """The topic of a second sensor, from the setting `key`; empty for none."""
         asked: str = getattr(self._settings, key)
         if asked and (asked == first or asked not in self._bag.topics(*kinds)):
             raise UsageError(f"{self._path}: input.{key}: no other {messages} on {asked}; {self._contents()}")
         return asked
 
     def image(self, second: str) -> str:
-        """The image topic of the first camera, which is not the second one's; empty for none, or depth alone."""
+        """Image topic of the first camera, different from `second`; empty without one, or if there is only depth."""
         asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
         silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
         if silent and not asked:
@@ -67,23 +67,23 @@ class TopicChoice:
             self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
         compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same as the raw ones
         found = [topic for topic in found if topic not in depth and (topic == asked or topic not in compressed)]
-        usual = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kinds of kitti2bag
+        usual = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kitti2bag variants
         return self._one_of(found, asked, usual, "image", "images")
 
     def imu(self) -> str:
-        """An IMU's topic, empty for none."""
+        """Topic of an IMU; empty for none."""
         if not self._settings.imu:
             return ""
         return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, naming.IMU, "Imu", "Imu messages")
 
     def gnss(self) -> str:
-        """The topic of fixes, empty for none."""
+        """Topic of GNSS fixes; empty for none."""
         asked = self._settings.gnss_topic
         return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
 
     def camera(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
-        """The camera of an image topic with its first CameraInfo of use, by its frame that of the first image if there
-        are some of several cameras; None without, which is an error where it is asked for."""
+        """The camera of an image topic with its first usable CameraInfo. If the messages are of several cameras, the
+        first in the frame of the first image. None without; that is an error if the topic was asked for."""
         info_topic = info_topic or info_topic_beside(topic)
         problem, usable, image = f"no CameraInfo on {info_topic}", list[CameraTopic](), self._bag.first(topic)
         frame = frame_name(image.header.frame_id) if image else ""
@@ -91,7 +91,7 @@ class TopicChoice:
             info = info_of(topic, message)
             try:
                 decode_camera(info, np.eye(4), info_topic)
-            except MessageError as error:  # drivers send zeros before the calibration is there
+            except MessageError as error:  # drivers send zeros until they have the calibration
                 problem = str(error)
                 continue
             usable.append(CameraTopic(topic, info))
@@ -114,7 +114,7 @@ class TopicChoice:
         return next((topic for topic in (asked, *naming.TRUTHS) if topic in found), "")
 
     def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
-        """The topic that is asked for, else the usual one, else the only one; empty where that leaves a choice."""
+        """The requested topic, else the usual one, else the only one; empty if several remain."""
         if asked:
             if asked not in found:
                 raise UsageError(f"{self._path}: no {messages} on {asked}; {self._contents()}")

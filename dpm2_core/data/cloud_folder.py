@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of PCD or PLY files, one a scan, as a `Source`."""
+"""A folder of PCD or PLY files, one per scan, as a `Source`."""
 
 from __future__ import annotations
 
@@ -25,27 +25,28 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Frame
 
 SUFFIXES = (".pcd", ".ply")
-_LONGEST = 30_000_000_000  # ns from one scan to the next: beyond it numbers count something else, such as ms
+_LONGEST = 30_000_000_000  # ns between scans: if it is longer, the numbers are something else, such as ms
 _PCD_LINES = 10  # of a header: the package reads no more
-_PACKED = 100  # times longer than packed: LZF makes at most 264 bytes of 3
-_MOST_COLUMNS = 1000  # of a PCD file; a normal and its curvature are 4, a histogram of features is 308
+_PACKED = 100  # largest accepted compression ratio: LZF makes at most 264 bytes from 3
+_MOST_COLUMNS = 1000  # of a PCD file; a normal with curvature has 4, a histogram of features 308
 _PAIR = re.compile(r"(?:.*\D)?(\d{9,10})[_-](\d{1,9})")
-"""Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without the zeros before them."""
+"""Seconds since 1970 and their fraction, of 3, 6 or 9 digits; nanoseconds also without leading zeros."""
 _EPOCHS = ((10**8, 10**11, 10**9), (10**11, 10**14, 10**6), (10**14, 10**17, 10**3), (10**17, 10**20, 1))
-"""From, to, ns: a number in a name that is a time since 1970 after 1973."""
+"""Range from, to, and ns per unit: numbers in names that are times since 1970, after 1973."""
 
-_USUALLY = 3  # numbers whose steps are more than so many times the least are no count: milliseconds of a clock
+_USUALLY = 3  # a median step above this multiple of the common divisor: no count of scans, but ms of a clock
 
 
 class CloudFolder(IndexedSource):
-    """Scans in the order of the numbers in their names. See `Source`; neither images nor ground truth.
+    """Scans in the order of the numbers in their names. See `Source`; no images and no ground truth.
 
     Fields are those of PointCloud2: intensity, and the time of each point, under their usual names. The stamp is the
-    last number in the name where all of them are times since 1970 (s, ms, us or ns), or the last two, seconds and their
-    fraction, or a date and the time of day; else they are `input.period` apart, more where numbers are missing.
+    last number in the name if all of these are times since 1970 (s, ms, us or ns). It may also be the last two numbers,
+    seconds and their fraction, or a date and time of day. Else scans are `input.period` apart, more where numbers are
+    missing.
 
     Raises:
-        UsageError: no such file in the folder, or what reads PCD is not installed.
+        UsageError: no such file in the folder, or the package that reads PCD is not installed.
     """
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
@@ -65,11 +66,11 @@ class CloudFolder(IndexedSource):
             if missing := int(numbers[-1]) + 1 - len(numbers):
                 self.notes.append(f"{folder}: {missing} numbers are missing among the names: taken to be scans as well")
         if any(file.suffix.lower() == ".pcd" for file in self._files):
-            _pcd_types()  # now, rather than at the first scan
+            _pcd_types()  # report a missing package now, not at the first scan
         self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`."""
+        """See `IndexedSource`."""
         file, stamp = self._files[position], int(self.stamps[position])
         try:
             frame = self._frames.frame(stamp, _cloud(file, stamp), position)
@@ -82,9 +83,9 @@ class CloudFolder(IndexedSource):
 
 
 def _cloud(path: Path, stamp: int) -> Any:
-    """As a sensor_msgs/PointCloud2, that all that is known of clouds holds."""
+    """A file as a sensor_msgs/PointCloud2, so that it is decoded like any cloud message."""
     columns = _read_pcd(path) if path.suffix.lower() == ".pcd" else read_vertices(path)
-    # PointField has no 64-bit integers: times since 1970 in ns, whose differences count.
+    # PointField has no 64-bit integers, as in times since 1970 in ns; only their differences matter.
     parts = {name: part.astype(np.float64) if part.dtype.itemsize == 8 else part for name, part in columns.items()}
     if not parts:
         raise UsageError(f"{path}: no fields")
@@ -109,7 +110,7 @@ def _pcd_types() -> tuple[Any, Any]:
 
 
 def _pcd_header(file: BinaryIO) -> list[str]:
-    """The lines that the package takes for the header; the data come next."""
+    """The lines that the package reads as the header; the data follow."""
     lines = list[str]()
     while len(lines) < _PCD_LINES and not (lines and lines[-1].startswith("DATA")) and (line := file.readline()):
         if (text := line.decode().strip()) and not text.startswith("#"):
@@ -118,14 +119,14 @@ def _pcd_header(file: BinaryIO) -> list[str]:
 
 
 def _check_header(header: Any, file: BinaryIO) -> None:
-    """Not thousands of columns: the package makes a name for each, which is gigabytes for a few digits in a header. Nor
-    other data than it announces: the package takes what there is, or makes room for what there is not.
+    """Check a header before the package uses it. The package makes a name for each column, which is gigabytes for a few
+    digits in a header. It also accepts less data than announced, or allocates memory for data that is not there.
 
     Args:
-        file: where its data begin.
+        file: at the start of its data.
 
     Raises:
-        ValueError: there are.
+        ValueError: there are too many columns, or the amount of data differs.
     """
     if sum(header.count) > _MOST_COLUMNS:
         raise ValueError(f"more than {_MOST_COLUMNS} columns")
@@ -138,8 +139,8 @@ def _check_header(header: Any, file: BinaryIO) -> None:
 
 
 def _counts(files: list[Path]) -> NDArray[np.int64]:
-    """(N,) which scan of the drive each of the sorted files is, the first 0: by their last numbers if those count, some
-    of which may be missing; else one is right after the other."""
+    """(N,) index of each of the sorted files in the drive, starting at 0. By the last numbers in their names if these
+    count scans, of which some may be missing; else the files are consecutive."""
     last = [numbers[-1] for file in files if (numbers := _numbers(file))]
     whole = len(last) == len(files) > 1 and all(number == int(number) and number < 10**15 for number in last)
     steps = np.diff(np.array([int(number) for number in last], np.int64)) if whole else np.zeros(1, np.int64)
@@ -150,12 +151,12 @@ def _counts(files: list[Path]) -> NDArray[np.int64]:
 
 
 def _numbers(file: Path) -> list[Decimal]:
-    """All numbers in a name, the first first: of 2023-11-14_22-13-20_750 as of scan_012."""
+    """All numbers in a name, in order: of 2023-11-14_22-13-20_750 as of scan_012."""
     return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
 
 
 def name_times(files: list[Path]) -> list[int]:
-    """ns of each file by its name; empty where they are not all times since 1970, each another one, of one drive."""
+    """ns of each file from its name; empty unless all names are different times since 1970, of one drive."""
     dates = [date for file in files if (date := date_ns(file.stem)) is not None]
     pairs = [match for file in files if (match := _PAIR.fullmatch(file.stem))]
     widths = {len(match[2]) for match in pairs}

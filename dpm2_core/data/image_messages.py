@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image, CompressedImage and CameraInfo messages to arrays, duck-typed: of rclpy or of rosbags."""
+"""Image, CompressedImage and CameraInfo messages to arrays, duck-typed for rclpy and rosbags."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.frame import Array, Camera
 
 DISTORTIONS = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients of a camera's distortion that OpenCV supports."""
+"""Numbers of distortion coefficients that OpenCV supports."""
 _WIDEST_IMAGE = 1 << 15
 # Encoding to (numpy type, channels, OpenCV conversion to RGB). 8UC3 and 8UC4 are BGR(A), as in cv_bridge.
 _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -34,7 +34,7 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
     "yvyu": ("u1", 2, cv2.COLOR_YUV2RGB_YVYU),
-    # Half as many rows of color below those of brightness.
+    # Half as many rows of color follow the rows of brightness.
     "nv12": ("u1", 1, cv2.COLOR_YUV2RGB_NV12),
     "nv21": ("u1", 1, cv2.COLOR_YUV2RGB_NV21),
     # OpenCV names a Bayer pattern by its second row, ROS by its first.
@@ -55,14 +55,14 @@ _FISHEYE_COUNT = 4
 
 
 def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 10 to 16 bits the upper 8 count.
+    """sensor_msgs/Image or CompressedImage to (H, W, 3) uint8 RGB; of 10 to 16 bits the upper 8 are kept.
 
     Args:
         msg: the message.
         size: width and height of the camera: a JPEG or PNG of another size is not decoded.
 
     Raises:
-        MessageError: an encoding that is not supported, data shorter than declared, or a JPEG or PNG that is damaged.
+        MessageError: an unsupported encoding, data shorter than declared, or a damaged JPEG or PNG.
     """
     if not hasattr(msg, "encoding"):
         return _decode_compressed(msg, size)
@@ -90,7 +90,7 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
 
 
 def _check_even(encoding: str, width: int, height: int) -> None:
-    """Raises MessageError where two pixels share a color, and one has none to share it with."""
+    """Raise MessageError if an encoding in which neighboring pixels share a color is used with an odd size."""
     two_rows = encoding.lower() in _HALF_COLOR
     if (two_rows or "yu" in encoding.lower() or "yv" in encoding.lower()) and (width % 2 or (two_rows and height % 2)):
         raise MessageError(
@@ -110,26 +110,26 @@ def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uin
     _, _, conversion = _IMAGE_ENCODINGS.get(encoding, ("", 0, None))
     if conversion is None or not encoding.startswith("bayer_") or "compressed bgr" in compression:
         return pixels
-    # image_transport compresses the mosaic as it is.
+    # image_transport compresses the raw Bayer mosaic.
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), conversion), np.uint8)
 
 
 def is_depth(msg: Any) -> bool:
-    """Whether an image shows how far things are, not how they look."""
+    """Whether an image contains depth."""
     named = str(getattr(msg, "encoding", getattr(msg, "format", ""))).lower()  # "16UC1; png compressed "
     return named.startswith(_DEPTH) or "compresseddepth" in named
 
 
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
-    """sensor_msgs/CameraInfo to `Camera`: K and D as they are; P's left block where D is zero, the image rectified.
+    """sensor_msgs/CameraInfo to `Camera`: K and D unchanged, or the left block of P if D is zero (rectified image).
 
-    A fisheye (equidistant with 4 coefficients, also zeros) comes as the pinhole camera of the same focal length that
-    `rectified` makes of its images.
+    A fisheye (equidistant with 4 coefficients, also zeros) is returned as the pinhole camera of the same focal length
+    to which `rectified` converts its images.
 
     Args:
-        info: with model plumb_bob, rational_polynomial (whose 8 coefficients stay in OpenCV's order) or equidistant.
+        info: its model is plumb_bob, rational_polynomial (8 coefficients, in OpenCV's order) or equidistant.
         T_lidar_cam: (4, 4) optical frame of the camera to LiDAR frame.
-        name: what messages call it.
+        name: name used in messages.
 
     Raises:
         MessageError: another distortion model, no focal length, or no size.
@@ -155,13 +155,13 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
 
 
 def info_of(topic: str, info: Any) -> Any:
-    """The CameraInfo of a topic's images: of the part of the sensor that they show, in their pixels (roi, binning); and
-    without distortion, so that P counts, for image_rect and the like, which image_proc publishes beside the CameraInfo
-    of the raw image, and for KITTI's, as kitti2bag does."""
+    """The CameraInfo for a topic's images: cropped and scaled to the part of the sensor that they show (roi, binning).
+    Distortion is removed, so that P is used, for rectified images: image_rect and the like, which image_proc publishes
+    next to the CameraInfo of the raw image, and KITTI's from kitti2bag."""
     name = topic.removesuffix("/compressed").rpartition("/")[2]
     is_rectified = bool((name.startswith("image_rect") or topic.startswith("/kitti/")) and info.p[0])
     roi, x, y = info.roi, max(info.binning_x, 1), max(info.binning_y, 1)
-    size = (roi.width or info.width) // x, (roi.height or info.height) // y  # zeros stand for all, and for no binning
+    size = (roi.width or info.width) // x, (roi.height or info.height) // y  # zeros mean all pixels, and no binning
     part = np.array([[1 / x, 0, -roi.x_offset / x], [0, 1 / y, -roi.y_offset / y], [0, 0, 1]])
     if not is_rectified and size == (info.width, info.height) and (part == np.eye(3)).all():
         return info
@@ -171,20 +171,20 @@ def info_of(topic: str, info: Any) -> Any:
 
 
 def info_topic_beside(image_topic: str) -> str:
-    """The topic of the CameraInfo beside images; relative for a relative one."""
+    """The CameraInfo topic in the same namespace as an image topic; relative for a relative topic."""
     folder = image_topic.removesuffix("/compressed").rpartition("/")[0]
     return f"{folder}/camera_info".removeprefix("" if folder or image_topic.startswith("/") else "/")
 
 
 def is_fisheye(info: Any) -> bool:
-    """Whether images of a CameraInfo that `decode_camera` takes are to be `rectified`."""
+    """Whether images of a CameraInfo that `decode_camera` accepts must be `rectified`."""
     return info.distortion_model in _FISHEYE and len(info.d) == _FISHEYE_COUNT
 
 
 def rectified(pixels: NDArray[np.uint8], info: Any) -> NDArray[np.uint8]:
-    """(H, W, 3) of an equidistant fisheye as a pinhole camera with the same K would see it, black where it cannot.
+    """(H, W, 3) of an equidistant fisheye as seen by a pinhole camera with the same K, black outside its view.
 
-    What is 90 degrees and more off the axis is left out, and what is far off it as the image's border says.
+    Directions 90 degrees and more off the axis are lost, and so are those outside the pinhole image's border.
     J. Kannala, S. Brandt, "A generic camera model and calibration method", PAMI 2006, with 4 coefficients.
     """
     maps = _fisheye_maps(tuple(map(float, info.k)), tuple(map(float, info.d)), pixels.shape[1::-1])

@@ -21,7 +21,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import R_AHEAD, Array, Camera, Frame
 from dpm2_core.geometry import se3
 
-_FIELD_OF_VIEW = 72.0  # deg, across the width, of its cameras
+_FIELD_OF_VIEW = 72.0  # deg, horizontal, of its cameras
 _PERIOD = 0.1  # s between sweeps
 # The simulated camera's axes are x forward, y left, z up; those of a `Camera` x right, y down, z forward.
 _T_BODY_OPTICAL = se3.make(R_AHEAD, np.zeros(3))
@@ -30,9 +30,9 @@ _T_BODY_OPTICAL = se3.make(R_AHEAD, np.zeros(3))
 class KittiCarlaSource(IndexedSource):
     """One town, by its folder, its `generated` folder, or the root and `input.sequence` (such as Town01).
 
-    A sweep is as measured: each point is in the frame of the LiDAR at its own time. The stamp is that of the first
-    point, which is also when the image was taken. There is no intensity: the points have the cosine of the angle of
-    incidence in its place.
+    Sweeps are not de-skewed: each point is in the LiDAR frame at its own time. The stamp is that of the first point,
+    which is also the time of the image. There is no intensity; the cosine of the angle of incidence is used in its
+    place.
 
     Raises:
         UsageError: no sweeps, or a text file is damaged; the message names it.
@@ -51,21 +51,21 @@ class KittiCarlaSource(IndexedSource):
         self.camera = self._camera()
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`; `Frame.index` is the number in the file name."""
+        """See `IndexedSource`; `Frame.index` is the number in the file name."""
         stamp, number, problem = int(self.stamps[position]), int(self.numbers[position]), None
         try:
             columns = read_ply(self._sweeps[position], ("x", "y", "z", "cos_angle_lidar_surface", "timestamp"))
         except UsageError as error:
             columns, problem = np.empty((0, 5)), str(error)
         points = columns[:, :4].astype(np.float32)
-        points[:, 3] = np.minimum(np.abs(points[:, 3]), 1)  # rounded, a cosine may be above it
+        points[:, 3] = np.minimum(np.abs(points[:, 3]), 1)  # a rounded cosine may exceed 1
         offset = (columns[:, 4] - stamp * 1e-9).astype(np.float32) if len(points) else None
         points = correct_vertical_angle(points, self._settings.angle_correction(0.0))
         images = images_of(self._image_path(number), self.camera, self.notes)
         return Frame(stamp, points, offset, images, index=number, problem=problem)
 
     def _trajectory(self) -> tuple[NDArray[np.int64], Array | None]:
-        """Stamps (len,) ns and poses (len, 4, 4) T_world_lidar at them, of the file with one pose a millisecond."""
+        """Stamps (len,) ns and poses (len, 4, 4) T_world_lidar at them, from the file with one pose per millisecond."""
         path, seconds = self.folder / "full_poses_lidar.txt", self.numbers * _PERIOD
         rows = read_numbers(path, 13)
         if not len(rows):
@@ -82,7 +82,7 @@ class KittiCarlaSource(IndexedSource):
         return np.round(np.where(near, times[at], seconds) * 1e9).astype(np.int64), poses
 
     def _extrinsic(self) -> Array | None:
-        """LiDAR to the optical frame of camera 0; None where lidar_to_cam0.txt is missing."""
+        """LiDAR to the optical frame of camera 0; None if lidar_to_cam0.txt is missing."""
         rows = read_numbers(self.folder / "lidar_to_cam0.txt", 12)
         return se3.inverse(_T_BODY_OPTICAL) @ se3.from_rows(rows[0]) if len(rows) else None
 
@@ -97,7 +97,7 @@ class KittiCarlaSource(IndexedSource):
             self.notes.append(f"{self.folder}: images are left out: there is no lidar_to_cam0.txt")
             return None
         focal = size[0] / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
-        # The principal point is the middle of the image; pixel centers are at integers here.
+        # The principal point is the image center; pixel centers are at integers here.
         K = np.array([[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]])
         return Camera(K, se3.inverse(self.T_cam_lidar), size, name="cam0")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of an Ouster LiDAR as it comes over the network, as a `Source`: .pcap, or .osf of Ouster's own tools."""
+"""A recording of an Ouster LiDAR's network packets, as a `Source`: .pcap, or .osf of Ouster's own tools."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
 from dpm2_core.frame import NO_POINTS, Array, Frame
 
-# Its dependencies hold rosbags and others at releases that this package cannot use; to read, it needs none of them.
+# Its dependencies pin rosbags and others to releases that this package cannot use; for reading, none are needed.
 INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
-_RECEIVED = 1  # the bit of a column's status
-_FRAME = "os_sensor"  # of the housing
+_RECEIVED = 1  # bit in a column's status
+_FRAME = "os_sensor"  # frame of the housing
 _PERIOD = 100_000_000  # ns, the longest sweep
-_INTENSITY = ("REFLECTIVITY", "SIGNAL")  # the first that a recording has
+_INTENSITY = ("REFLECTIVITY", "SIGNAL")  # the first one that the recording has
 
 
 class OusterSource:
-    """Sweeps in the frame of the sensor's housing, stamped when their first column was measured. See `Source`.
+    """Sweeps in the frame of the sensor's housing, stamped at the time of their first column. See `Source`.
 
-    Intensity is the reflectivity, and each column has its time. Of a .pcap the sensor's IMU is read, too; it needs the
-    sensor's metadata beside it: the .json whose name begins alike. There are neither images nor ground truth.
+    Intensity is the reflectivity, and each column has its time. From a .pcap the sensor's IMU is read, too. A .pcap
+    needs the sensor's metadata next to it: the .json whose name begins alike. There are no images and no ground truth.
 
     Raises:
         UsageError: the file cannot be read, or has several sensors of which `input.points_topic` names none.
@@ -48,7 +48,7 @@ class OusterSource:
         self.path, settings = Path(path), settings or InputSettings()
         self.name, self.notes = self.path.stem, list[str]()
         self._sensor, self._project, self._sweeps = _opened(self.path, settings.points_topic)
-        # An .osf has an index, or one would be written into it.
+        # An .osf has an index; if one is missing, the package would write it into the file.
         self._count = len(self._sweeps) if self._sweeps.is_indexed else sum(1 for _ in self._sweeps)
         if not self._count:
             raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
@@ -60,9 +60,9 @@ class OusterSource:
         return self._count
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Frames start..stop-1 by position; the first that cannot be read has `problem` set and is the last."""
+        """Frames start..stop-1 by position; the first unreadable one has `problem` set and is the last."""
         wanted, stamp = range(*slice(start, stop).indices(self._count)), 0
-        # By its index the package (1.0) finds the first sweep of an .osf in place of its last.
+        # With its index, the package (1.0) finds the first sweep of an .osf in place of its last.
         upcoming = islice(self._sweeps, wanted.start, wanted.stop)
         samples = _samples(self.path, self._sensor) if self._reads_imu else iter(())
         self._imu.clear()
@@ -72,7 +72,7 @@ class OusterSource:
                     raise UsageError("its data are not there")
                 columns, stamp = self._columns(sweep[0], stamp)
                 self._fill(samples, stamp + _PERIOD)
-            except Exception as error:  # damaged files raise several kinds of the package's own
+            except Exception as error:  # the package raises several error types of its own for damaged files
                 problem = f"{self.path}: sweep {index}: {_reason(error)}"
                 self.notes.append(problem)
                 yield Frame(stamp, NO_POINTS, index=index, problem=problem)
@@ -80,10 +80,10 @@ class OusterSource:
             yield self._frames.frame(stamp, point_cloud(columns, stamp, _FRAME), index)
 
     def _fill(self, samples: Iterator[tuple[int, Any]], until: int) -> None:
-        """Samples of the IMU up to the first one after a time, ns."""
+        """Add samples of the IMU up to the first one after a time, ns."""
         try:
             for stamp, message in samples:
-                with suppress(MessageError):  # one that no sensor measures, or that is not newer than the last
+                with suppress(MessageError):  # an impossible sample, or one that is not newer than the last
                     self._imu.add(stamp, message)
                 if stamp > until:
                     break
@@ -91,7 +91,7 @@ class OusterSource:
             self.notes.append(f"{self.path}: going on without the IMU: {_reason(error)}")
 
     def _columns(self, sweep: Any, last: int) -> tuple[dict[str, NDArray[Any]], int]:
-        """Fields of PointCloud2 of what has returned, and the stamp, ns; `last` where no column was received."""
+        """PointCloud2 fields of the returned points, and the stamp, ns; the stamp `last` if no column was received."""
         received = (sweep.status & _RECEIVED).astype(bool)
         times = sweep.timestamp.astype(np.int64)
         stamp = int(times[received][0]) if received.any() else last
@@ -107,7 +107,7 @@ class OusterSource:
 
 
 def _samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
-    """Stamp, ns, and sensor_msgs/Imu along the axes of the housing, of each sample of a sensor's IMU."""
+    """Stamp, ns, and sensor_msgs/Imu along the axes of the housing, for each sample of a sensor's IMU."""
     from ouster.sdk import core, open_packet_source
 
     packets = open_packet_source(str(path))
@@ -125,8 +125,8 @@ def _samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
 
 
 def _opened(path: Path, sensor: str) -> tuple[int, Callable[[NDArray[Any]], Array], Any]:
-    """Of the sensor with that serial number, or the only one: its position in the file, what makes (H, W, 3) m of its
-    ranges (H, W), and its sweeps."""
+    """The sensor with that serial number, or the only one: its position in the file, the function from ranges (H, W) to
+    points (H, W, 3) m, and its sweeps."""
     try:
         from ouster.sdk import core, open_source
     except ModuleNotFoundError as error:
@@ -142,10 +142,10 @@ def _opened(path: Path, sensor: str) -> tuple[int, Callable[[NDArray[Any]], Arra
         return chosen, core.XYZLut(sweeps.sensor_info[0]), sweeps
     except UsageError:
         raise
-    except Exception as error:  # of the package, whose own are derived from nothing else
+    except Exception as error:  # of the package, whose error types have no common base
         raise UsageError(f"{path}: cannot be read as a recording of an Ouster: {_reason(error)}") from None
 
 
 def _reason(error: Exception) -> str:
-    """The last sentence of an error of the package, whose first ones repeat what was asked for."""
+    """The last sentence of one of the package's errors; the first ones only repeat the request."""
     return " ".join(str(error).rpartition("more details:")[2].split())[:200] or type(error).__name__

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver or a relay that sends a scan, a part of it or an image again under a new stamp: that would look like a halt.
+"""Detects a driver or relay that repeats a scan, a part of it or an image with a new stamp. It looks like a halt.
 
-A caller may use its arrays again.
+Clouds are copied where needed: a caller may reuse its arrays.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from dpm2_core.geometry.compiled import compiled
 
 REPEATED = "the same cloud as before: the LiDAR or its driver repeats itself"
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
-_STOPS = 1.5  # m/s: robots of simulations without noise stop dead, and then see the same again; none that is faster
+_STOPS = 1.5  # m/s: slower robots may stop at once and, in simulations without noise, measure the same cloud again
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
-_STILL, _LONG = 0.02, 30  # m and clouds: a robot that has moved less in so many stands; if all differ, noise has no end
-# Of the points, of those that are the same again as of the others; noise leaves 0.2 at most, in coarse steps.
+_STILL, _LONG = 0.02, 30  # m, clouds: a robot within that distance stands; if that many clouds differ, there is noise
+# Share of the points that repeat, and share of those that do not; coarse noise leaves at most 0.2 unchanged.
 _PART = 0.3
 _LEAST = 100  # points that are compared
-_LOOKED_AT = 8192  # points: noise changes any few of them
-_ROWS = 8  # of an image each so many-th row: noise changes any of them
-_Seen = tuple[int, Guess | None, Array]  # checksum; the guess when it was new; R (3, 3) that it has turned since
+_LOOKED_AT = 8192  # points in the checksum: noise changes any sample of them
+_ROWS = 8  # every 8th row of an image is compared: noise changes every row
+_Seen = tuple[int, Guess | None, Array]  # checksum; guess when the cloud was new; rotation R (3, 3) since then
 
 
 class RepeatedCloud:
-    """Remembers the last registered cloud, and how the sensor has moved since it was new."""
+    """Stores the last registered cloud, and the motion of the sensor since that cloud was new."""
 
     def __init__(self) -> None:
         self._registered: _Seen | None = None
         self._now: _Seen | None = None
         self._again = False
-        self._T_still, self._differ = np.eye(4), 0  # where it stands, and how many clouds have differed there
-        self._has_noise = False  # the same cloud twice is then none, wherever the robot is
+        self._T_still, self._differ = np.eye(4), 0  # pose at rest, and number of clouds that differed there
+        self._has_noise = False  # then two equal clouds are always a repetition, also of a robot at rest
 
     def repeats(self, frame: Frame, speed: float, turn: Array | None = None) -> bool:
-        """Whether a cloud is the registered one to the last bit although the sensor should have moved meanwhile.
+        """Whether a cloud is bit-identical to the registered one although the sensor should have moved since.
 
         Args:
-            speed: m/s, by the motion before. A repetition that was taken for a halt has ended that motion; the frame's
-                guess and `turn` count from when the cloud was new.
-            turn: R_before_now (3, 3) since the last registered frame, as an IMU has it; None where it shows none.
+            speed: m/s, from the motion before. A repetition that was taken for a halt has ended that motion; the
+                frame's guess and `turn` are relative to the time when the cloud was new.
+            turn: R_before_now (3, 3) since the last registered frame, from an IMU; None if the IMU gives none.
         """
         before, checksum = self._registered, _checksum(frame.points)
         if not len(frame.points) or before is None or before[0] != checksum:
@@ -66,20 +66,20 @@ class RepeatedCloud:
         return self._again
 
     def keep(self, T_odom_lidar: Array, same: float) -> None:
-        """This cloud was registered, at a pose (4, 4); `same`: see `RepeatedPart`."""
+        """Keep the current cloud, registered at a pose (4, 4); `same`: see `RepeatedPart`."""
         self._registered = self._now
         stands = np.linalg.norm(T_odom_lidar[:3, 3] - self._T_still[:3, 3]) < _STILL
-        if not stands or same > _PART:  # of a simulation without noise all but what moves there is the same
+        if not stands or same > _PART:  # in a simulation without noise all static points repeat
             self._T_still, self._differ = T_odom_lidar, 0
         self._differ += 1
         self._has_noise |= self._differ > _LONG
 
 
 class RepeatedPart:
-    """Remembers the last cloud.
+    """Stores the last cloud.
 
     Attributes:
-        same: share of the points of the last cloud that are those of the one before to the last bit.
+        same: share of the points of the last cloud that are bit-identical to points of the cloud before.
     """
 
     def __init__(self) -> None:
@@ -88,9 +88,9 @@ class RepeatedPart:
         self._known = np.zeros(0, np.uint64)
 
     def new(self, frame: Frame) -> Frame:
-        """A frame without the points that are those of the one before, to the last bit, where they are many.
+        """A frame without the points that are bit-identical to points of the frame before, if these are many.
 
-        There must be as many others: in a simulation without noise a robot at rest sees nearly all of them again.
+        As many points must be new: in a simulation without noise, nearly all points repeat for a robot at rest.
         """
         known, self._known = self._known, _marks(_some(frame.points))
         self.same = float(np.isin(self._known, known).mean()) if len(self._known) >= _LEAST else 0.0
@@ -103,7 +103,7 @@ class RepeatedPart:
         return replace(frame, points=frame.points[new], time_offset=offset)
 
     def _keep(self, points: Points) -> None:
-        """In one place for all clouds: new memory for each would take longer than the rest."""
+        """Copy into one buffer for all clouds: new memory for each would take longer than everything else."""
         self._count = len(points)
         if len(self._buffer) < self._count:
             self._buffer = np.empty((self._count, 4), np.float32)
@@ -111,16 +111,16 @@ class RepeatedPart:
 
 
 class RepeatedImages:
-    """Remembers the last image of each camera, when it was taken, and the cloud beside it."""
+    """Stores the last image of each camera, its time, and the cloud in the same frame."""
 
     def __init__(self) -> None:
-        self._last: dict[str, tuple[int, int, int]] = {}  # checksums of image and cloud, ns
+        self._last: dict[str, tuple[int, int, int]] = {}  # checksums of image and cloud; time, ns
 
     def new(self, frame: Frame) -> tuple[Image, ...]:
-        """The images of a frame that are not those of before under a new stamp.
+        """The images of a frame that do not repeat the images before under a new stamp.
 
-        One image may be the nearest of two clouds. In a simulation without noise a robot at rest sees the same again,
-        but then its cloud is the same too.
+        One image may be the nearest to two clouds. In a simulation without noise, a robot at rest sees the same image
+        again, but then its cloud is the same too.
         """
         if not frame.images:
             return ()
@@ -139,14 +139,14 @@ def _checksum(points: Points) -> int:
 
 
 def _some(points: Points) -> Points:
-    """About one in 64 of those that have returned, by the bits of x: of each cloud the same ones."""
+    """About one in 64 of the measured points, selected by the bits of x: the same ones in every cloud."""
     some = points[_chosen(np.ascontiguousarray(points).view(np.uint32))]
     return some[returned(some)]
 
 
 @compiled(int64[::1](types.Array(uint32, 2, "C", readonly=True)))
 def _chosen(bits: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Indices of the points, of which (N, 4) are the bits, for `_some`."""
+    """Indices of points for `_some`, from their bits (N, 4)."""
     which, count = np.empty(len(bits), np.int64), 0
     for i in range(len(bits)):
         if np.uint32(bits[i, 0] * np.uint32(2654435761)) < 2**26:
@@ -156,6 +156,6 @@ def _chosen(bits: NDArray[np.uint32]) -> NDArray[np.int64]:
 
 
 def _marks(points: Points) -> NDArray[np.uint64]:
-    """(N,) a number for the bits of each place."""
+    """(N,) a hash of the bits of each position."""
     x, y, z = np.ascontiguousarray(points[:, :3].T).view(np.uint32).astype(np.uint64)
     return x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)

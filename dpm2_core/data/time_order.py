@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times of a recording that cannot be, by those around them."""
+"""Detects and corrects wrong times in a recording from the times around them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from dpm2_core.frame import Array, Frame
 
 Item = TypeVar("Item")
 
-_AROUND = 2 * FEW + 1  # clouds on either side that show which of the stamps between them are off: more than may be
+_AROUND = 2 * FEW + 1  # clouds on either side that show which stamps are wrong: more than can be wrong
 
 
 def out_of_order(times: Array) -> NDArray[np.bool_]:
-    """Which of the times (N,) increase with the others only if they are changed: at most three in a row, between two
-    that are in order. One that is 1 s off at 10 Hz comes after some later ones, or before some earlier ones."""
+    """Which of the times (N,) must be changed to make all times increase: at most three in a row, between two times in
+    order. For example, a stamp that is 1 s off at 10 Hz is after some later stamps, or before some earlier ones."""
     ordered = np.zeros(len(times), bool)
     ordered[_longest_increasing(times)] = True
     ends = np.flatnonzero(ordered)
@@ -36,13 +36,13 @@ def out_of_order(times: Array) -> NDArray[np.bool_]:
 
 
 def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[int, int], None]) -> Iterator[RawMessage]:
-    """The messages of a recording, those clouds of a topic whose stamps are off with stamps between their neighbors'.
+    """The messages of a recording; wrong stamps of clouds on a topic are replaced by stamps between their neighbors'.
 
     A stamp that is repeated stays: it may be the same cloud twice.
 
     Args:
-        messages: in recorded order; up to seven clouds, and what came between them, are held back.
-        corrected: is told the number of each such cloud, and the stamp that it had, ns.
+        messages: in recorded order; up to seven clouds, and the messages between them, are held back.
+        corrected: called with the number of each such cloud, and its original stamp, ns.
     """
 
     def stamp_of(message: RawMessage) -> int | None:
@@ -52,7 +52,7 @@ def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[in
 
 
 def frames_in_order(source: Source, start: int, stop: int, corrected: Callable[[int, int], None]) -> Iterator[Frame]:
-    """The same for frames start..stop-1 of a drive, by those before and after them, too; a bag has done so itself."""
+    """The same for frames start..stop-1 of a drive, also using the frames around them; a bag is corrected already."""
     if getattr(source, "in_order", False):
         return source.frames(start, stop)
     first = max(start - _AROUND, 0)
@@ -66,7 +66,7 @@ def frames_in_order(source: Source, start: int, stop: int, corrected: Callable[[
 
 
 def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -> None:
-    """Add to the notes, once, that there are such stamps (ns): the first one, and its frame's number."""
+    """Add a note, once, that stamps (ns) were corrected, with the first one and the number of its frame."""
     what = f"{whose}stamps that are not between their neighbors are taken to be"
     note_once(notes, what, f"the first at frame {number}: {stamp * 1e-9:.3f} s")
 
@@ -77,11 +77,11 @@ def _in_order(
     restamp: Callable[[Item, int], Item],
     corrected: Callable[[int, int], None],
 ) -> Iterator[Item]:
-    """`stamp_of`: ns, None of what is between the clouds."""
+    """`stamp_of`: ns, or None for items that are not clouds."""
     held, stamps, decided, number = deque[tuple[Item, int | None]](), deque[int](), 0, 0
 
     def decide() -> Iterator[Item]:
-        """All up to the first cloud that is held."""
+        """Release all items up to the first cloud that is held."""
         nonlocal decided, number
         while held[0][1] is None:
             yield held.popleft()[0]
@@ -110,13 +110,13 @@ def _in_order(
 
 
 def _in_place(stamps: Sequence[int], which: int) -> int:
-    """The stamp (ns) of one of some clouds in a row, put between its neighbors where it is off."""
+    """The stamp (ns) of one of several consecutive clouds, interpolated from its neighbors if it is wrong."""
     near = list(stamps)
     increase = [before < after for before, after in pairwise(near)]
     repeated = near[which] in near[max(which - 1, 0) : which] + near[which + 1 : which + 2]
     if all(increase) or repeated:
         return near[which]
-    since = np.array([stamp - near[0] for stamp in near], np.float64)  # whose differences may have more than 64 bits
+    since = np.array([stamp - near[0] for stamp in near], np.float64)  # differences may exceed 64 bits
     off = out_of_order(since)
     known = np.flatnonzero(~off)
     stamp = near[0] + round(np.interp(which, known, since[known]))
@@ -124,7 +124,7 @@ def _in_place(stamps: Sequence[int], which: int) -> int:
 
 
 def _longest_increasing(times: Array) -> list[int]:
-    """Where the longest increasing subsequence of the times (N,) is, by patience sorting."""
+    """Indices of the longest increasing subsequence of the times (N,), by patience sorting."""
     smallest, places, before = list[float](), list[int](), list[int]()
     for i, time in enumerate(times.tolist()):
         length = bisect_left(smallest, time)
