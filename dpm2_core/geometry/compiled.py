@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops over points as machine code, by numba."""
+"""Compiles loops over points to machine code, with numba."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numba
 
 F = TypeVar("F", bound=Callable[..., object])
 READ_F4, READ_F8 = (numba.types.Array(kind, 2, "C", readonly=True) for kind in (numba.float32, numba.float64))
-"""Arrays that may not be written to, as the points of messages are: `f4[:, ::1]` would not take them."""
+"""Read-only arrays, such as the points of messages: `f4[:, ::1]` would not accept them."""
 
 
 def compiled(signature: object) -> Callable[[F], F]:
     """Decorator: compile for these types when the module is imported, in double precision as written, without the GIL.
 
-    The machine code is kept in `__pycache__` beside the source, or in the user's cache folder, so that it is made once
-    after an installation. Where neither can be written, every start compiles anew, and says so; `NUMBA_CACHE_DIR`
-    names another folder. A function may call compiled ones of its own file alone: the cache does not see that another
-    file changed.
+    The machine code is cached in `__pycache__` next to the source, or in the user's cache folder, so that it is made
+    once per installation. If neither is writable, every start compiles again, and prints a message; `NUMBA_CACHE_DIR`
+    sets another folder. A function may call only compiled functions of its own file: the cache does not detect changes
+    in other files.
     """
 
     def decorate(function: F) -> F:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of an image is texture: its brightness, whatever light falls on it."""
+"""Extracts the texture of an image: its brightness, independent of the illumination."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_DARK = 2.0  # gray levels: less contrast is noise
+_DARK = 2.0  # gray levels: lower contrast is noise
 
 
 def local_contrast(gray: NDArray[np.uint8], local: float) -> NDArray[np.float32]:
-    """Brightness (H, W) without what changes over more than `local` pixels, over the contrast around."""
+    """Brightness (H, W) without changes over more than `local` pixels, divided by the contrast of the surroundings."""
     detail = gray.astype(np.float32)
     detail -= cv2.GaussianBlur(detail, (0, 0), local)
     detail /= np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2 * local)) + _DARK

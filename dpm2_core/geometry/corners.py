@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image corners with the depth of a scan: places that two pictures show alike, however smooth the geometry is."""
+"""Image corners with depth from a scan: points that two images show alike, however smooth the geometry is."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from dpm2_core.geometry.sampling import neighbours
 
 SIDE = 8  # samples along a patch
 TEXTURE = SIDE * SIDE
-"""Values of a patch."""
+"""Number of values in a patch."""
 _SIZE = 1.5  # m, edge of the patch around a corner
 _SPACING = 0.5  # m between two corners
 _NEAR, _FAR = 2.0, 35.0  # m of depth: farther away, a pixel is as wide as the spacing of corners
 _CANDIDATES = 600
 _BORDER = 4  # pixels without a corner
-_LOCAL = 8.0  # pixels: light that changes more slowly is no texture
+_LOCAL = 8.0  # pixels: slower changes of brightness are no texture
 _NEIGHBORS, _WITHIN = 12, 10.0  # points of the scan that give the depth, pixels
-_BELL = 4.0  # pixels, the deviation of their weights
-_ROUNDS = (0.2, 0.05, 0.05)  # relative residuals that count half in the fits of a plane: rain and what lies behind
+_BELL = 4.0  # pixels, standard deviation of their weights
+_ROUNDS = (0.2, 0.05, 0.05)  # relative residuals that count half in the plane fits: rain, and points behind the plane
 _SURFACE, _LEAST = 0.05, 5  # relative residual and number of the points that make up the surface
-_SHARE = 0.5  # of the weights around a corner that its surface must have
-_CLEAN = 4  # power of that share by which a corner's clearness counts less: on borders of surfaces they do not recur
-_BLURS = (0.7, 1.4, 2.8, 5.6)  # pixels: a patch is read from the image whose blur is half its spacing
+_SHARE = 0.5  # smallest share of the weights around a corner on its surface
+_CLEAN = 4  # power of that share in a corner's score: corners at borders of surfaces are not repeatable
+_BLURS = (0.7, 1.4, 2.8, 5.6)  # pixels: a patch is sampled from the image whose blur is half the sample spacing
 
 
 class Corners(NamedTuple):
-    """Where (k, 3) corners are, m, in the LiDAR frame, and the patch (k, TEXTURE) around each, of unit length."""
+    """Corner positions (k, 3), m, in the LiDAR frame, and the patch (k, TEXTURE) around each, of unit length."""
 
     xyz: Points
     texture: NDArray[np.float32]
 
 
 def no_corners() -> Corners:
-    """None."""
+    """An empty set of corners."""
     return Corners(np.zeros((0, 3), np.float32), np.zeros((0, TEXTURE), np.float32))
 
 
 def image_corners(pixels: NDArray[np.uint8], K: Array, T_lidar_cam: Array, cloud: Points, most: int) -> Corners:
-    """Up to `most` corners of an image (H, W, 3) that lie on a surface of the scan, the clearest first.
+    """Up to `most` corners of an image (H, W, 3) that lie on a surface of the scan, strongest first.
 
     Args:
         K: (3, 3) of the image, without distortion. T_lidar_cam: (4, 4). cloud: (N, 3) m.
@@ -65,8 +65,8 @@ def image_corners(pixels: NDArray[np.uint8], K: Array, T_lidar_cam: Array, cloud
 
 
 def _corners(image: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
-    """(k, 2) pixels u, v of the local maxima of the smaller eigenvalue of the structure tensor (J. Shi, C. Tomasi,
-    "Good Features to Track", CVPR 1994), to fractions of a pixel, and those eigenvalues."""
+    """(k, 2) subpixel positions u, v of the local maxima of the smaller eigenvalue of the structure tensor (J. Shi,
+    C. Tomasi, "Good Features to Track", CVPR 1994), and those eigenvalues."""
     score = cv2.cornerMinEigenVal(image, 3, ksize=3)
     top = (score == cv2.dilate(score, np.ones((5, 5), np.uint8))) & (score > 0)
     top[:_BORDER] = top[-_BORDER:] = top[:, :_BORDER] = top[:, -_BORDER:] = False
@@ -81,16 +81,16 @@ def _corners(image: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
 def _parabola(
     before: NDArray[np.float32], middle: NDArray[np.float32], after: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Where the parabola through three values, one apart, is highest: -0.5 .. 0.5 from the middle one."""
+    """Position of the maximum of the parabola through three values, one apart: -0.5 .. 0.5 from the middle one."""
     bend = 2 * (2 * middle - before - after)
     return np.clip((after - before) / np.maximum(bend, 1e-12), -0.5, 0.5)
 
 
 def _depth(uv: Array, in_camera: NDArray[np.floating], K: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Depth (k,) m of pixels (k, 2) on the plane through the points (N, 3) around each, and the share (k,) of these
-    that lie on it; 0 where there is no such plane, or it is too near or too far.
+    points on the plane. The share is 0 if there is no such plane, or if it is too near or too far.
 
-    The inverse of the depth is linear in the pixel on every plane.
+    On every plane, the inverse depth is linear in the pixel coordinates.
     """
     points = in_camera[in_camera[:, 2] > _NEAR / 2]
     at = points @ K.T
@@ -106,7 +106,7 @@ def _depth(uv: Array, in_camera: NDArray[np.floating], K: Array, shape: tuple[in
     away = at[index, :2] - uv[:, None]
     squared = (away * away).sum(-1)
     bell = np.exp(-squared / (2 * _BELL**2)) * (squared <= _WITHIN**2)
-    bell[:, 1:][index[:, 1:] == index[:, :1]] = 0  # where there are fewer, the nearest is repeated
+    bell[:, 1:][index[:, 1:] == index[:, :1]] = 0  # if there are fewer neighbors, the nearest is repeated
     inverse = inverse[index]
     at_corner, on_plane = _plane(away, inverse, bell)
     share = (bell * on_plane).sum(1) / np.maximum(bell.sum(1), 1e-9)
@@ -116,8 +116,8 @@ def _depth(uv: Array, in_camera: NDArray[np.floating], K: Array, shape: tuple[in
 
 
 def _plane(away: Array, inverse: Array, weight: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Planes through points that lie `away` (k, n, 2), pixels, from corners, with inverse depths and weights (k, n):
-    the inverse depth (k,) at the corners, and which points are on their plane."""
+    """Fit planes to points at offsets `away` (k, n, 2), pixels, from corners, with inverse depths and weights (k, n).
+    Returns the inverse depth (k,) at the corners, and which points are on their plane."""
     A = np.concatenate([away, np.ones((*inverse.shape, 1))], -1)
     middle = np.median(inverse, 1)
     residual = inverse - middle[:, None]
@@ -131,7 +131,7 @@ def _plane(away: Array, inverse: Array, weight: Array) -> tuple[Array, NDArray[n
 
 
 def _patches(detail: NDArray[np.float32], uv: Array, size: Array) -> NDArray[np.float32]:
-    """Patches (k, TEXTURE) around pixels (k, 2), `size` (k,) pixels wide, without their mean and of unit length."""
+    """Patches (k, TEXTURE) around pixels (k, 2), `size` (k,) pixels wide, with zero mean and unit length."""
     steps = np.linspace(-0.5, 0.5, SIDE)
     du, dv = (part.ravel() for part in np.meshgrid(steps, steps))
     u, v = ((uv[:, i, None] + size[:, None] * part).astype(np.float32) for i, part in enumerate((du, dv)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way of a sensor around a moment: a curve that is a polynomial in time, in the tangent space of its pose then."""
+"""The trajectory of a sensor around a time 0: a polynomial in time, in the tangent space of its pose at that time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import READ_F4, READ_F8, compiled
 
-_STEPS = 32  # along a sweep, between which its points are moved in a straight line: 0.03 mm at 3 rad/s, 20 m away
-_FITTED = 11  # times
+_STEPS = 32  # poses along a sweep, linearly interpolated: an error of 0.03 mm at 3 rad/s, 20 m away
+_FITTED = 11  # number of times
 Cloud = TypeVar("Cloud", NDArray[np.float32], Array)
 
 
 def poses(times: ArrayLike, motion: Array) -> Array:
-    """(..., 4, 4) poses at times (...), s, as seen from where the sensor was at 0.
+    """(..., 4, 4) poses at times (...), s, relative to the pose at time 0.
 
     Args:
-        motion: (K, 6) the twist at 0 [rad/s, m/s] and its derivatives by time; a twist (6,) alone is constant.
+        motion: (K, 6) the twist at 0 [rad/s, m/s] and its time derivatives; a single twist (6,) is constant.
     """
     t = np.asarray(times, np.float64)[..., None]
     way, part = np.zeros(1), np.ones(1)
@@ -35,9 +35,9 @@ def poses(times: ArrayLike, motion: Array) -> Array:
 
 
 def beyond(time: float, half: float, motion: Array) -> Array:
-    """As `poses` at one time (4, 4), of a motion that is known from -half to half s: before and after that steady.
+    """Like `poses` for one time (4, 4), for a motion known from -half to half s; outside, the twist is constant.
 
-    Away from where it was found a polynomial is of no use: half a sweep farther one of third degree is degrees off.
+    A polynomial must not be extrapolated: half a sweep farther, one of third degree is degrees off.
     """
     end = float(np.clip(time, -half, half))
     twist = np.sum([end**k / factorial(k) * derivative for k, derivative in enumerate(np.atleast_2d(motion))], 0)
@@ -45,8 +45,9 @@ def beyond(time: float, half: float, motion: Array) -> Array:
 
 
 def fitted(turn: Callable[[Array], Array | None], half: float) -> Array | None:
-    """The derivatives at 0 (3, 3) of the rotation of a motion, as rotation vectors [rad/s, rad/s2, rad/s3], that is
-    nearest to a `turn`, rotations (M, 3, 3) at times (M,), from -half to half s; None where it says nothing."""
+    """Derivatives at 0 (3, 3) of a rotation, as rotation vectors [rad/s, rad/s2, rad/s3], fitted from -half to half s.
+
+    `turn` returns the rotations (M, 3, 3) at times (M,), or None; the result is None then."""
     times = np.linspace(-half, half, _FITTED)
     R = turn(times)
     if R is None:
@@ -56,10 +57,10 @@ def fitted(turn: Callable[[Array], Array | None], half: float) -> Array | None:
 
 
 def moved(points: Cloud, times: NDArray[np.floating], along: Callable[[Array], Array]) -> Cloud:
-    """Points (N, 3+), each seen by the sensor at its time (N,), s, as seen from where it was at 0.
+    """Points (N, 3+), each measured at its time (N,), s, transformed to the sensor pose at time 0.
 
     Args:
-        along: gives the poses (M, 4, 4) at times (M,).
+        along: returns the poses (M, 4, 4) at times (M,).
     """
     if len(points) == 0:
         return points
@@ -75,7 +76,7 @@ def moved(points: Cloud, times: NDArray[np.floating], along: Callable[[Array], A
     ]
 )
 def _moved(points: Cloud, step: Array, T: Array) -> Cloud:
-    """`step` (N,): how many of the poses T (M, 4, 4) were passed when a point was seen, with fractions."""
+    """`step` (N,): time of each point in units of the pose interval of T (M, 4, 4), with fractions."""
     out = points.copy()
     for n in range(len(points)):
         i = min(int(step[n]), len(T) - 2)

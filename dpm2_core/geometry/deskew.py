@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured while moving, as if at the stamp: points of a scan, and the camera of an image."""
+"""Corrects for motion during the measurement: points of a scan, and the camera of an image, as if at the stamp."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ def deskew(
     motion: Array,
     turn: Turn | None = None,
 ) -> NDArray[np.float32]:
-    """(N, 4) points as if all had been taken at the stamp; `time_offset` (N,) s.
+    """(N, 4) points as if all had been measured at the stamp; `time_offset` (N,) s.
 
     Args:
-        motion: (6,) twist [rad/s, m/s] or (K, 6), see `curve.poses`, which leaves nothing to be measured.
-        turn: gives, of times (M,) s, the rotations (M, 3, 3) from the axes then to those at the stamp, as they were
-            measured; where it gives None, and without it, the sensor turns as `motion` says.
+        motion: (6,) twist [rad/s, m/s], or (K, 6), see `curve.poses`; with (K, 6) `turn` is not used.
+        turn: returns for times (M,) s the measured rotations (M, 3, 3) from the axes at those times to the axes at the
+            stamp. If it returns None, and without it, the rotation is that of `motion`.
     """
     return curve.moved(points, time_offset, partial(way, motion=motion, turn=turn))
 
 
 def way(times: Array, motion: Array, turn: Turn | None) -> Array:
-    """Poses (M, 4, 4) at increasing times (M,) s of a sensor that moves so, as `deskew` takes it."""
+    """Poses (M, 4, 4) at increasing times (M,) s of a sensor with that motion; arguments as in `deskew`."""
     R = None if turn is None or motion.ndim == 2 else turn(times)
     return curve.poses(times, motion) if R is None else _along(times, R, motion[3:])
 
 
 def measured_turn(frame: Frame) -> Turn | None:
-    """How the LiDAR turned around the stamp, for `deskew`; None without an IMU."""
+    """The LiDAR's rotation around the stamp as measured by the IMU, for `deskew`; None without an IMU."""
     imu = frame.imu
     return None if imu is None else partial(turned, (imu.stamps - frame.stamp) * 1e-9, imu.rates)
 
 
 def placed(image: Image, seconds: float, twist: Array) -> Image:
-    """The image, with its camera where that was so many seconds later, in the LiDAR frame of before.
+    """The image with its camera moved to its pose `seconds` later, in the LiDAR frame before the motion.
 
     `twist` (6,) [rad/s, m/s] is the motion of the LiDAR.
     """
@@ -55,11 +55,11 @@ def placed(image: Image, seconds: float, twist: Array) -> Image:
 
 
 def _along(times: Array, R: Array, velocity: Array) -> Array:
-    """Poses (M, 4, 4) at times (M,) s of a sensor that turns by R (M, 3, 3), at a constant velocity (3,) of its own."""
+    """Poses (M, 4, 4) at times (M,) s with rotations R (M, 3, 3), at a constant velocity (3,) in the sensor's axes."""
     ways = R @ velocity
     way = np.concatenate([np.zeros((1, 3)), np.cumsum((ways[1:] + ways[:-1]) / 2 * np.diff(times)[:, None], 0)])
     here = [np.interp(0.0, times, way[:, i]) for i in range(3)] if times[0] <= 0 <= times[-1] else None
-    if here is None:  # the stamp is outside the sweep: as if it went on from the nearest end
+    if here is None:  # the stamp is outside the sweep: continue from the nearest end
         nearest = 0 if times[0] > 0 else -1
         here = (way[nearest] - ways[nearest] * times[nearest]).tolist()
     return se3.make(R, way - np.array(here))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vertical edges and poles of a cloud: places that are found again from elsewhere, unlike farthest points."""
+"""Vertical edges and poles of a cloud: points that are repeatable from other poses, unlike farthest points."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from dpm2_core.geometry.sampling import Index, neighbours
 from dpm2_core.geometry.voxel import voxel_first
 
 SPACING = 0.9  # m between two edges: those of one pole are HEIGHT apart
-HEIGHT = 1.0  # m, and an edge lies at a multiple of it: at heights of their own two scans' places on a pole do not meet
+HEIGHT = 1.0  # m; edges lie at multiples of it: at arbitrary heights, two scans' points on a pole would not coincide
 _NEIGHBOURS, _RADIUS = 16, 1.5  # m
-_LENGTH = 1.0  # m that the neighborhood of an edge spans vertically, at least
-_GAP = 0.5  # m between heights seen of an edge, at most: between sparser beams it is a guess where an edge is
-_SCORE = 0.2  # least of an edge: an upright patch five points high and four wide
-_CELL = 0.45  # m, of the columns that may hold an edge, and of the grid that thins them: an edge has many candidates
-_KEPT = 16  # best candidates for each edge wanted: more than are within the spacing of one
+_LENGTH = 1.0  # m, smallest vertical extent of the neighborhood of an edge
+_GAP = 0.5  # m, largest gap between measured heights of an edge: with sparser beams its position is uncertain
+_SCORE = 0.2  # smallest score of an edge: that of an upright patch five points high and four wide
+_CELL = 0.45  # m, of the columns that may contain an edge, and of the grid that thins the many candidates of an edge
+_KEPT = 16  # best candidates per requested edge: more than there are within the spacing of one
 
 
 def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
-    """Up to `most` (k, 3) places on vertical edges and poles, the clearest first, `SPACING` m apart.
+    """Up to `most` (k, 3) points on vertical edges and poles, best score first, `SPACING` m apart.
 
-    A place is the mean of 16 neighbors whose extent is linear and vertical, moved along it to the nearest multiple of
-    `HEIGHT` above the origin. Sparse beams, and places without vertical structure, give fewer or none: each must have
-    been seen at heights no farther apart than 0.5 m, over 1 m.
+    A point is the mean of 16 neighbors whose extent is linear and vertical, moved along it to the nearest multiple of
+    `HEIGHT` above the origin. Sparse beams, and scenes without vertical structure, give fewer or none: each must have
+    been measured at heights no farther apart than 0.5 m, over 1 m.
 
     Args:
-        cloud: (N, 3) m, of one point a voxel of about 0.3 m. grid: of the cloud.
+        cloud: (N, 3) m, with one point per voxel of about 0.3 m. grid: of the cloud.
     """
     candidates = cloud[_in_tall_columns(cloud)]
     candidates = candidates[voxel_first(candidates, _CELL)]
@@ -50,9 +50,9 @@ def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
 
 
 def _at_multiples_of_height(mean: Points, centered: NDArray[np.floating]) -> Points:
-    """The (N, 3) means of (N, k, 3) neighborhoods, moved to a multiple of `HEIGHT` along the line that the heights fit.
+    """The (N, 3) means of (N, k, 3) neighborhoods, moved to a multiple of `HEIGHT` along the line fitted over height.
 
-    Half of a height at most, which is what a neighborhood of `_LENGTH` spans to each side."""
+    The shift is at most half of `HEIGHT`, which a neighborhood of `_LENGTH` spans to either side."""
     height = centered[..., 2:]
     per_height = (centered[..., :2] * height).sum(1) / (height * height).sum(1)
     z = np.round(mean[:, 2:] / HEIGHT) * HEIGHT
@@ -60,7 +60,7 @@ def _at_multiples_of_height(mean: Points, centered: NDArray[np.floating]) -> Poi
 
 
 def verticality(centered: NDArray[np.floating]) -> Array:
-    """(N,) 0..1 of (N, k, 3) neighborhoods about their means: 1 is a vertical line, 0 a patch without a direction.
+    """(N,) 0..1 of centered (N, k, 3) neighborhoods: 1 is a vertical line, 0 a patch without a direction.
 
     (sqrt l1 - sqrt l2) / sqrt l1 with the largest eigenvalues of the covariance, times the vertical part of the axis.
     """
@@ -83,14 +83,14 @@ def verticality(centered: NDArray[np.floating]) -> Array:
 
 
 def spaced(points: Points, spacing: float, most: int) -> Index:
-    """Ascending indices of the first `most` of the (N, 3) points that stay if, in order, each drops those within
-    `spacing` m of it."""
+    """Ascending indices of the first `most` of the (N, 3) points that remain if each kept point, in order, removes
+    those within `spacing` m of it."""
     return _spaced(points.astype(np.float64), spacing * spacing, most)
 
 
 @compiled("i8[::1](f8[:, ::1], f8, i8)")
 def _spaced(points: Array, squared: float, most: int) -> Index:
-    """Each is compared with those that stay, which are few."""
+    """Compares each point with the kept ones, which are few."""
     stays, count = np.empty(min(most, len(points)), np.int64), 0
     for i in range(len(points)):
         if count == len(stays):
@@ -109,7 +109,7 @@ def _spaced(points: Array, squared: float, most: int) -> Index:
 
 
 def _in_tall_columns(cloud: Points) -> NDArray[np.bool_]:
-    """Mask of the points of columns that span at least the length of an edge: what is not ground or roof."""
+    """Mask of the points in columns that are at least as tall as an edge, so not of ground or roofs."""
     cell = np.floor(cloud[:, :2] / _CELL).astype(np.int64)
     cell -= cell.min(0, initial=0)
     width = int(cell[:, 1].max(initial=0)) + 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry within a network that multiplies in bf16 (torch)."""
+"""Full precision for geometry within a network that uses bf16 autocast (torch)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _R = TypeVar("_R")
 
 
 def full_precision(function: Callable[Concatenate[Tensor, _P], _R]) -> Callable[Concatenate[Tensor, _P], _R]:
-    """A function of coordinates that autocast does not touch: bf16 has eight bits, 0.2 m at 50 m."""
+    """Exclude a function of coordinates from autocast: bf16 has eight bits, which is 0.2 m at 50 m."""
 
     @wraps(function)
     def exact(first: Tensor, *args: _P.args, **kwargs: _P.kwargs) -> _R:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """WGS84: geodetic positions to the Earth's frame (ECEF) and back, and local frames with axes east, north, up.
 
-Source: NIMA TR8350.2, Department of Defense World Geodetic System 1984; the way back is B. R. Bowring's, "The accuracy
-of geodetic latitude and height equations", Survey Review 28 (1985): below 1 mm for all that drives or flies.
+Source: NIMA TR8350.2, Department of Defense World Geodetic System 1984; the inverse is B. R. Bowring's, "The accuracy
+of geodetic latitude and height equations", Survey Review 28 (1985): below 1 mm for all vehicles and aircraft.
 """
 
 from __future__ import annotations

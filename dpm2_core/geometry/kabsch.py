@@ -12,7 +12,7 @@ from dpm2_core.geometry.se3_torch import make
 def weighted_kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     """T_target_source that minimizes sum w |target - T source|^2.
 
-    A reflection is never returned. Where the weights sum to zero the transform is that of the plain centroids.
+    A reflection is never returned. If the weights sum to zero, the translation is zero.
 
     Args:
         source, target: (B, K, 3), m. weights: (B, K), >= 0.

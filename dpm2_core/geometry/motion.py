@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion of a vehicle while no sensor shows it: at constant velocity, and how far off that may be by then."""
+"""Predicts the motion of a vehicle without sensor data, at constant velocity, with its covariance."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 OPEN = 0.9
-"""Standard deviation of a registered position, m, from which the scene leaves a direction open: it ends at 1 m."""
+"""Standard deviation of a registered position, m, from which a direction is open: the scene does not constrain it. The
+largest value is 1 m."""
 _TURNED = 0.12**2
-"""Share of a scene's information that is noise of its normals, as for its covariance: by so much, rad, it turns the
-open direction towards another one that has all the rest. On a road seen for 10 m it was 20 to 70 degrees per scan."""
-_FREE = 0.05  # m: the speed tells nothing where it leads less far
-_HORIZON = 10.0  # s: farther ahead no motion is extrapolated
-_LONGEST = 3600.0  # s: after it nothing more is to be forgotten
+"""Share of a scene's information that is noise of its normals, as for its covariance. It rotates the open direction, by
+that many rad, towards a direction with all other information. On a road seen for 10 m it was 20 to 70 deg per scan."""
+_FREE = 0.05  # m: shorter translations do not show a period
+_HORIZON = 10.0  # s: motion is not extrapolated farther
+_LONGEST = 3600.0  # s: after that time the covariance grows no further
 _STEPS = 10  # of a motion that changes
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
-_TILT = 0.1  # of the heading's: slopes
-_ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of a heading of which nothing is known
+_TILT = 0.1  # roll and pitch relative to the heading: slopes
+_ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of an unknown heading
 
 
 def predicted(T: Array, twist: Array, seconds: float, turns: Array | None = None) -> Array:
-    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]; `turns` as of `between`."""
+    """The pose (4, 4) after that time at a constant `twist` (6,) [rad/s, m/s]; `turns` as in `between`."""
     if turns is not None:
         return between(T, twist, twist, seconds, turns)
     return T @ se3.exp(twist * min(seconds, _HORIZON))
 
 
 def between(T: Array, before: Array, after: Array, seconds: float, turns: Array | None = None) -> Array:
-    """The pose (4, 4) after that time if the motion changes evenly from one twist (6,) [rad/s, m/s] to the other.
+    """The pose (4, 4) after that time if the motion changes linearly from one twist (6,) [rad/s, m/s] to the other.
 
     Args:
-        turns: rotations R_T_t (K + 1, 3, 3) in the middle of each of K even parts of the time, and in the end, where
-            they were measured: of the twists then the velocity counts alone.
+        turns: measured rotations R_T_t (K + 1, 3, 3), in the middle of each of K equal parts of the time and at its
+            end. With them only the velocities of the twists are used.
     """
     if turns is not None:
         parts = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
@@ -48,15 +49,15 @@ def between(T: Array, before: Array, after: Array, seconds: float, turns: Array 
 
 
 def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float, Array], steadiness: float) -> float:
-    """Seconds that a period lasted of which the stamp is in doubt, by how far the LiDAR has moved in it.
+    """Duration, s, of a period whose stamp is in doubt, from the distance that the LiDAR has moved in it.
 
-    A driver or network that holds frames back, and whose stamps are those of arrival, makes one period long and those
-    of the burst after it short; of lost frames the stamps are right. The speed goes on through both: the period is as
-    stamped where an acceleration explains the pose, or between that and as usual.
+    A driver or network that holds frames back, and stamps them on arrival, makes one period long and those of the burst
+    after it short; if frames are lost, the stamps are right. The real speed is unaffected by both. The period is as
+    stamped if an acceleration explains the pose, else between the stamped and the usual period.
 
     Args:
-        T: pose (4, 4) that was found.
-        stamped, usual: period, s, and pose (4, 4) to which the motion so far leads in it.
+        T: estimated pose (4, 4).
+        stamped, usual: period, s, and pose (4, 4) that the previous motion predicts after it.
         steadiness: standard deviation of the acceleration, m/s2.
     """
     dt, T_stamped = stamped
@@ -74,9 +75,10 @@ def covariance(
     turn: float = 0.0,
     of_turn: Array | None = None,
 ) -> Array:
-    """Covariance (6, 6) [rad, m] of the pose that `predicted` gives, of a velocity with the covariance `of_velocity`
-    (3, 3) [m/s] and a rate of turn that is off by `turn`, rad/s, about any axis; no heading is worse than any heading,
-    and no pause longer than an hour. Where the turn was measured, `of_turn` (3, 3) [rad] is its covariance."""
+    """Covariance (6, 6) [rad, m] of the pose that `predicted` returns, for a velocity with the covariance `of_velocity`
+    (3, 3) [m/s] and an error of the angular rate of `turn`, rad/s, about any axis. The heading's deviation is at most
+    that of an unknown heading, and the time at most an hour. If the rotation was measured, `of_turn` (3, 3) [rad] is
+    its covariance."""
     seconds = min(seconds, _LONGEST)
     meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
     swing, heading = (min(rate * seconds, _ANY_TURN) for rate in (turn, _TURN))
@@ -89,31 +91,31 @@ def covariance(
 
 
 def velocity_change(speed: float, seconds: float, acceleration: float) -> float:
-    """Standard deviation of the velocity after that time, m/s: by that acceleration (m/s2) in every direction, but not
-    more than a vehicle as fast as this one can change it."""
+    """Standard deviation of the velocity after that time, m/s, for that acceleration (m/s2) in every direction; not
+    more than a vehicle at this speed can change it."""
     return min(acceleration * seconds, speed + acceleration)
 
 
 def spread(sigma: float, seconds: float, of_velocity: Array) -> Array:
-    """Covariance (6, 6) [rad, m] of `sigma` in every direction, and of a velocity with the covariance `of_velocity`
-    (3, 3) [m/s] over that time."""
+    """Covariance (6, 6) [rad, m] of `sigma` in every direction plus that of a velocity with the covariance
+    `of_velocity` (3, 3) [m/s] over that time."""
     result = sigma**2 * np.eye(6)
     result[3:, 3:] += of_velocity * seconds**2
     return result
 
 
 def combined(of_scene: Array, of_prediction: Array) -> Array:
-    """Covariance (3, 3) [m] of a position that the scene and the motion so far show; 1 m of the scene says nothing."""
+    """Covariance (3, 3) [m] of a position fused from scene and prediction; 1 m of the scene is no information."""
     information, axes = np.linalg.eigh(np.linalg.inv(of_scene))
     shown = (axes * np.maximum(information - 1, 0)) @ axes.T
     return np.asarray(np.linalg.inv(shown + np.linalg.inv(of_prediction)))
 
 
 def turned_open(of_scene: Array, of_prediction: Array) -> Array:
-    """A covariance of_scene (3, 3) [m], as uncertain beside the directions that it leaves open as these are not known
-    themselves: in them the prediction, of_prediction (3, 3), decides.
+    """A covariance of_scene (3, 3) [m] with larger variances across its open directions, since these directions are
+    uncertain themselves. Along them the prediction, of_prediction (3, 3), decides.
 
-    Otherwise each scan, whose open direction is a little beside that of the one before, seems to show the way along it.
+    Otherwise the small changes of the open direction from scan to scan would seem to measure the motion along it.
     """
     variances, axes = np.linalg.eigh(of_scene)
     left = variances >= OPEN**2
@@ -126,7 +128,7 @@ def turned_open(of_scene: Array, of_prediction: Array) -> Array:
 
 
 def along_open(of_scene: Array, other: Array) -> Array:
-    """Of a covariance `other` (3, 3) the part along the directions that a scene, of_scene (3, 3) [m], leaves open."""
+    """The part of a covariance `other` (3, 3) along the directions that are open in a scene, of_scene (3, 3) [m]."""
     variances, axes = np.linalg.eigh(of_scene)
     left = axes[:, variances >= OPEN**2]
     return np.asarray(left @ (left.T @ other @ left) @ left.T)

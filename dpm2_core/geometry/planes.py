@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least-squares planes through many small neighborhoods at once."""
+"""Least-squares planes for many small neighborhoods at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def fit_planes(neighborhoods: Array) -> tuple[Array, Array]:
     """Unit normals (N, 3) and variances along them (N,), m2, of (N, k, 3) neighborhoods.
 
     The smallest eigenvector of each covariance in closed form (trigonometric solution of the characteristic cubic).
-    A neighborhood without any extent gets the normal (0, 0, 1), variance 0.
+    A neighborhood without any extent has the normal (0, 0, 1) and the variance 0.
     """
     n, k, _ = neighborhoods.shape
     normals, variances = np.empty((n, 3)), np.empty(n)

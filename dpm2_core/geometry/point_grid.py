@@ -15,22 +15,22 @@ _GRID = "Tuple((f8[:, ::1], f8[::1], i4[:, :, ::1], i4[::1]))"
 
 _SIDE = 4  # cells along the edge of a block
 _VOLUME = _SIDE**3
-_BLOCKS = 1 << 20  # at most so many; points that are scattered wider get larger cells
+_BLOCKS = 1 << 20  # largest number; clouds of larger extent have larger cells
 _ROUNDING = 1e-9  # m, of the borders of cells
-_FIRST = 0.8  # cells: how far `neighbors` looks at first
+_FIRST = 0.8  # cells: first search distance of `neighbors`
 
 
 class PointGrid:
-    """Where the (M, 3) float64 points of a cloud are; all finite.
+    """Spatial index of the (M, 3) float64 points of a cloud; all finite.
 
-    The occupied blocks are numbered in a dense table; the points of a block follow one another, cell by cell.
+    The occupied blocks are numbered in a dense table; the points of a block are consecutive, cell by cell.
 
     Attributes:
-        order: (M,) input index of each point as the grid keeps them. points: (M, 3), in that order.
+        order: (M,) input index of each point in the grid's order. points: (M, 3), in that order.
     """
 
     def __init__(self, points: Array, cell: float) -> None:
-        """`cell` is the edge of the cells, m: about as far as the neighbors are that will be asked for."""
+        """`cell` is the edge of the cells, m: about the distance of the neighbors that will be queried."""
         low = points.min(0) if len(points) else np.zeros(3)
         extent = points.max(0) - low if len(points) else np.zeros(3)
         while np.prod(blocks := np.floor(extent / (_SIDE * cell)) + 1) > _BLOCKS:
@@ -42,14 +42,14 @@ class PointGrid:
         self._grid = self.points, corner, block, start
 
     def nearest(self, queries: Array, radius: float) -> Index:
-        """Place (Q,) in `points` of the nearest one closer than `radius` m to each of the (Q, 3) queries, -1 if
+        """Index (Q,) in `points` of the nearest one closer than `radius` m to each of the (Q, 3) queries, -1 if
         none."""
         return _nearest(np.ascontiguousarray(queries), radius, self._grid)
 
     def neighbors(self, queries: Array, k: int, radius: float = np.inf) -> Index:
-        """Places (Q, k) in `points` of the k nearest to each of the finite (Q, 3) queries, nearest first.
+        """Indices (Q, k) in `points` of the k nearest to each of the finite (Q, 3) queries, nearest first.
 
-        Where there are fewer, or fewer within `radius`, m, the nearest one is repeated; it may be farther.
+        If there are fewer, or fewer within `radius`, m, the nearest one is repeated; it may be farther than `radius`.
 
         Raises:
             ValueError: the cloud is empty.
@@ -61,12 +61,12 @@ class PointGrid:
 
 @compiled("Tuple((i4[::1], i4[::1]))(f8[:, ::1], f8[::1], i4[:, :, ::1])")
 def _sorted_into(points: Array, corner: Array, block: Index) -> tuple[Index, Index]:
-    """Number the occupied blocks in `block`; where each of their cells starts, and the order of the points."""
+    """Number the occupied blocks in `block`; returns the start of each of their cells, and the order of the points."""
     m, scale, occupied = len(points), 1 / corner[3], 0
     nx, ny, nz = block.shape
     cell = np.empty(m, np.int64)
     for i in range(m):
-        x = min(int((points[i, 0] - corner[0]) * scale), nx * _SIDE - 1)  # a point on the upper border may round
+        x = min(int((points[i, 0] - corner[0]) * scale), nx * _SIDE - 1)  # rounding at the upper border
         y = min(int((points[i, 1] - corner[1]) * scale), ny * _SIDE - 1)
         z = min(int((points[i, 2] - corner[2]) * scale), nz * _SIDE - 1)
         at = block[x // _SIDE, y // _SIDE, z // _SIDE]
@@ -102,7 +102,7 @@ def _outside(x: float, low: float, edge: float) -> float:
 
 @compiled(f"Tuple((i8, f8))(f8[::1], f8, f8, {_GRID})")
 def _closest(query: Array, reach: float, best: float, grid: _Grid) -> tuple[int, float]:
-    """The nearest point of the cells within `reach` m and its squared distance; -1 if that is not below `best`, m2."""
+    """The nearest point in cells within `reach` m and its squared distance; -1 if that is not below `best`, m2."""
     points, corner, block, start = grid
     found, cell, r = -1, corner[3], reach + _ROUNDING
     nx, ny, nz = block.shape[0] * _SIDE, block.shape[1] * _SIDE, block.shape[2] * _SIDE
@@ -131,7 +131,7 @@ def _closest(query: Array, reach: float, best: float, grid: _Grid) -> tuple[int,
 
 @compiled(f"i4[::1](f8[:, ::1], f8, {_GRID})")
 def _nearest(queries: Array, radius: float, grid: _Grid) -> Index:
-    """See `PointGrid.nearest`: what lies within half a cell, else as far as the point that was found, or twice as
+    """See `PointGrid.nearest`: searches within half a cell, then as far as the point that was found, or twice as
     far."""
     index = np.full(len(queries), -1, np.int32)
     for q in range(len(queries)):
@@ -152,10 +152,10 @@ def _nearest(queries: Array, radius: float, grid: _Grid) -> Index:
 
 @compiled(f"i8(f8[::1], f8, {_GRID}, f8[::1], i4[::1])")
 def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Index) -> int:
-    """How many points lie within `reach` m; their squared distances and places are written."""
+    """Number of points within `reach` m; their squared distances and indices are written."""
     points, corner, block, start = grid
     found, limit, r = 0, reach * reach, reach + _ROUNDING
-    side = 1 if reach < _SIDE * corner[3] else _SIDE  # cells one by one, or whole blocks
+    side = 1 if reach < _SIDE * corner[3] else _SIDE  # single cells, or whole blocks
     edge, cells = side * corner[3], _SIDE // side
     nx, ny, nz = block.shape[0] * cells, block.shape[1] * cells, block.shape[2] * cells
     x, y, z = query[0] - corner[0], query[1] - corner[1], query[2] - corner[2]
@@ -172,7 +172,7 @@ def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Inde
                 if at < 0:
                     continue
                 c, end = at * _VOLUME, (at + 1) * _VOLUME
-                if side == 1:  # the cells of a row, whose points follow one another
+                if side == 1:  # the cells of a row, whose points are consecutive
                     end = c + row + min(z_last - bz * _SIDE, _SIDE - 1) + 1
                     c += row + max(z_first - bz * _SIDE, 0)
                 for i in range(start[c], start[end]):
@@ -184,7 +184,7 @@ def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Inde
 
 @compiled("void(f8[::1], i4[::1], i8, i8)")
 def _select(squared: Array, index: Index, count: int, k: int) -> None:
-    """Bring the k smallest of the first `count` to the front, in order, each with its index."""
+    """Move the k smallest of the first `count` to the front, sorted, each with its index."""
     first, last = 0, count - 1
     while first < last:  # quickselect
         pivot = squared[(first + last) // 2]
@@ -215,7 +215,7 @@ def _select(squared: Array, index: Index, count: int, k: int) -> None:
 
 @compiled(f"i4[:, ::1](f8[:, ::1], i8, f8, {_GRID})")
 def _neighbors(queries: Array, k: int, radius: float, grid: _Grid) -> Index:
-    """See `PointGrid.neighbors`: all within a distance, which is doubled until there are enough."""
+    """See `PointGrid.neighbors`: all points within a distance that is increased until there are enough."""
     out = np.empty((len(queries), k), np.int32)
     squared, index = np.empty(len(grid[0]) + 1), np.empty(len(grid[0]) + 1, np.int32)
     wanted = min(k, len(grid[0]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels as rays in the LiDAR frame: where a camera looks, and how far points are from what it sees (torch)."""
+"""Pixels as rays in the LiDAR frame: viewing directions, and distances of points from them (torch)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.geometry.full_precision import full_precision
 def pixel_rays(uv: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tensor]:
     """Rays through pixels.
 
-    A direction is rotated only, it has no translation: the paper's equation 5 prints (u, u, 1, 1) and means (u, v, 1).
+    A direction is only rotated, not translated: the paper's equation 5 prints (u, u, 1, 1) and means (u, v, 1).
 
     Args:
         uv: (T, 2) pixel coordinates, the center of the first pixel being (0, 0).
@@ -49,13 +49,13 @@ def point_ray_distance(points: Tensor, origins: Tensor, directions: Tensor) -> t
 
 @full_precision
 def project(points: Tensor, K: Tensor, T_lidar_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """LiDAR points in the image.
+    """Project LiDAR points into the image.
 
     Args:
         points: (B, N, 3), m. K: (B, 3, 3), pixels. T_lidar_cam: (B, 4, 4).
 
     Returns:
-        uv (B, N, 2), pixels, and depth (B, N), m along the optical axis; uv means nothing where depth <= 0.
+        uv (B, N, 2), pixels, and depth (B, N), m along the optical axis; uv is invalid where depth <= 0.
     """
     in_camera = (points - T_lidar_cam[:, None, :3, 3]) @ T_lidar_cam[:, :3, :3]
     depth = in_camera[..., 2]

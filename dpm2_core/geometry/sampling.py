@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sampling: places in a row, farthest points, hybrid neighbor query."""
+"""Sampling: evenly spaced indices, farthest points, hybrid neighbor query."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from dpm2_core.geometry.point_grid import PointGrid
 Index = NDArray[np.int64]
 
 _CHUNK = 128  # points that are updated together: 64 and 256 are slower for scans
-_HALVINGS = 5  # of the cloud, to where the sampling starts
+_HALVINGS = 5  # of the cloud, to find the start of the sampling
 
 
 def evenly(count: int, most: int) -> Index:
-    """At most `most` of the numbers below `count`, spread evenly from the first to the last; none of none."""
+    """At most `most` of the numbers below `count`, evenly spaced from the first to the last; empty for 0."""
     return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
 
 
 def farthest_points(points: Points, count: int, grid: PointGrid) -> Index:
     """Farthest point sampling of (N, 3) points: min(N, count) indices, in sampling order.
 
-    The same cloud is sampled alike. A prefix of the result is the farthest point sampling of that length: one call
-    serves all levels of a pyramid.
+    Deterministic for a cloud. A prefix of the result is the farthest point sampling of that length: one call serves all
+    levels of a pyramid.
 
     Args:
-        grid: of these points; any cell.
+        grid: of these points; any cell size.
     """
     count = min(count, len(points))
     if count <= 1:
@@ -40,9 +40,9 @@ def farthest_points(points: Points, count: int, grid: PointGrid) -> Index:
 
 @compiled("i8(f4[:, ::1], i8[::1])")
 def _in_the_corner(points: Points, index: Index) -> int:
-    """The first point of the lowest cell, when a cloud is halved at the mean of its widest axis again and again.
+    """The first point of the lowest cell when the cloud is repeatedly halved at the mean of its widest axis.
 
-    This is where the samplings of training started. Both arrays are reordered.
+    Samplings in training started at this point. Both arrays are reordered.
     """
     count = len(points)
     for _ in range(_HALVINGS):
@@ -82,10 +82,10 @@ def _from_boxes(x: float, y: float, z: float, low: Points, high: Points, squared
 
 @compiled("i8[::1](f4[:, ::1], i8, i8)")
 def _farthest(points: Points, start: int, count: int) -> Index:
-    """`farthest_points`, from a start, of points of which those that follow each other are near each other.
+    """`farthest_points`, from a start, for points in an order in which neighbors are close to each other.
 
-    Chunks of them whose farthest point is nearer to the points so far than to the new one need no update. Distances are
-    compared as the integers of their bits, which are in the same order: these the compiler does many at a time.
+    A chunk needs no update if its farthest point is closer to the points so far than to the new one. Distances are
+    compared as the integers of their bits, which are in the same order: the compiler vectorizes that.
     """
     n, chunks = len(points), (len(points) + _CHUNK - 1) // _CHUNK
     xyz = np.empty((chunks, 3, _CHUNK), np.float32)
@@ -93,7 +93,7 @@ def _farthest(points: Points, start: int, count: int) -> Index:
     for c in range(chunks):
         for a in range(3):
             for i in range(_CHUNK):
-                value = points[min(c * _CHUNK + i, n - 1), a]  # the last chunk is filled up with the last point
+                value = points[min(c * _CHUNK + i, n - 1), a]  # the last chunk is padded with the last point
                 xyz[c, a, i] = value
                 low[a, c], high[a, c] = min(low[a, c], value), max(high[a, c], value)
     squared, farthest = np.full((chunks, _CHUNK), np.float32(np.inf)), np.full(chunks, np.float32(np.inf))
@@ -121,9 +121,9 @@ def _farthest(points: Points, start: int, count: int) -> Index:
 
 
 def interleaved(points: Points, special: Points, first: int) -> Points:
-    """The (N, 3) points with (k, 3) special ones spread evenly among the `first` of them; the last ones fall out.
+    """The (N, 3) points with (k, 3) special ones evenly spaced among the `first` of them; as many are cut at the end.
 
-    Any prefix within `first` holds both in the same ratio. k is at most `first` and N.
+    Any prefix within `first` has both in the same ratio. k is at most `first` and N.
     """
     out = np.empty_like(points)
     slot = np.zeros(len(points), bool)
@@ -134,8 +134,8 @@ def interleaved(points: Points, special: Points, first: int) -> Points:
 
 
 def neighbours(grid: PointGrid, queries: NDArray[np.floating], k: int, radius: float) -> Index:
-    """(M, k) indices of the neighbors of each query, nearest first; those beyond `radius` m repeat the nearest.
+    """(M, k) indices of the neighbors of each query, nearest first; neighbors beyond `radius` m repeat the nearest.
 
-    The hybrid of a ball query and k nearest neighbors, in the cloud that the grid was made of.
+    The hybrid of a ball query and k nearest neighbors, in the cloud of which the grid was built.
     """
     return grid.order[grid.neighbors(queries.astype(np.float64), k, radius)].astype(np.int64)

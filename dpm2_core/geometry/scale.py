@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a scan was taken in a room or in the open: by how much surface it shows, and how far away that is.
+"""Classifies a scan as indoor or outdoor from the amount of visible surface and its distance.
 
-And what follows for the network, which learned streets: a room that is enlarged looks like one.
+And the resulting scale for the network, which was trained on streets: an enlarged room looks like one.
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ from dpm2_core.frame import Array, Points
 from dpm2_core.geometry.scatter import scattered
 from dpm2_core.geometry.voxel import voxel_first
 
-_CELL = 0.5  # m: so much surface counts once, however many beams meet it
+_CELL = 0.5  # m: surface in one cell counts once, however many beams hit it
 _FEW = 20_000  # points are enough
 _NEAREST = 0.3  # m
-# Cells seen, and the distance within which three quarters of them are, m. Measured: rooms and offices 130 to 530 cells
+# Number of visible cells, and the distance of three quarters of them, m. Measured: rooms and offices 130 to 530 cells
 # within 8 m; streets, tunnels, highways and car parks, also with 16 beams, 1,900 to 11,000 within 14 m and more. A hall
 # shows 740 to 925 within 10 m with 16 beams; a yard of 18 by 20 m, seen by a LiDAR 70 degrees wide, 2,300 and more.
 _ROOM = (800, 18.0)
 _HALL = 10.0
 _OPEN = (1300, 25.0)
-_ENCLOSED = 2.0  # m: rooms in which one works are larger than this to all sides
-_SECTORS = 6  # of half a turn: a LiDAR that looks ahead alone sees nothing of what is behind it
+_ENCLOSED = 2.0  # m: working rooms are larger than this in all directions
+_SECTORS = 6  # per half revolution: a LiDAR that looks only ahead cannot show what is behind it
 _FEWER = 2000  # points
-_LEAST = 30  # cells: fewer say nothing
+_LEAST = 30  # cells: fewer are not enough to decide
 ROOM_SCALE = 5.0
-"""Of scans in rooms. Measured, 16 beams, pairs up to 1 / 1 to 2 m apart that are registered to 0.3 m and 3 degrees:
-67 to 100 / 20 to 47 % as they are, 100 / 73 to 93 % enlarged, with a fifth of the error; 4 to 8 do alike."""
+"""Scale of indoor scans. Measured, 16 beams, share of pairs up to 1 / 1 to 2 m apart registered to 0.3 m and 3 degrees:
+67 to 100 / 20 to 47 % unscaled, 100 / 73 to 93 % enlarged, with a fifth of the error; 4 to 8 give the same."""
 
 T = TypeVar("T")
 
 
 def is_room(points: Points) -> bool | None:
-    """True for a room, a corridor or a hall, False for a street or a tunnel, None where it may be either.
+    """True for a room, a corridor or a hall, False for a street or a tunnel, None if it may be either.
 
     Args:
-        points: (N, 4) a scan in the LiDAR frame, or a keyframe's cloud; NaN and zeros are passed over.
+        points: (N, 4) a scan in the LiDAR frame, or a keyframe's cloud; NaN and zeros are ignored.
     """
     return look(points)[0]
 
 
 def look(points: Points) -> tuple[bool | None, int]:
-    """As `is_room`; and about how many of the points are of what does not float in the air."""
+    """Like `is_room`; also the approximate number of points that are not airborne particles."""
     step = max(1, len(points) // _FEW)
     some = points[::step]
     away = np.linalg.norm(some[:, :3], axis=1)
@@ -58,7 +58,7 @@ def look(points: Points) -> tuple[bool | None, int]:
 
 
 def _room_of(away: Array) -> bool | None:
-    """Of the distances (C,), m, of the cells that are seen."""
+    """See `is_room`; `away` (C,): distances of the visible cells, m."""
     if len(away) < _LEAST:
         return None
     reach = float(np.percentile(away, 75))
@@ -69,23 +69,23 @@ def _room_of(away: Array) -> bool | None:
 
 @dataclass(frozen=True)
 class ByScale(Generic[T]):
-    """What is used in the open, and where it may be either; and what in rooms."""
+    """An outdoor variant, also used if the scan may be either, and an indoor variant."""
 
     outdoor: T
     indoor: T
 
     def suited_to(self, points: Points) -> T:
-        """The one for what a scan (N, 4), or a keyframe's cloud, shows."""
+        """The variant for a scan (N, 4), or a keyframe's cloud."""
         return self.indoor if is_room(points) else self.outdoor
 
 
 def scale_of(points: Points) -> float:
-    """The factor by which a scan (N, 4), or a keyframe's cloud, is enlarged for the network: 1 in the open."""
+    """The factor by which a scan (N, 4), or a keyframe's cloud, is enlarged for the network: 1 outdoors."""
     return ByScale(1.0, ROOM_SCALE).suited_to(points)
 
 
 def is_enclosed(points: Points) -> bool:
-    """Whether a scan (N, 4) shows nothing but what is near, all around: a lift's cabin, which may move along."""
+    """Whether a scan (N, 4) shows only close surfaces, all around: an elevator car, which may move with the sensor."""
     some = points[:: max(1, len(points) // _FEWER)]
     away = np.linalg.norm(some[:, :3], axis=1)
     valid = away > 0  # False for NaN

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Returns from what floats in the air near the sensor: fog, dust, smoke, spray, snow.
+"""Detects returns from airborne particles near the sensor: fog, dust, smoke, spray, snow.
 
-They move along with the sensor. Where they are the greater part of a scan they fit a map of others of their kind, best
-of all at rest.
+They move with the sensor. If they are most of a scan, they fit a map of other such points, best of all at rest.
 """
 
 from __future__ import annotations
@@ -18,33 +17,34 @@ from dpm2_core.geometry.compiled import READ_F4, compiled
 
 _NEAR = 8.0  # m: farther away they return too little to be many
 _CELLS = 80  # along each edge of a cube around the sensor: of 0.7 to 1.4 degrees
-_DENSE = 40_000  # points; scans of fewer get larger cells
-_ENOUGH, _LEAST = 15, 5  # points of a strip: it is lengthened until it has so many; fewer than 5 say nothing
+_DENSE = 40_000  # points; smaller scans get larger cells
+_ENOUGH, _LEAST = 15, 5  # points of a strip: it is lengthened until it has _ENOUGH; fewer than _LEAST are not used
 _LONGEST = 12  # cells on either side
-_LIKE, _LONGER = 0.03, 0.2  # of range + _SHIFT is as far away; by so much more for each further cell on either side
+_LIKE, _LONGER = 0.03, 0.2  # tolerance of equal ranges, times range + _SHIFT; its growth per further cell
 _SHIFT = 0.5  # m: the noise of ranges is more than 3 % of short ones
 _ALONE, _CHANCE = 0.3, 2.5
-"""A point is alone where fewer of the others are as far away in both of its strips, and not more than there are in all
-directions, by so many standard deviations. Of a surface one strip has more, even if it is seen at a grazing angle."""
-_PAIR = 2.0  # others: fewer are none, however few there are in all directions
+"""A point is isolated if, in both of its strips, fewer than this share of the other points have its range, and not more
+than in all directions, by this many standard deviations. On a surface one strip has more, even at a grazing angle."""
+_PAIR = 2.0  # points of equal range: fewer count as none, whatever the share in all directions
 _BIN = 0.01  # of ln(range + _SHIFT)
 _BINS = int(log((_NEAR + _SHIFT) / _SHIFT) / _BIN) + 1
 MANY = 0.2
-"""Of what is near: less hides nothing, and does not hold an odometry whose map is as sparse as those of streets."""
-_SOME, _LEAST_NEAR = 6000, 100  # points tell whether there are many; of these so many must be near
-_PATCH = 4  # cells: these points are taken from squares of directions, as large as that
+"""Share of the near points: fewer occlude nothing, and do not hold back an odometry with a map as sparse as on streets.
+"""
+_SOME, _LEAST_NEAR = 6000, 100  # points that are sampled to see whether there are many; least number of near ones
+_PATCH = 4  # cells: the sampled points are from square patches of directions with this edge
 
 
 def scattered(points: Points, least: float = MANY) -> NDArray[np.bool_]:
-    """Which of (N, 4) valid points in the LiDAR frame float in the air (N,): few others in their direction are as far
-    away. (Others count neighbors in a radius that grows with the range: N. Charron et al., "De-noising of Lidar Point
-    Clouds Corrupted by Snowfall", CRV 2018. What is few depends on the sensor there, and on how dense the snow is.)
+    """Which of (N, 4) valid points in the LiDAR frame are airborne (N,): few other points in their direction have the
+    same range. (Others count neighbors in a radius that grows with the range: N. Charron et al., "De-noising of Lidar
+    Point Clouds Corrupted by Snowfall", CRV 2018. Their threshold depends on the sensor and the density of the snow.)
 
-    Measured where 60 % of the pulses meet fog: 91 to 97 % of them are found, and 0 to 3 % of the others within 8 m. In
-    clean scans 0 to 2 %; 6 % with one point per degree, 10 % of a street that was thinned to one per 0.3 m.
+    Measured with 60 % of the pulses hitting fog: 91 to 97 % of them are found, and 0 to 3 % of the others within 8 m.
+    In clean scans 0 to 2 %; 6 % with one point per degree, 10 % of a street that was thinned to one per 0.3 m.
 
     Args:
-        least: fraction of what is near. None are found where fewer are.
+        least: fraction of the near points. If fewer are found, none are returned.
     """
     points = np.ascontiguousarray(points)
     every = max(1, len(points) // _SOME) if least > 0 else 1
@@ -60,9 +60,8 @@ def scattered(points: Points, least: float = MANY) -> NDArray[np.bool_]:
 def _in_cells(
     points: Points, edge: int, looked: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Of (N, 4) points those (M,) in the patches of directions (face, row, column) that are looked at; their cells of
-    directions and ranges (M,); the ranges cell by cell; and where those of each cell begin. Around each face of the
-    cube are cells without points."""
+    """The (M,) of (N, 4) points in the selected patches of directions (face, row, column); their cells and ranges (M,);
+    the ranges sorted by cell; and the start of each cell. Around each face of the cube are cells without points."""
     side, count = edge + 2 * _LONGEST, 0
     which, cell, away = (
         np.empty(len(points), np.int64),
@@ -95,15 +94,15 @@ def _in_cells(
 
 
 def _alone(points: Points, every: int) -> tuple[NDArray[np.bool_], int]:
-    """Which of (N, 4) points are near and unlike those around them, and how many are near; of all patches of directions
-    one in `every` is looked at."""
+    """Which of (N, 4) points are near and isolated, and how many are near; one in `every` patches of directions is
+    examined."""
     edge = max(1, int(_CELLS * min(1.0, sqrt(len(points) / _DENSE))))
     patches, faces = np.arange(edge // _PATCH + 1), np.arange(6)[:, None, None]
     looked = (patches + 7 * patches[:, None] + 3 * faces) % every == 0
     which, cell, away, of_cells, start = _in_cells(points, edge, looked)
     near = np.flatnonzero(away < _NEAR)
     bins = (np.log((away[near] + _SHIFT) / _SHIFT) / _BIN).astype(np.int64)
-    nearer = np.append(0, np.cumsum(np.bincount(bins, minlength=_BINS)))  # than each bin
+    nearer = np.append(0, np.cumsum(np.bincount(bins, minlength=_BINS)))  # points closer than each bin
     alone = np.zeros(len(points), np.bool_)
     alone[which[near]] = _unlike(near, cell, away, of_cells, start, (bins, nearer, edge + 2 * _LONGEST))
     return alone, len(near)
@@ -118,11 +117,11 @@ def _unlike(
     start: NDArray[np.int32],
     ranges: tuple[NDArray[np.int64], NDArray[np.int64], int],
 ) -> NDArray[np.bool_]:
-    """Which of some points are unlike those around them.
+    """Which points are unlike those around them.
 
     Args:
-        near: (M,) their indices. cell, away, of_cells, start: those of `_in_cells`.
-        ranges: the bins (M,) of their ranges, how many points are nearer than each bin, and the cells of a row.
+        near: (M,) their indices. cell, away, of_cells, start: as returned by `_in_cells`.
+        ranges: bins (M,) of their ranges, number of points closer than each bin, and number of cells in a row.
     """
     bins, nearer, row = ranges
     alone = np.zeros(len(near), np.bool_)

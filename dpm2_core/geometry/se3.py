@@ -32,7 +32,7 @@ def inverse(T: Array) -> Array:
 
 
 def transform(T: Array, points: NDArray[_F]) -> NDArray[_F]:
-    """T (4, 4) applied to the first three columns of (N, 3+) points; further columns and the dtype stay."""
+    """T (4, 4) applied to the first three columns of (N, 3+) points; further columns and the dtype are kept."""
     out = points.copy()
     out[:, :3] = points[:, :3] @ T[:3, :3].T.astype(points.dtype) + T[:3, 3].astype(points.dtype)
     return out
@@ -63,7 +63,7 @@ def log(T: Array) -> Array:
 
 
 def interpolated(T0: Array, T1: Array, part: ArrayLike) -> Array:
-    """(..., 4, 4) poses at a part of the way from T0 to T1 (..., 4, 4), 0 to 1, which is a screw."""
+    """(..., 4, 4) poses at a fraction `part`, 0 to 1, of the screw motion from T0 to T1 (..., 4, 4)."""
     return T0 @ exp(np.asarray(part)[..., None] * log(inverse(T0) @ T1))
 
 
@@ -81,12 +81,12 @@ def quaternion(T: Array) -> Array:
     """The rotation of (..., 4, 4) as (..., 4) x, y, z, w with w >= 0."""
     w = log(T)[..., :3]
     half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
-    return np.concatenate([w * np.sinc(half / np.pi) / 2, np.abs(np.cos(half))], -1)  # of half a turn not -1e-16
+    return np.concatenate([w * np.sinc(half / np.pi) / 2, np.abs(np.cos(half))], -1)  # at pi cos may be -1e-16
 
 
 @compiled("void(f8[:, ::1], f8[:, :, ::1])")
 def _exp(xi: Array, T: Array) -> None:
-    """`exp` of (N, 6), into (N, 4, 4): Rodrigues' formula, by half the angle, where 1 - cos does not cancel."""
+    """`exp` of (N, 6), into (N, 4, 4): Rodrigues' formula with half the angle, to avoid cancellation in 1 - cos."""
     for n in range(len(xi)):
         x, y, z = xi[n, 0], xi[n, 1], xi[n, 2]
         squared = x * x + y * y + z * z
@@ -96,7 +96,7 @@ def _exp(xi: Array, T: Array) -> None:
         else:
             first, third = sin(angle) / angle, (angle - sin(angle)) / (squared * angle)
             second = 2 * (sin(angle / 2) / angle) ** 2
-        # W is the matrix of the cross product with x, y, z; W W is w w^T - squared I.
+        # W is the cross-product matrix of x, y, z; W W is w w^T - squared I.
         W = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
         w, moved = (x, y, z), xi[n, 3:]
         for a in range(3):
@@ -111,7 +111,7 @@ def _exp(xi: Array, T: Array) -> None:
 
 @compiled("void(f8[:, :, ::1], f8[:, ::1])")
 def _log(T: Array, xi: Array) -> None:
-    """`log` of (N, 4, 4), into (N, 6): by the quaternion, whose largest part is found first (Shepperd 1978)."""
+    """`log` of (N, 4, 4), into (N, 6): with the quaternion, from its largest component (Shepperd 1978)."""
     for n in range(len(T)):
         R = T[n]
         trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -129,7 +129,7 @@ def _log(T: Array, xi: Array) -> None:
         scale = (angle / length if length > 0 else 0.0) * (-1.0 if real < 0 else 1.0)
         x, y, z = q[0] * scale, q[1] * scale, q[2] * scale
         squared = x * x + y * y + z * z
-        # Of the inverse of the matrix by which `_exp` moves: 1 - W / 2 + third W W.
+        # Apply the inverse of the matrix of the translation in `_exp`: 1 - W / 2 + third W W.
         third = 1 / 12 + squared / 720 if squared < 1e-4 else (1 - angle / 2 / tan(angle / 2)) / squared
         u, v, w = T[n, 0, 3], T[n, 1, 3], T[n, 2, 3]
         along = x * u + y * v + z * w
@@ -149,17 +149,17 @@ def adjoint(T: Array) -> Array:
 
 
 def angle(T: Array) -> Array:
-    """Rotation angle of (..., 4, 4), rad; exact near zero, where the trace formula is not."""
+    """Rotation angle of (..., 4, 4), rad; exact near zero, unlike the trace formula."""
     return np.linalg.norm(log(T)[..., :3], axis=-1)
 
 
 def magnitude(T: Array) -> tuple[float, float]:
-    """How far (4, 4) moves, m, and how far it turns, degrees."""
+    """Translation, m, and rotation angle, degrees, of (4, 4)."""
     return float(np.linalg.norm(T[:3, 3])), float(np.degrees(angle(T)))
 
 
 def apart(T: Array, T_other: Array) -> tuple[float, float]:
-    """How far two poses (4, 4) are from each other, m and degrees."""
+    """Distance, m, and rotation angle, degrees, between two poses (4, 4)."""
     return magnitude(inverse(T) @ T_other)
 
 
@@ -169,34 +169,34 @@ def way(T: Array, T_other: Array) -> Array:
 
 
 def squared_sigmas(T: Array, T_other: Array, covariance: Array) -> float:
-    """Squared distance of two poses (4, 4), in standard deviations of a covariance (6, 6) on the right of the first."""
+    """Squared Mahalanobis distance of two poses (4, 4); the covariance (6, 6) acts on the right of the first."""
     xi = way(T, T_other)
     return float(xi @ np.linalg.solve(covariance, xi))
 
 
 def orthonormalized(T: Array) -> Array:
-    """The nearest rigid transform (projects the rotation, guards against a reflection)."""
+    """The nearest rigid transform (projects the rotation, never to a reflection)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return make(U @ Vt, T[..., :3, 3])
 
 
 def from_rows(rows: ArrayLike) -> Array:
-    """(..., 12) numbers of files, row-major, to (..., 4, 4), their rounding removed."""
+    """(..., 12) numbers from a file, row-major, to (..., 4, 4), with orthonormal rotation despite rounding."""
     rows = np.asarray(rows, np.float64)
     matrices = rows.reshape(*rows.shape[:-1], 3, 4)
     return orthonormalized(make(matrices[..., :3], matrices[..., 3]))
 
 
 def is_covariance(covariance: Array, largest: float = 1e15) -> bool:
-    """Whether (N, N) is finite, symmetric, positive definite, with variances that a solver can invert."""
+    """Whether (N, N) is finite, symmetric and positive definite, with variances that a solver can invert."""
     if covariance.ndim != 2 or not np.isfinite(covariance).all():
         return False
     variances = np.diag(covariance)
     if variances.min() < _SMALLEST_VARIANCE or variances.max() > largest:
         return False
     sigma = np.sqrt(variances)
-    correlation = covariance / np.outer(sigma, sigma)  # so that rad and m, however different, are treated alike
+    correlation = covariance / np.outer(sigma, sigma)  # makes rad and m comparable
     if np.abs(correlation - correlation.T).max() > 1e-6:
         return False
     try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """SE(3) in torch, twice differentiable everywhere below pi; conventions of `se3`: [rotation, translation], T @ exp(xi).
 
-Near the identity every function is its series: sin(theta)/theta and its kin are 0/0 there, and `where` around a
-division leaks its NaN into the gradient, so that the argument is replaced before the division and not after it.
+Near the identity every function uses a series, since sin(theta)/theta and similar terms are 0/0 there. A `where` around
+a division would leak its NaN into the gradient; so the argument is replaced before the division, not the result after.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def log(T: Tensor) -> Tensor:
 
 
 def log_rotation(R: Tensor) -> Tensor:
-    """Rotation vectors (..., 3), rad, of (..., 3, 3), by way of the quaternion: exact up to pi."""
+    """Rotation vectors (..., 3), rad, of (..., 3, 3), computed with the quaternion: exact up to pi."""
     q = _quaternion(R)
     w, v = q[..., :1], q[..., 1:]
     square = (v * v).sum(-1, keepdim=True)
@@ -101,7 +101,7 @@ def _inverse_coefficient(a: Tensor, b: Tensor, square: Tensor) -> Tensor:
 
 
 def _quaternion(R: Tensor) -> Tensor:
-    """Unit quaternions (..., 4) w, x, y, z with w >= 0, by the largest component, whose root is far from zero."""
+    """Unit quaternions (..., 4) w, x, y, z with w >= 0, from the largest component, whose root is far from zero."""
     r = R.flatten(-2).unbind(-1)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = r
     rows = torch.stack(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the stamp of a cloud to the middle of its sweep, and back.
+"""Conversion between the stamp of a cloud and the middle of its sweep.
 
-Scans are registered where the LiDAR was in the middle of its sweep, whatever moment of it the driver stamps, and poses
-are handed out at the stamp. Were the points brought to the stamp itself, each error of the velocity would move the scan
-by half a sweep, and so the next velocity: of clouds stamped at their start such errors never decay.
+Scans are registered at the LiDAR's pose in the middle of the sweep, whichever time of the sweep the driver stamps;
+poses are returned for the stamp. If the points were moved to the stamp instead, each velocity error would move the scan
+by half a sweep, and so change the next velocity: for clouds stamped at their start such errors never decay.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.deskew import measured_turn
 
-_CENTERED = 0.1  # of a sweep: a stamp so near to its middle counts as the middle
-_WHOLE = 1.2  # times as long as another one: that one is a part of a sweep
-_LATELY, _OFTEN = 50, 5  # of so many clouds so many: of raw ones, however they were moved, hardly any
+_CENTERED = 0.1  # of a sweep: a stamp this close to the middle counts as the middle
+_WHOLE = 1.2  # a sweep is partial if another one is this many times as long
+_LATELY, _OFTEN = 50, 5  # times are wrong if this many of the last clouds contradict; raw clouds hardly ever do
 _WRONG = (
     "the times of the points are not used, the motion contradicts them: clouds that are de-skewed already want "
     "slam.preprocess.deskew: false"
@@ -28,11 +28,11 @@ _WRONG = (
 
 
 class Sweep:
-    """The sweep of the last cloud with times. Each has its own: what a driver sends first is a part of a sweep.
+    """The sweep of the last cloud with times. It differs between clouds: a driver's first cloud is a partial sweep.
 
     Attributes:
         middle: s after the stamp. span: s from the first to the last point; 0: not known.
-        problem: why the times of the points are not used, in words; empty where they are.
+        problem: why the times of the points are not used, in words; empty if they are used.
     """
 
     def __init__(self) -> None:
@@ -41,13 +41,13 @@ class Sweep:
         self._contradicted = deque[bool](maxlen=_LATELY)
 
     def judge(self, contradicted: bool) -> None:
-        """Whether the motion contradicts the times of the last cloud's points; if it does often, they are wrong."""
+        """Record whether the motion contradicts the times of the last cloud; if it does often, the times are wrong."""
         self._contradicted.append(contradicted)
         if sum(self._contradicted) >= _OFTEN:
             self.problem = _WRONG
 
     def look(self, frame: Frame) -> float:
-        """How long after the stamp of the frame the middle of its sweep is, s."""
+        """Time from the frame's stamp to the middle of its sweep, s."""
         if frame.time_offset is not None and len(frame.time_offset):
             start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
             middle, self.span = (start + end) / 2, end - start
@@ -55,22 +55,22 @@ class Sweep:
         return self.middle
 
     def centered(self, frame: Frame) -> Frame:
-        """The frame, timed from the middle of its sweep; without times that are wrong, as if taken at its stamp."""
+        """The frame, timed from the middle of its sweep; if its times are wrong, without them and at its stamp."""
         if self.problem:
             self.middle = self.span = 0.0
             frame = replace(frame, time_offset=None)
         return frame.later(self.look(frame))
 
     def is_part(self, span: float) -> bool:
-        """Whether another sweep, of `span` s, was only a part of one as this."""
+        """Whether another sweep, of `span` s, was only a part of a sweep like this one."""
         return self.span > _WHOLE * span
 
     def to_stamp(self, frame: Frame, motion: Array | None) -> Array:
-        """T_scan_lidar (4, 4): where the LiDAR was at the stamp, seen from where it was in the middle.
+        """T_scan_lidar (4, 4): pose of the LiDAR at the stamp relative to its pose in the middle of the sweep.
 
         Args:
-            frame: as `centered` gives it, with its IMU if that is of use. motion: (6,) twist [rad/s, m/s] or (K, 6) as
-                `curve.poses` takes it; None if not known.
+            frame: as returned by `centered`, with its IMU if usable. motion: (6,) twist [rad/s, m/s] or (K, 6) as for
+                `curve.poses`; None if not known.
         """
         if not self.middle or motion is None:
             return np.eye(4)
@@ -80,6 +80,6 @@ class Sweep:
         return T if R is None else se3.make(R[0], T[:3, 3])
 
     def covariance(self, change: Array) -> Array:
-        """(6, 6) [rad, m] of that way, where the twist changes by so much (6,) from one scan to the next."""
+        """(6, 6) [rad, m] of that transform if the twist changes by `change` (6,) from one scan to the next."""
         off = self.middle * change
         return isotropic(float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which way is up in a scan: square to the ground, where enough of it is seen around the sensor."""
+"""Estimates the up direction of a scan as the normal of the ground, if enough ground is visible around the sensor."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from dpm2_core.descriptors import is_level, levelling
 from dpm2_core.frame import Array, Up
 from dpm2_core.geometry.voxel import voxel_first
 
-_STEEPEST = 40.0  # degrees: a wall beside a sensor that is tilted by no more than this is steeper
-_REACH = 25.0  # m: farther away the ground is another one
-_VOXEL = 0.75  # m, so that the ground near by does not count for all
-_NEAR = 0.15  # m from a plane: what lies in it
+_STEEPEST = 40.0  # degrees: if the sensor is tilted by no more than this, a wall next to it is steeper
+_REACH = 25.0  # m: farther away the ground may have another slope
+_VOXEL = 0.75  # m, so that the ground close by does not outweigh the rest
+_NEAR = 0.15  # m from a plane: points that lie in it
 _HEIGHT = (0.2, 4.0)  # m of the sensor above the ground
 _TRIES = 256
-_LEAST = 0.12  # fraction of the points that lie in the ground, at least...
-_BELOW = 0.4  # ...and so many times as many beneath it, at most: ditches, and slopes behind them
-_SCORED = 1000  # points that a plane is chosen by
-_SECTORS, _AROUND = 8, 3  # of a turn: ground in so many of them, neither a hill alone nor a wall is
+_LEAST = 0.12  # smallest fraction of the points that lie in the ground...
+_BELOW = 0.4  # ...and largest number below it, relative to those in it: ditches, and slopes behind them
+_SCORED = 1000  # points by which a plane is chosen
+_SECTORS, _AROUND = 8, 3  # of a revolution; ground is in at least _AROUND of them, unlike a single hill or a wall
 
 
 def up_of(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
-    """Unit vector (3,) square to the ground of (N, 3+) points in the sensor's axes, of which z points up by and large.
+    """Unit normal (3,) of the ground of (N, 3+) points in the sensor's axes, whose z points roughly up.
 
-    None of a scan that shows no ground, such as of a room full of things, or whose ground is steeper than 40 degrees.
+    None for a scan that shows no ground, such as of a cluttered room, or whose ground is steeper than 40 degrees.
     """
     points = points.astype(np.float32, copy=False)
     xyz = points[voxel_first(points, _VOXEL, 0.5, _REACH), :3].astype(np.float64)
@@ -46,12 +46,12 @@ def up_of(points: NDArray[np.floating]) -> NDArray[np.float32] | None:
 
 
 def tilt_of(cloud: NDArray[np.floating], mounted: Up | None = None) -> NDArray[np.float32] | None:
-    """Unit vector (3,) that points up in a cloud (N, 3+) of a tilted sensor, which is read in level axes.
+    """Unit up vector (3,) in a cloud (N, 3+) of a tilted sensor, whose cloud is then processed in level axes.
 
-    None where the sensor is level, or neither the ground nor its mounting shows how it is.
+    None if the sensor is level, or if neither the ground nor its mounting shows its tilt.
 
     Args:
-        mounted: which way is up by the mounting; from there the ground is looked for.
+        mounted: up direction from the mounting; the search for the ground starts from it.
     """
     if mounted is not None and not is_level(up := np.array(mounted, np.float32)):
         R = levelling(up)
@@ -62,13 +62,13 @@ def tilt_of(cloud: NDArray[np.floating], mounted: Up | None = None) -> NDArray[n
 
 
 def _planes(xyz: Array) -> tuple[Array, Array]:
-    """Unit normals (K, 3) and heights (K,) of the sensor above planes through three points that may be the ground."""
-    noise = np.random.default_rng(0)  # the same scan has the same ground
+    """Unit normals (K, 3) of candidate ground planes through three points, and sensor heights (K,) above them."""
+    noise = np.random.default_rng(0)  # deterministic for a scan
     low = xyz[xyz[:, 2] <= np.median(xyz[:, 2])] if len(xyz) > 256 else xyz
     a, b, c = low[noise.integers(len(low), size=(3, _TRIES))]
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
-    wide = length > 4.0  # m2: of points close together no plane is known
+    wide = length > 4.0  # m2: points close together do not define a plane
     normals = normals[wide] / length[wide, None]
     normals[normals[:, 2] < 0] *= -1
     heights = -np.einsum("ij,ij->i", normals, a[wide])

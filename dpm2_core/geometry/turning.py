@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a sensor turned, from the angular rates that a gyroscope measured."""
+"""Integrates the angular rates of a gyroscope to rotations of the sensor."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from numpy.typing import ArrayLike, NDArray
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_LONGEST = 0.1  # s between two samples, across which the rate is taken to change evenly
-_BEYOND = 0.05  # s before the first sample or after the last, for which its rate is taken to go on
-_SLOWEST = 0.11  # s between the samples of the slowest IMU: those of 10 Hz, as of kitti2bag, have 0.104 s
-_UNEVEN = 1.25  # of their usual distance: so much may be between two samples of a slow one
+_LONGEST = 0.1  # s between two samples, across which the rate is assumed to change linearly
+_BEYOND = 0.05  # s before the first sample or after the last, for which its rate is assumed to continue
+_SLOWEST = 0.11  # s between the samples of the slowest IMU: at 10 Hz, as from kitti2bag, it is 0.104 s
+_UNEVEN = 1.25  # largest gap between samples of a slow IMU, in usual periods
 
 
 def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array | None:
     """Rotations R_0_t (M, 3, 3) from the axes at the times `at` (M,) s to those at 0 s.
 
-    Between two samples the rate changes evenly; the error falls with the square of their distance.
+    Between two samples the rate is interpolated linearly; the error falls with the square of their distance.
 
     Args:
         seconds: (K,) increasing times of the samples. rates: (K, 3) rad/s about the sensor's own axes.
 
     Returns:
-        None where the samples do not tell: none within 0.1 s of each other, or of the times to within 0.05 s; of an
-        IMU of 10 Hz within a quarter more than its period.
+        None if samples are missing: more than 0.1 s between two of them, or more than 0.05 s from the times to the
+        nearest; for an IMU of 10 Hz a quarter more than its period.
     """
     at = np.asarray(at, np.float64)
     low, high = min(0.0, float(at.min())), max(0.0, float(at.max()))
     longest, beyond = _limits(seconds)
     near = (seconds > low - longest) & (seconds < high + longest)
     seconds, rates = seconds[near], rates[near]
-    if len(seconds) > 1 and seconds[1] <= low:  # of those before, the last one alone
+    if len(seconds) > 1 and seconds[1] <= low:  # of the samples before, only the last one is needed
         first = int(np.searchsorted(seconds, low, "right")) - 1
         seconds, rates = seconds[first:], rates[first:]
     if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > longest:
-        seconds, rates = seconds[1:], rates[1:]  # it stopped and has come back
+        seconds, rates = seconds[1:], rates[1:]  # the IMU paused before `low`
     last = int(np.searchsorted(seconds, high)) + 1
     seconds, rates = seconds[:last], rates[:last]
     if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > longest:
@@ -65,20 +65,20 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
 
 
 def _limits(seconds: NDArray[np.floating]) -> tuple[float, float]:
-    """s between two samples, and beyond the first and the last, by how far apart they (K,) usually are."""
+    """Largest s between two samples, and beyond the first and last one, from the usual distance of the samples (K,)."""
     usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     allowed = _UNEVEN * usual if usual < _SLOWEST else 0.0
     return max(_LONGEST, allowed), max(_BEYOND, allowed)
 
 
 def leveled(up: ArrayLike, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """The smallest rotation (3, 3) that turns the direction `up` (3,) into `axis` (3,); lengths do not matter."""
+    """The smallest rotation (3, 3) that rotates the direction `up` (3,) to `axis` (3,); lengths do not matter."""
     u, z = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (up, axis))
     cross, cosine = np.cross(u, z), float(u @ z)
     sine = float(np.linalg.norm(cross))
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        cross = np.cross(u, np.eye(3)[int(np.abs(u).argmin())])  # upside down: about any level axis
+        cross = np.cross(u, np.eye(3)[int(np.abs(u).argmin())])  # upside down: about any horizontal axis
         return np.asarray(se3.rotation(np.pi * cross / np.linalg.norm(cross)))
     return np.asarray(se3.rotation(cross / sine * np.arctan2(sine, cosine)))

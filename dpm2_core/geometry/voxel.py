@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxel-grid sampling fast enough for every frame: linear in the points, no sorting."""
+"""Voxel-grid sampling fast enough for every frame: linear in the number of points, no sorting."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ def voxel_first(points: NDArray[np.floating], size: float, near: float = 0.0, fa
 
     Only points between `near` and `far` m from the origin count.
 
-    Keeping a measured point, not the mean, keeps surfaces sharp; and points put first stay when a map grows.
-    Coordinates of those must be within 2^20 cells of the origin; NaN is never in range, and inf only if `far` is.
+    Keeping a measured point, not the mean, keeps surfaces sharp; and earlier points stay when a map grows. Coordinates
+    of the points in range must be within 2^20 cells of the origin; NaN is never in range, and inf only if `far` is inf.
     """
     return _first(points, _empty(len(points)), size, near, far)
 
 
 class VoxelCells:
-    """`voxel_first` of clouds that come one after the other: the cells that have a point already get no other one."""
+    """`voxel_first` for a sequence of clouds: cells that already have a point are not filled again."""
 
     def __init__(self, size: float) -> None:
-        """`size`: of a cell, m."""
+        """`size`: edge of a cell, m."""
         self._size, self._table, self._count = size, _empty(0), 0
 
     def first(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Ascending indices of the (N, 3+) points that are the first in their cells, of all so far."""
+        """Ascending indices of the (N, 3+) points that are the first in their cells, among all clouds so far."""
         if len(self._table) < 2 * (self._count + len(points)):
             before, self._table = self._table, _empty(2 * (self._count + len(points)))
             _put(before, self._table)
@@ -41,7 +41,7 @@ class VoxelCells:
 
 
 def _empty(points: int) -> NDArray[np.int64]:
-    """A hash table with room for the cells of so many points: at least half of it stays empty."""
+    """A hash table for the cells of `points` points: at least half of it stays empty."""
     return np.full(1 << max(2 * points - 1, 1023).bit_length(), -1, np.int64)
 
 
@@ -54,7 +54,7 @@ def _first(
 
 @compiled(uint64(int64[::1]))
 def _shift(table: NDArray[np.int64]) -> np.uint64:
-    """By so many bits a hash is shifted to a place in the table: the upper ones are the best mixed."""
+    """Number of bits by which a hash is shifted to a table index: its upper bits are mixed best."""
     shift = 64
     while (1 << 64 - shift) < len(table):
         shift -= 1
@@ -63,7 +63,7 @@ def _shift(table: NDArray[np.int64]) -> np.uint64:
 
 @compiled(int64(int64[::1], uint64, int64))
 def _slot(table: NDArray[np.int64], shift: np.uint64, key: np.int64) -> np.int64:
-    """Where a hash table has a key, or has room for it."""
+    """Index of a key in a hash table, or of the free slot for it."""
     slot = np.int64(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> shift)
     while table[slot] >= 0 and table[slot] != key:
         slot = (slot + 1) & (len(table) - 1)
@@ -72,7 +72,7 @@ def _slot(table: NDArray[np.int64], shift: np.uint64, key: np.int64) -> np.int64
 
 @compiled(void(int64[::1], int64[::1]))
 def _put(keys: NDArray[np.int64], table: NDArray[np.int64]) -> None:
-    """Keys that are not negative into a table that has none of them."""
+    """Insert the non-negative keys into a table that has none of them."""
     shift = _shift(table)
     for key in keys:
         if key >= 0:
@@ -83,7 +83,7 @@ def _put(keys: NDArray[np.int64], table: NDArray[np.int64]) -> None:
 def _first_in_cells(
     points: NDArray[np.floating], table: NDArray[np.int64], scale: np.floating, least: np.floating, most: np.floating
 ) -> NDArray[np.int64]:
-    """`voxel_first` by a hash table of the cells seen so far; `least` and `most` are squared distances."""
+    """`voxel_first` with a hash table of the cells seen so far; `least` and `most` are squared distances."""
     shift = _shift(table)
     first, count, before = np.empty(len(points), np.int64), 0, np.int64(-1)
     for i in range(len(points)):
@@ -92,7 +92,7 @@ def _first_in_cells(
             continue
         x, y, z = np.floor(points[i, 0] * scale), np.floor(points[i, 1] * scale), np.floor(points[i, 2] * scale)
         key = (np.int64(x) + _HALF << 42) | (np.int64(y) + _HALF << 21) | (np.int64(z) + _HALF)
-        if key == before:  # as its neighbor on the beam's ring
+        if key == before:  # same cell as the point before, its neighbor on the beam's ring
             continue
         before = key
         slot = _slot(table, shift, key)
