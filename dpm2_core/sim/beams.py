@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the pulses of a LiDAR go: the patterns of spinning sensors, and of one with two prisms that never repeats."""
+"""Directions of a LiDAR's pulses: patterns of spinning sensors, and of a non-repeating one with two prisms."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.settings import LidarConfig
 
 _CAR_BODY = (1.5, 1.67, 0.85, 0.56)
-"""Edges of the roof ahead, behind and aside, and the sensor's height over it, m: hides what it hides on KITTI's car."""
+"""Roof edges ahead, behind and to the side, and the sensor's height above it, m: occludes the same as KITTI's car."""
 _PRISMS = ((7294 / 60, np.radians(17.6)), (-4664 / 60, np.radians(17.6)))
-"""Turns a second and deflection, rad, of the two prisms of the rosette, as in Livox' Mid-40 and Avia."""
+"""Revolutions per second and deflection, rad, of the two prisms of the rosette, as in Livox' Mid-40 and Avia."""
 _LASERS = np.radians(0.28)
-"""Between two lasers of the rosette, rad."""
+"""Angle between two lasers of the rosette, rad."""
 
 
 def elevations(beams: int) -> Array:
-    """(beams,) rad above the horizon of a spinning sensor, top beam first."""
+    """(beams,) elevations of a spinning sensor, rad, top beam first."""
     degrees = {
         16: np.linspace(15, -15, 16),
         32: np.linspace(10.67, -30.67, 32),
@@ -31,7 +31,7 @@ def elevations(beams: int) -> Array:
 
 
 class Beams:
-    """The pulses of a turn (of a period, where nothing turns), by beam, within a beam by column.
+    """The pulses of a revolution (for the rosette, of a period), ordered by beam, within a beam by column.
 
     Attributes:
         ring, column: (R,) beam, 0 is the top one, and number of the firing.
@@ -44,7 +44,7 @@ class Beams:
         n = config.columns
         ring, column = np.divmod(np.arange(config.beams * n), n)
         self._kept: NDArray[np.bool_] | slice = slice(None)
-        self._always: Float | None = None  # a spinning one's directions
+        self._always: Float | None = None  # constant directions of a spinning sensor
         if self._spinning:
             turn = self._turn()
             if config.car_body:
@@ -52,12 +52,12 @@ class Beams:
             self._always = np.ascontiguousarray(turn[self._kept], np.float32)
         self.ring, self.column = ring.astype(np.uint8)[self._kept], column[self._kept]
         azimuth = np.arange(n) * (2 * np.pi / n)
-        # A spinning one turns clockwise and looks straight ahead at the stamp.
+        # A spinning sensor rotates clockwise and faces straight ahead at the stamp.
         phase = -np.remainder(azimuth + np.pi, 2 * np.pi) + np.pi if self._spinning else azimuth - np.pi
         self.column_time = (phase / (2 * np.pi) * FRAME_PERIOD).astype(np.float32)
 
     def directions(self, time: float) -> Float:
-        """(R, 3) unit directions in the LiDAR frame of the turn at a time, s."""
+        """(R, 3) unit directions in the LiDAR frame of the revolution at a time, s."""
         return self._rosette(time) if self._always is None else self._always
 
     def _turn(self) -> Array:
@@ -75,7 +75,7 @@ class Beams:
         return np.stack(parts, -1).reshape(-1, 3)
 
     def _rosette(self, time: float) -> Float:
-        """A row of lasers behind two prisms that turn against each other: the sum of two deflections, ever shifting."""
+        """A row of lasers behind two counter-rotating prisms: the sum of two deflections, which does not repeat."""
         when = time + self.column_time.astype(float)
         aside, up = (
             sum(bend * wave(2 * np.pi * rate * when) for rate, bend in _PRISMS) for wave in (np.cos, np.sin)

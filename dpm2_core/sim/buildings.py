@@ -18,17 +18,17 @@ WALL_COLORS = np.array([
 ])  # fmt: skip
 ROOF_COLORS = np.array([(150, 78, 58), (120, 66, 52), (92, 84, 82), (110, 104, 100), (136, 92, 70)])
 FLOOR = 2.9
-"""Height of a storey, m."""
+"""Height of a story, m."""
 FOUNDATION = 2.0
-"""How far walls go below the ground at their origin, m, for slopes."""
+"""Depth of walls below the ground at their origin, m, for slopes."""
 
 
 class Style(NamedTuple):
-    """What the sides of a house have in common.
+    """Common properties of the sides of a house.
 
     Attributes:
-        floors: how many. wall: color (3,). material: of the walls.
-        bay: width from window to window, m. glass: fraction of it that a window takes. shop: on the ground floor.
+        floors: number. wall: color (3,). material: of the walls.
+        bay: distance between windows, m. glass: fraction of it that a window takes. shop: on the ground floor.
     """
 
     floors: int
@@ -40,7 +40,7 @@ class Style(NamedTuple):
 
 
 def building(width: float, depth: float, floors: int, rng: np.random.Generator) -> Mesh:
-    """A house with its front on y = 0, x from -width/2 to width/2, and its back on y = depth; the ground is z = 0."""
+    """A house with its front at y = 0, x from -width/2 to width/2, and its back at y = depth; the ground is z = 0."""
     style = Style(
         floors,
         wall=np.clip(WALL_COLORS[rng.integers(len(WALL_COLORS))] + rng.normal(0, 10, 3), 30, 240),
@@ -87,7 +87,7 @@ def _facade(width: float, style: Style, rng: np.random.Generator, front: bool = 
 def _features(
     style: Style, depth: NDArray, window: NDArray[np.bool_], color: NDArray, rng: np.random.Generator
 ) -> None:
-    """Doors, shops, bays, recesses and balconies, written into the cells of a front."""
+    """Write doors, shops, bays, recesses and balconies into the cells of a front."""
     bays = len(depth) // 2
     door = 1 + 2 * int(rng.integers(bays))
     depth[door, :2] += rng.uniform(0.3, 0.8)
@@ -111,7 +111,7 @@ def _features(
         depth[:, 0] -= 0.08  # plinth
         color[:, 0] *= 0.7
     if rng.random() < 0.25 and bays > 3:
-        depth[: 2 * int(rng.integers(1, bays - 1)) + 1] += rng.uniform(0.5, 2.0)  # a part that steps back
+        depth[: 2 * int(rng.integers(1, bays - 1)) + 1] += rng.uniform(0.5, 2.0)  # a part that is set back
 
 
 def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> list[Mesh]:

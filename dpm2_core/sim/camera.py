@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rectified color camera by ray casting: shadows, exposure, vignetting, noise."""
+"""A rectified color camera simulated by ray casting: shadows, exposure, vignetting, noise."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
 _RESPONSE = 255 * np.minimum(np.arange(4096, dtype=np.float32) / 4096 * 1.25, 1) ** np.float32(1 / 2.2)
 _HAZE = np.array([0.72, 0.78, 0.86], np.float32)
 _BAND = 32
-"""Rows of pixels that are worked on at a time."""
+"""Number of pixel rows that are processed at a time."""
 REACH = 600.0
-"""How far one sees, m."""
+"""Visible range, m."""
 
 
 def calibration(config: CameraConfig) -> Camera:
-    """The camera on the car: looking ahead, 0.27 m ahead of and 0.08 m below the LiDAR, 0.06 m left of its middle."""
+    """The camera on the car: facing ahead, 0.27 m ahead of and 0.08 m below the LiDAR, 0.06 m left of its middle."""
     K = np.array([[config.focal, 0, config.width / 2 - 0.5], [0, config.focal, config.height / 2 - 0.5], [0, 0, 1]])
     return Camera(K, se3.make(R_AHEAD, (0.27, 0.06, -0.08)), (config.width, config.height), name="image_2")
 
@@ -47,9 +47,9 @@ def _rays(config: CameraConfig) -> Float:
 def render(
     world: World, config: CameraConfig, T_world_cam: Array, time: float, rng: np.random.Generator, hours: float = 0.0
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` makes the pixel noise.
+    """(H, W, 3) uint8 RGB of a world from a pose (4, 4) at a time, s; `rng` draws the pixel noise.
 
-    `hours`: later in the day, the sun elsewhere.
+    `hours`: later in the day, with another position of the sun.
     """
     light = world.light.later(hours)
     eye = T_world_cam[:3, 3].astype(np.float32)
@@ -65,7 +65,7 @@ def render(
 def _band(
     world: World, light: Light, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
 ) -> Float:
-    """(R, 3) light that comes from the directions (R, 3), some rows of pixels."""
+    """(R, 3) light from the directions (R, 3) of some rows of pixels."""
     surface, seen, distance = _visible(world, dynamic_objects, eye, view, config)
     lit = np.ones(len(distance), np.float32)
     if not light.tunnel and light.overcast < 0.85:
@@ -85,7 +85,7 @@ def _band(
 def _visible(
     world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
 ) -> tuple[VisiblePoints, NDArray[np.bool_], Float]:
-    """The nearest surface points of the rays that meet one, static or moving; which rays these are; their distances."""
+    """The nearest surface points on the rays that hit one, static or moving; which rays hit; and their distances."""
     hits = world.scene.cast(np.broadcast_to(eye, view.shape).copy(), view, REACH)
     if dynamic_objects is not None:
         moving, toward = dynamic_objects.cast(eye, view, REACH)
@@ -110,7 +110,7 @@ def _visible(
 
 
 def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """uv (R, 2), texture, material and color of the triangles hit; of any triangle where none was."""
+    """uv (R, 2), texture, material and color of the triangles hit; arbitrary values for rays that hit none."""
     face = np.maximum(hits.face, 0)
     corners = mesh.uv[face]
     uv = (1 - hits.u - hits.v)[:, None] * corners[:, 0]
@@ -144,13 +144,13 @@ def _sunlit(
 
 
 def _develop(radiance: Float, exposure: float, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Automatic exposure, the lens's fall-off, the sensor's response and noise."""
+    """Apply automatic exposure, lens vignetting, and the sensor's response and noise."""
     height, width = radiance.shape[:2]
     v, u = (np.linspace(-1, 1, n, dtype=np.float32) for n in (height, width))
     vignette = 1 - 0.22 * (u[None] ** 2 * 0.8 + v[:, None] ** 2 * 0.2)
     level = np.float32(exposure * 0.24 / (radiance[::4, ::4].mean() + 0.02))
     x = radiance * (vignette * level)[..., None]
-    x *= np.float32(4095) / (1 + x)  # rolls off towards white
+    x *= np.float32(4095) / (1 + x)  # compresses highlights
     image = _RESPONSE[x.astype(np.uint16)]
     image += rng.standard_normal(image.shape, np.float32) * np.float32(noise)
     return image.clip(0, 255).astype(np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive through a world, written as a KITTI odometry data set with labels, static twins and a map of the ground."""
+"""A drive through a world, written as a KITTI odometry data set with labels, static twins and a ground map."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from dpm2_core.sim.world import World, build_world, own_preset, random_stream
 
 NOTE = "dpm2_sim.json"
 OVERLAP = 16.0
-"""How far a closed drive goes on beyond its start, m."""
+"""Distance that a closed drive continues beyond its start, m."""
 LONGEST_LAP = 800.0
-"""A longer drive goes round again, m."""
+"""A longer drive goes around again, m."""
 _SMOOTH = 31
-"""Samples of an IMU over which the course is smoothed: 0.3 s, a few samples of a road; it moves by 1 mm (RMS)."""
+"""IMU samples over which the trajectory is smoothed: 0.3 s, a few samples of a road; it moves by 1 mm (RMS)."""
 _UNSAID = {"pattern", "roll", "pitch", "real", "wet", "lens", "traffic", "imu", "gnss"}
 _LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM, _GNSS_STREAM = 10, 11, 14, 15
 
@@ -43,18 +43,18 @@ def simulate(
     workers: int = 2,
     progress: Advance = untold,
 ) -> bool:
-    """Write a drive to `out`, which appears when it is complete and not before.
+    """Write a drive to `out`, which appears only when it is complete.
 
     Args:
         out: root of the KITTI layout: sequences/00/{velodyne,image_2,labels,static,...}, poses/00.txt.
-        workers: threads; the result does not depend on them.
-        progress: called with frames done and frames in all.
+        workers: number of threads; the result does not depend on it.
+        progress: called with the number of frames done and the total.
 
     Returns:
-        False if the same drive was there already, and is left as it is.
+        False if the same drive exists already; it is not changed.
 
     Raises:
-        UsageError: a setting cannot be, or `out` holds something else. Dpm2Error: it could not be written.
+        UsageError: a setting is invalid, or `out` contains something else. Dpm2Error: it could not be written.
     """
     drive = drive.model_copy(update={"frames": _frames(drive)})
     recipe = _recipe(drive)
@@ -65,7 +65,7 @@ def simulate(
     plan, height = world.road.plan, drive.lidar.height
     if plan is not None and height >= plan.headroom:
         raise UsageError(f"--height {height:g}: the way leads under what is {plan.headroom:.2f} m high")
-    with new_folder(out) as part:  # `sequences`, by which a drive is known, comes last
+    with new_folder(out) as part:  # `sequences`, which identifies a drive, is written last
         _Drive(world, drive).write(part, recipe, workers, progress)
     return True
 
@@ -82,11 +82,11 @@ def _frames(drive: DriveConfig) -> int:
 
 
 def fitting_length(drive: DriveConfig) -> float:
-    """Of the road, m, that the frames of a drive just fill."""
+    """Length of the road, m, that the frames of a drive just fill."""
     kind = own_preset(drive.preset, drive.seed, drive.traffic)
     end = (_frames(drive) - 1) * FRAME_PERIOD
     length = float(np.clip(end * kind.speed, 60, 20000))
-    for _ in range(12):  # how far it goes depends on the curves, and these on the length
+    for _ in range(12):  # the driven distance depends on the curves, and these on the length
         streets = make_road(drive.road, kind, random_stream(drive.seed, drive.preset, 0), length)
         driven = float(streets.distance(end) - streets.distance(0.0))
         if streets.drive.closed:
@@ -98,8 +98,8 @@ def fitting_length(drive: DriveConfig) -> float:
 
 
 def _recipe(drive: DriveConfig) -> dict[str, Any]:
-    """What the drive is made from, of a file its name and checksum; usual traffic, a level and clean LiDAR that turns
-    and a dry lens go without saying."""
+    """The drive's settings; a file of poses by name and checksum. Defaults of newer settings are left out: usual
+    traffic, a level, clean and spinning LiDAR, and a dry lens."""
     recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump(mode="json")}
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
@@ -113,7 +113,7 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
 
 
 def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
-    """Whether `out` holds this very drive; UsageError if it holds anything else."""
+    """Whether `out` contains exactly this drive; UsageError if it contains anything else."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return False
     try:
@@ -129,7 +129,7 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
 
 
 class _Drive:
-    """One world, sensors and the poses of the drive; writes frames in any order."""
+    """One world, its sensors and the poses of the drive; writes frames in any order."""
 
     def __init__(self, world: World, drive: DriveConfig) -> None:
         self.world, self.lidar, self.camera = world, Lidar(drive.lidar), drive.camera if drive.images else None
@@ -139,7 +139,7 @@ class _Drive:
         self.times = np.arange(_frames(drive), dtype=np.float64) * FRAME_PERIOD
         self.T_world_lidar = self._poses(self.times)
         color = calibration(drive.camera)
-        # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 sits beside it.
+        # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 is next to it.
         T_level_cam0 = color.T_lidar_cam.copy()
         T_level_cam0[1, 3] = 0.0
         T_lidar_level = se3.inverse(self.lidar.T_level_lidar)
@@ -199,12 +199,12 @@ class _Drive:
         (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
 
     def _write_imu(self, imu: Imu, path: Path) -> None:
-        """A line for each sample, from before the first scan to after the last: s, then rad/s and m/s2 of its axes."""
+        """One line per sample, from before the first scan to after the last: s, then rad/s and m/s2 along its axes."""
         times = imu.times(-FRAME_PERIOD, self.times[-1] + FRAME_PERIOD)
         np.savetxt(path, np.column_stack([times, *imu.measure(times, self._smooth_poses)]), "%.9e")
 
     def _write_fixes(self, gnss: Receiver, path: Path) -> None:
-        """A line for each: s, latitude and longitude, deg, altitude, m, standard deviations east, north, up, m."""
+        """One line per fix: s, latitude and longitude, deg, altitude, m, standard deviations east, north, up, m."""
         times = gnss.times(self.times[-1])
         sigmas = np.tile(gnss.sigmas, (len(times), 1))
         np.savetxt(path, np.column_stack([times, gnss.measure(self._poses(times)), sigmas]), "%.12e")
@@ -214,9 +214,9 @@ class _Drive:
         return np.reshape([self.lidar.pose(self.world, float(t)) for t in times], (-1, 4, 4))
 
     def _smooth_poses(self, times: Array) -> Array:
-        """As `_poses`, 0.01 s apart, of a car that has been on its way before 0 s, and on a course without corners:
-        roads are straight from sample to sample, and an IMU would feel a blow of some g at each."""
-        from scipy.signal import savgol_filter  # takes longer to import than all else here
+        """Like `_poses`, 0.01 s apart, for a car that moves before 0 s, on a trajectory without corners. Roads are
+        straight between samples, so that an IMU would measure peaks of some g at each sample."""
+        from scipy.signal import savgol_filter  # takes longer to import than everything else here
 
         T, early = self._poses(np.maximum(times, 0.0)), times < 0
         first, soon = self._poses(np.array([0.0, 0.02]))
@@ -226,7 +226,7 @@ class _Drive:
         return T
 
     def _write_ground(self, path: Path) -> None:
-        """Height of the ground, kerbs included, NaN where unknown; T_grid_cam0 is the first pose in its frame."""
+        """Height of the ground, with curbs, NaN where unknown; T_grid_cam0 is the first pose in the map's frame."""
         terrain = self.world.terrain
         np.savez_compressed(
             path,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the walls of a building are: rooms, corridors, halls and doors, or a deck of a car park; and a way round."""
+"""Floor plans: rooms, corridors, halls and doors, or a car park's deck; and a closed path through them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from dpm2_core.frame import Array
 
 RoomKind = Literal["room", "corridor", "hall", "stairs", "deck"]
 _NARROW = 2.4
-"""Least width of a room that is no corridor, m."""
+"""Smallest width of a room that is no corridor, m."""
 AISLE = 6.2
 """Width of the lanes of a car park, m; the rows of cars between them are `ROW` deep."""
 ROW = 10.0
 PIPE = 0.57
-"""The lowest pipe of a deck hangs so far below its ceiling, m."""
-_TRIES = 50  # plans of a building, of which one is more than a single hall
+"""Distance of the lowest pipe of a deck below its ceiling, m."""
+_TRIES = 50  # attempts to plan a building with more than a single hall
 
 
 @dataclass(frozen=True)
 class Room:
-    """An upright box without what stands in it: `low` and `high` (x, y) m, `height` m."""
+    """An upright, empty box: `low` and `high` (x, y) m, `height` m."""
 
     kind: RoomKind
     low: tuple[float, float]
@@ -33,12 +33,12 @@ class Room:
 
     @property
     def center(self) -> Array:
-        """(2,) m."""
+        """Center (2,) m."""
         return (np.array(self.low) + self.high) / 2
 
     @property
     def size(self) -> Array:
-        """(2,) m."""
+        """Size (2,) m."""
         return np.array(self.high) - self.low
 
 
@@ -48,7 +48,7 @@ class Door:
 
     Attributes:
         rooms: numbers of both. axis: 0 for a wall at a constant x, 1 at a constant y. at: that constant, m.
-        start, end: along the wall, m. top: height, m.
+        start, end: positions along the wall, m. top: height, m.
     """
 
     rooms: tuple[int, int]
@@ -59,7 +59,7 @@ class Door:
     top: float
 
     def point(self, towards: Array, away: float) -> Array:
-        """(2,) before the middle of the door, `away` m on the side of a place (2,)."""
+        """(2,) point in front of the middle of the door, `away` m on the side of a position (2,)."""
         out = np.full(2, (self.start + self.end) / 2)
         out[self.axis] = self.at + away * np.sign(towards[self.axis] - self.at)
         return out
@@ -67,7 +67,7 @@ class Door:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Rooms, the doors between them, and the corners (K, 2) of a closed way through all of them."""
+    """Rooms, the doors between them, and the corners (K, 2) of a closed path through all of them."""
 
     rooms: list[Room]
     doors: list[Door]
@@ -75,13 +75,13 @@ class FloorPlan:
 
     @property
     def headroom(self) -> float:
-        """Height of the lowest that the way leads under, m: doors, or the pipe below the ceiling of a deck."""
+        """Smallest height along the path, m: of doors, or of the pipe below the ceiling of a deck."""
         decks = [room.height - PIPE for room in self.rooms if room.kind == "deck"]
         return min([door.top for door in self.doors] + decks)
 
 
 def office(length: float, rng: np.random.Generator) -> FloorPlan:
-    """A floor of rooms, corridors, halls and a staircase, with a way of very roughly `length` m through it.
+    """A floor of rooms, corridors, halls and a staircase, with a path of very roughly `length` m through it.
 
     Raises:
         UsageError: too short for two rooms.
@@ -90,7 +90,7 @@ def office(length: float, rng: np.random.Generator) -> FloorPlan:
     size = np.sqrt([area * aspect, area / aspect])
     for _ in range(_TRIES):
         rooms = _split((0.0, 0.0), (float(size[0]), float(size[1])), rng)
-        if len(rooms) > 1:  # one hall has no door, and so no way
+        if len(rooms) > 1:  # a single hall has no door, and so no path
             break
     else:
         raise UsageError(f"a building for a way of {length:g} m has a single room; want a longer way")
@@ -105,7 +105,7 @@ def office(length: float, rng: np.random.Generator) -> FloorPlan:
 
 
 def car_park(length: float, rng: np.random.Generator) -> FloorPlan:
-    """A deck with rows of parked cars, and a way round one or two of them."""
+    """A deck with rows of parked cars, and a path around one to four of them."""
     pitch, rows = AISLE + ROW, int(np.clip(round(length / 110), 1, 4))
     reach = max(length / 2 - rows * pitch, 24.0)
     high = (reach + AISLE, rows * pitch + AISLE)
@@ -115,7 +115,7 @@ def car_park(length: float, rng: np.random.Generator) -> FloorPlan:
 
 
 def _split(low: tuple[float, float], high: tuple[float, float], rng: np.random.Generator) -> list[Room]:
-    """Rooms that fill a rectangle: halved at random, at times along a corridor, until they are of usual sizes."""
+    """Rooms that fill a rectangle: split at random, sometimes along a corridor, until they have usual sizes."""
     size = np.array(high) - low
     axis = int(size[1] > size[0])
     area, least = float(size.prod()), 2 * _NARROW
@@ -137,7 +137,7 @@ def _split(low: tuple[float, float], high: tuple[float, float], rng: np.random.G
 
 
 def _connections(rooms: list[Room], rng: np.random.Generator) -> tuple[list[Door], list[Door]]:
-    """Doors that make a tree of all rooms, by corridors where there are any, and a few more."""
+    """Doors that connect all rooms in a tree, through corridors if possible, and a few more."""
     found = [door for i in range(len(rooms)) for j in range(i + 1, len(rooms)) if (door := _door(rooms, i, j, rng))]
     corridors = [any(rooms[k].kind == "corridor" for k in door.rooms) for door in found]
     order = np.argsort(rng.random(len(found)) - 2 * np.array(corridors, float))
@@ -170,7 +170,7 @@ def _door(rooms: list[Room], i: int, j: int, rng: np.random.Generator) -> Door |
 
 
 def _tour(rooms: list[Room], tree: list[Door]) -> Array:
-    """Corners of a closed way along the tree of doors and back; where there is one door only, round the room."""
+    """Corners of a closed path along the tree of doors and back; in a room with one door, around the room."""
     doors: list[list[Door]] = [[] for _ in rooms]
     for door in tree:
         for k in door.rooms:
@@ -196,7 +196,7 @@ def _tour(rooms: list[Room], tree: list[Door]) -> Array:
 
 
 def _round(room: Room, door: Door) -> list[Array]:
-    """Four corners about the middle of a room, from the one nearest to the door."""
+    """Four corners around the middle of a room, starting with the one nearest to the door."""
     reach = np.maximum(room.size / 2 - 1.1, 0.35)
     corners = [room.center + reach * turn for turn in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     first = int(np.argmin([np.linalg.norm(corner - door.point(room.center, 0.7)) for corner in corners]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands along a kerb: x along the street, -y towards the road, z up from the ground."""
+"""Objects along a curb: x along the street, -y towards the road, z up from the ground."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _METAL = Surface(Label.POLE, Material.METAL, (120, 122, 124))
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
-    """A street lamp of 4.5 to 9 m reaching over the road."""
+    """A street lamp of 4.5 to 9 m that reaches over the road."""
     height, arm = rng.uniform(4.5, 9), rng.uniform(0.4, 2.0)
     return merge([
         rod((0, 0, -0.3), (0, 0, height), (0.09, 0.05), 8, _METAL),
@@ -56,7 +56,7 @@ def street_box(rng: np.random.Generator) -> Mesh:
 
 
 def bench(rng: np.random.Generator) -> Mesh:
-    """A bench looking at the road."""
+    """A bench facing the road."""
     wood = Surface(Label.OBJECT, Material.WOOD, np.array((134, 98, 66)) * rng.uniform(0.7, 1.2))
     metal = Surface(Label.OBJECT, Material.METAL, (60,) * 3)
     legs = [box((x, -0.2, -0.1), (x + 0.08, 0.2, 0.42), metal) for x in (-0.8, 0.72)]
@@ -79,4 +79,4 @@ def shelter(rng: np.random.Generator) -> Mesh:
 
 
 FURNITURE = ((lamp, 0.28), (sign, 0.34), (post, 0.16), (street_box, 0.14), (bench, 0.06), (shelter, 0.02))
-"""What a place on the kerb may hold, and how often."""
+"""Objects along the curb, with their frequencies."""

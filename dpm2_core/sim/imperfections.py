@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a real LiDAR adds to exact ranges: errors of its beams, of the pulse, of the window and of the air."""
+"""Errors of a real LiDAR added to exact ranges: of its beams, the pulse, the window and the air."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from dpm2_core.sim.settings import LidarConfig
 
 Bool = NDArray[np.bool_]
 _EDGE = (0.2, 1.5)
-"""Two surfaces so far apart along the beam, m, answer one pulse as one surface between them."""
+"""Two surfaces this far apart along the beam, m, can give a single return from between them."""
 _HALO = 2
-"""Beams and columns beside a retro-reflector that its glare reaches."""
+"""Beams and columns next to a retro-reflector that its glare reaches."""
 _NEAR = 25.0
-"""Drops farther away return too little, m."""
+"""Drops farther away than this, m, return too little."""
 
 
 @dataclass(eq=False)
 class Returns:
-    """What each of R pulses brings back.
+    """Returns of R pulses.
 
     Attributes:
-        distance: (R,) float32 m of what it met, whether that came back or not; the LiDAR's range where it met nothing.
-        intensity: (R,) float32 0..1. back: (R,) bool, whether it came back at all.
-        retro: (R,) bool, it met a retro-reflector.
+        distance: (R,) float32 m to the surface hit, even if it gives no return; the LiDAR's range if there is none.
+        intensity: (R,) float32 0..1. back: (R,) bool, whether there is a return.
+        retro: (R,) bool, whether it hit a retro-reflector.
     """
 
     distance: Float
@@ -38,17 +38,17 @@ class Returns:
     retro: Bool
 
     def copy(self) -> Returns:
-        """The same in arrays of its own."""
+        """A copy with its own arrays."""
         return Returns(*(getattr(self, field.name).copy() for field in fields(self)))
 
     def put(self, which: NDArray[np.intp], others: Returns) -> None:
-        """Replace those of some pulses (K,) by `others` of K."""
+        """Replace the returns of K pulses, with indices `which` (K,), by `others`."""
         for field in fields(self):
             getattr(self, field.name)[which] = getattr(others, field.name)
 
 
 class Draws(NamedTuple):
-    """Random numbers (R,) of one scan, one each for edges, glare and drops: the static twin sees the same weather."""
+    """Random numbers (R,) of one scan for edges, glare and drops; the static twin has the same weather."""
 
     edge: Float
     halo: Float
@@ -56,11 +56,11 @@ class Draws(NamedTuple):
 
 
 class SensorErrors:
-    """Errors of one sensor, made by its serial number; holds no state between scans.
+    """Errors of one sensor, determined by its serial number; stateless between scans.
 
     Attributes:
-        range_bias: (R,) m. origin_height: (R,) m over the sensor. clear: (R,) fraction of the light that the window
-            lets pass.
+        range_bias: (R,) m. origin_height: (R,) m above the sensor. clear: (R,) fraction of the light that passes the
+            window.
     """
 
     def __init__(self, config: LidarConfig, ring: NDArray[np.uint8], column: NDArray[np.intp]) -> None:
@@ -84,7 +84,7 @@ class SensorErrors:
         return np.exp(-4 * np.maximum(spots - limit, 0) / max(float(spots.std()), 1e-6)).astype(np.float32)
 
     def aimed(self, directions: Float) -> Float:
-        """Where the pulses really go that the driver believes to go along (R, 3)."""
+        """True directions of the pulses that the driver assumes to have the directions (R, 3)."""
         if not self.settings.angle_bias:
             return directions
         up, left = (row[self.ring, None] for row in self._angles)
@@ -95,20 +95,20 @@ class SensorErrors:
         return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
     def noise(self, distance: Float, cosine: Float) -> Float:
-        """(R,) deviation of ranges (R,) m beside the sensor's own: it grows with range and grazing incidence."""
+        """(R,) standard deviation added to that of the ranges (R,) m: it grows with range and grazing incidence."""
         tangent = np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, np.float32(0.05))
         slanted = np.minimum(np.float32(0.04 * self.settings.footprint) * distance * tangent, np.float32(0.2))
         return np.hypot(np.float32(self.settings.growth) * distance, slanted)
 
     def draws(self, rng: np.random.Generator) -> Draws | None:
-        """The random numbers that `finish` needs, if it has anything to do."""
+        """The random numbers for `finish`, None if it has nothing to do."""
         real = self.settings
         if not (real.footprint or real.glare or real.drops):
             return None
         return Draws(*rng.random((3, len(self.ring)), np.float32))
 
     def finish(self, returns: Returns, draws: Draws | None) -> Bool:
-        """Edges, glare and drops: changes the returns of a whole scan in place; which (R,) are of no surface."""
+        """Apply edges, glare and drops to a whole scan in place; returns which returns (R,) are not of a surface."""
         stray = np.zeros(len(self.ring), bool)
         if draws is None:
             return stray
@@ -122,7 +122,7 @@ class SensorErrors:
         return stray
 
     def _mix_edges(self, distance: Float, back: Bool, chance: Float) -> None:
-        """A pulse that meets two surfaces comes back from between them."""
+        """Move returns of pulses that hit two surfaces to between them."""
         after = np.diff(distance, append=distance[-1:])
         gap = np.abs(after)
         step = 2 * np.pi / self.config.columns
@@ -132,7 +132,7 @@ class SensorErrors:
         distance[mixed] += after[mixed] * (chance[mixed] / np.float32(share))
 
     def _glare(self, distance: Float, intensity: Float, back: Bool, retro: Bool, chance: Float) -> Bool:
-        """Pulses beside a retro-reflector, with nothing nearer, return at its distance."""
+        """Make pulses next to a retro-reflector, with nothing nearer, return at its distance."""
         seen = np.full((self.config.beams, self.config.columns), np.inf, np.float32)
         shown = np.flatnonzero(retro & back)
         seen[self.ring[shown], self.column[shown]] = distance[shown]
@@ -143,9 +143,9 @@ class SensorErrors:
         return lit
 
     def _drops(self, distance: Float, intensity: Float, back: Bool, chance: Float) -> Bool:
-        """Rain, snow or dust: pulses that return from a drop before they reach anything."""
+        """Rain, snow or dust: pulses that return from a drop before they reach a surface."""
         density = np.float32(self.settings.drops)
-        at = -np.log(np.maximum(chance, np.float32(1e-7))) / density  # m, from an even density along the beam
+        at = -np.log(np.maximum(chance, np.float32(1e-7))) / density  # m, for a constant density along the beam
         hit = (at < np.minimum(distance, _NEAR)) & (at > self.config.min_range)
         distance[hit], intensity[hit], back[hit] = at[hit], np.float32(0.02), True
         return hit

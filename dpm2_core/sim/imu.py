@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An IMU that is moved along poses: angular rates and specific forces with the errors of a real one."""
+"""An IMU that moves along given poses: angular rates and specific forces with the errors of a real sensor."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from dpm2_core.sim.settings import ImuConfig
 
 GRAVITY = 9.81
 RATE = 100.0
-"""Samples per second; each is the mean over two periods, as its low-pass filter makes it."""
-_YAW = 90.0  # deg to the left, of the mount: its axes are not those of the LiDAR
+"""Samples per second; each is the mean over two periods, which simulates the sensor's low-pass filter."""
+_YAW = 90.0  # deg to the left, of the mount: its axes differ from those of the LiDAR
 
 
 class Imu:
-    """One sensor, with biases of its own.
+    """One sensor, with its own biases.
 
     Attributes:
-        R_lidar_imu: (3, 3) as the calibration has it.
+        R_lidar_imu: (3, 3) rotation from the calibration, without the mount's error.
     """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
-        """`rng` draws the sensor, and then its noise."""
+        """`rng` draws the sensor's errors, and then its noise."""
         self.config, self._rng = config, rng
         self.R_lidar_imu: Array = Rotation.from_euler("z", _YAW, degrees=True).as_matrix()
         off = Rotation.from_rotvec(np.radians(config.misaligned) * rng.standard_normal(3)).as_matrix()

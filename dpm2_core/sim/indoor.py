@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inside of buildings: walls with doors and windows, floors, ceilings, stairs, furniture; a car park's deck."""
+"""Interiors of buildings: walls with doors and windows, floors, ceilings, stairs, furniture; a car park's deck."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from dpm2_core.sim.shapes import box, rod
 from dpm2_core.sim.vehicles import car
 
 _WALL = 0.07
-"""Half of the thickness of a wall: what each room contributes, m."""
+"""Half of the thickness of a wall, m: the part on the side of each room."""
 _FREE = 0.55
-"""Nothing but walls is nearer to the way than this, m."""
+"""Smallest distance of everything but walls from the path, m."""
 _METAL = Surface(Label.OBJECT, Material.METAL, (120, 122, 126))
 
 
 class Interior:
-    """Draws what is in the rooms of a plan; `meshes()` yields it. `way`: (K, 2) m, what has to stay free."""
+    """Draws the contents of the rooms of a plan; `meshes()` yields them. `way`: (K, 2) m, path that is kept free."""
 
     def __init__(self, plan: FloorPlan, way: Array, rng: np.random.Generator) -> None:
         self.plan, self.rng, self.way = plan, rng, cKDTree(way)
@@ -32,7 +32,7 @@ class Interior:
         self.outside = (every[:, :2].min(0), every[:, 2:].max(0))
 
     def meshes(self) -> Iterator[Mesh]:
-        """All of it."""
+        """All meshes."""
         for number, room in enumerate(self.plan.rooms):
             yield from self._shell(number, room)
             if room.kind == "deck":
@@ -48,7 +48,7 @@ class Interior:
                 yield from self._tables(room)
 
     def _shell(self, number: int, room: Room) -> Iterator[Mesh]:
-        """Floor, ceiling, and four walls with the openings that are theirs."""
+        """Floor, ceiling, and four walls with their openings."""
         rng = self.rng
         stone = room.kind in ("corridor", "deck", "stairs")
         floor = (
@@ -117,7 +117,7 @@ class Interior:
                     yield box((x - half, y - half, 0), (x + half, y + half, room.height), shaft)
 
     def _stairs(self, room: Room) -> Iterator[Mesh]:
-        """Steps up along the wall that the way leaves free."""
+        """Steps up along a wall, where the path leaves space."""
         stone = Surface(Label.STRUCTURE, Material.CONCRETE, (160, 156, 150))
         rise, run, width = self.rng.uniform(0.15, 0.19), self.rng.uniform(0.26, 0.3), 1.0
         axis = int(room.size[1] > room.size[0])
@@ -133,7 +133,7 @@ class Interior:
             yield from steps
 
     def _along_walls(self, room: Room) -> Iterator[Mesh]:
-        """Cupboards, shelves, radiators, signs, extinguishers: flat things with their backs to a wall."""
+        """Cupboards, shelves, radiators, signs, extinguishers: flat objects with their backs to a wall."""
         rng = self.rng
         for _ in range(rng.poisson(room.size.sum() / (6 if room.kind == "corridor" else 2.5))):
             axis, side = int(rng.integers(2)), int(rng.integers(2))
@@ -154,7 +154,7 @@ class Interior:
                 yield box(low, high, Surface(Label.OBJECT, material, rng.uniform(30, 235, 3)))
 
     def _tables(self, room: Room) -> Iterator[Mesh]:
-        """Tables with chairs, and boxes, where the way leaves room."""
+        """Tables with chairs, and boxes, where the path leaves space."""
         rng = self.rng
         for _ in range(rng.poisson(room.size.prod() / 7)):
             at = rng.uniform(np.array(room.low) + 0.9, np.array(room.high) - 0.9)
@@ -185,7 +185,7 @@ class Interior:
         yield from self._lamps(deck)
 
     def _is_free(self, xy: Array | tuple[float, float], radius: float) -> bool:
-        """Whether the way stays that far from a place (2,), m."""
+        """Whether the path is farther than `radius`, m, from a position (2,)."""
         return float(self.way.query(np.asarray(xy, float))[0]) > radius
 
 
@@ -215,7 +215,7 @@ def _table(rng: np.random.Generator) -> Mesh:
 
 
 def _chair(cloth: Surface) -> Mesh:
-    """Its back at +y."""
+    """A chair with its back at +y."""
     return merge([
         box((-0.22, -0.22, 0.42), (0.22, 0.22, 0.48), cloth), box((-0.22, 0.17, 0.48), (0.22, 0.23, 0.95), cloth),
         rod((0, 0, 0), (0, 0, 0.42), (0.04, 0.04), 6, _METAL),

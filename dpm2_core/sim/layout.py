@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puts the props beside the streets. Every placement asks the same two rasters: distance to the kerb, and taken."""
+"""Places static objects along the streets. Every placement uses two rasters: distance to the curb, and occupied."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from dpm2_core.sim.terrain import RESOLUTION, Kerbline, Terrain, kerbside_ribbon
 from dpm2_core.sim.vehicles import car, truck
 
 CLEAR_OF_DRIVE = 2.15
-"""Nothing as low as a car reaches nearer to the path of the car's middle than this (parked cars: their middle), m."""
+"""Distance from the path of the car's center in which there is nothing as low as a car, m; for parked cars, no center.
+"""
 
 
 class Layout:
-    """Draws the static props of a world, class by class; `meshes()` yields them."""
+    """Draws the static objects of a world, class by class; `meshes()` yields them."""
 
     def __init__(self, road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> None:
         self.terrain, self.preset, self.rng = terrain, preset, rng
@@ -35,7 +36,7 @@ class Layout:
         self.drive = cKDTree(road.drive.xy)
 
     def meshes(self) -> Iterator[Mesh]:
-        """All static props. The order decides who gets a place: cars first, then buildings, then green."""
+        """All static objects. Space is taken in this order: cars first, then buildings, then plants."""
         preset = self.preset
         if preset.parked:
             yield from self._parked(preset.parked)
@@ -78,9 +79,9 @@ class Layout:
         patchy: bool = False,
         scale: tuple[float, float] | None = (0.8, 1.25),
     ) -> Iterator[Mesh]:
-        """Copies at random places of a band beside the kerb, that keep `radius` m from what is there already.
+        """Copies at random positions in a band along the curb, at least `radius` m from objects that are there already.
 
-        `scale`: least and largest; None for copies as they are, in line with the kerb.
+        `scale`: smallest and largest; None for unscaled copies, aligned with the curb.
         """
         if per_100m <= 0:
             return
@@ -89,7 +90,7 @@ class Layout:
         for line in terrain.contour(0.5 * (band[0] + band[1])):
             n = rng.poisson(per_100m * len(line.xy) / 100)
             at = rng.integers(0, len(line.xy), n)
-            if patchy:  # belts of about 40 m: half of the line, by a random wave
+            if patchy:  # belts of about 40 m: half of the line, from a random wave
                 at = at[np.sin(at * rng.uniform(0.05, 0.12) + rng.uniform(0, 6.3)) > 0.2]
             n = len(at)
             if not n:
@@ -229,6 +230,6 @@ class Layout:
 
 
 def _reach(mesh: Mesh) -> float:
-    """Of what would touch a passing car or its sensor: the horizontal extent of its lower 3 m, m."""
+    """Horizontal extent of the lower 3 m, m, which could touch a passing car or its sensor."""
     low = mesh.vertices[mesh.vertices[:, 2] < 3.0]
     return float(np.hypot(low[:, 0], low[:, 1]).max())

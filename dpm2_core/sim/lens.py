@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Water on a lens: spots that stay where they are, behind which the image is a blur."""
+"""Water on a lens: spots at fixed pixels, behind which the image is blurred."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.sim.settings import CameraConfig
 
 
 def through_lens(image: NDArray[np.uint8], config: CameraConfig) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 as seen through a lens that is wet by `config.wet`; the same drops whatever the image."""
+    """(H, W, 3) uint8 as seen through a lens of which `config.wet` is wet; the drops do not depend on the image."""
     if not config.wet:
         return image
     mask = _drops(config)[..., None]
@@ -23,7 +23,7 @@ def through_lens(image: NDArray[np.uint8], config: CameraConfig) -> NDArray[np.u
 
 @lru_cache(maxsize=8)
 def _drops(config: CameraConfig) -> NDArray[np.float32]:
-    """(H, W) 0..1, how much of each pixel's light comes through a drop."""
+    """(H, W) 0..1, share of each pixel's light that passes through a drop."""
     rng = np.random.default_rng([config.lens, 80])
     mask = np.zeros((config.height, config.width), np.float32)
     while (mask > 0.5).mean() < config.wet:

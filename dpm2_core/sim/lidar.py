@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A multi-beam LiDAR by ray casting: points, labels, and the twin of each scan without what moves."""
+"""A multi-beam LiDAR simulated by ray casting: points, labels, and the twin of each scan without moving objects."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from dpm2_core.sim.world import World
 
 @dataclass(eq=False)
 class Scan:
-    """One turn, by beam from the top, within a beam by azimuth from straight ahead to the left.
+    """One revolution, ordered by beam from the top, within a beam by azimuth from straight ahead to the left.
 
     Attributes:
         points: (N, 4) float32 [x, y, z in m, intensity 0..1] in the LiDAR frame.
-        label: (N,) uint32 as in SemanticKITTI: class in the low 16 bits (252 and more where moving), number of the
+        label: (N,) uint32 as in SemanticKITTI: class in the low 16 bits (252 and more if moving), number of the
             dynamic object in the high ones.
         ring: (N,) uint8, 0 is the top beam.
-        time_offset: (N,) float32 s, from the middle of the turn.
-        static: (M, 4) float32, what the same pulses return without anything that moves.
+        time_offset: (N,) float32 s, from the middle of the revolution.
+        static: (M, 4) float32, returns of the same pulses without any moving object.
     """
 
     points: Float
@@ -42,15 +42,15 @@ class Scan:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(N,) whether it is of a dynamic object."""
+        """(N,) whether a point is on a dynamic object."""
         return self.label >> 16 > 0
 
 
 class Lidar:
-    """Scans worlds. Holds no state between scans: one may serve many threads.
+    """Scans worlds. Stateless between scans: one instance may be used by many threads.
 
     Attributes:
-        T_level_lidar: (4, 4) of its mount, a turn alone.
+        T_level_lidar: (4, 4) of its mount, a pure rotation.
     """
 
     def __init__(self, config: LidarConfig | None = None) -> None:
@@ -59,7 +59,7 @@ class Lidar:
         self.T_level_lidar = se3.make(turn.as_matrix(), np.zeros(3))
         self.beams = Beams(config, self.T_level_lidar)
         self.errors = SensorErrors(config, self.beams.ring, self.beams.column)
-        # No two laser-receiver pairs are equally sensitive.
+        # Every laser-receiver pair has its own sensitivity.
         gain = np.random.default_rng(config.beams).normal(1, 0.12, config.beams).astype(np.float32)
         self.gain = gain[self.beams.ring]
 
@@ -72,14 +72,14 @@ class Lidar:
         twist: Array | None = None,
         believed: Array | None = None,
     ) -> Scan:
-        """One turn at a pose (4, 4).
+        """One revolution at a pose (4, 4).
 
         Args:
-            time: s, where the dynamic objects are. They stand still during the turn.
-            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the turn, or its poses (columns, 4, 4)
-                T_stamp_column at the times of the columns: each point is then given in the frame of its own moment, as
-                a driver delivers it. None: already corrected for motion, as KITTI's are.
-            believed: (6,) twist by which the points of a turn in motion are then taken to the stamp.
+            time: s, for the positions of the dynamic objects. They do not move during the revolution.
+            twist: (6,) [rad/s, m/s] of the sensor in its own frame during the revolution, or its poses (columns, 4, 4)
+                T_stamp_column at the times of the columns: each point is then in the sensor frame at its own time, as
+                in a driver's raw cloud. None: already de-skewed, as KITTI's are.
+            believed: (6,) twist used to de-skew the points of a revolution in motion.
         """
         aim = self.beams.directions(time)
         origins, directions = self._rays(T_world_lidar, self.errors.aimed(aim), twist)
@@ -89,7 +89,7 @@ class Lidar:
         still = world.scene.cast(origins, directions, self.config.range)
         returns = self._returns(world.static, still, directions, chance, jitter)
         label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
-        if not world.terrain.preset.degenerate:  # there, intensity would reveal the motion
+        if not world.terrain.preset.degenerate:  # there the intensity would show the motion
             self._paint(world, T_world_lidar, aim, returns, label)
         twin = returns.copy()
         self.errors.finish(twin, draws)
@@ -116,7 +116,7 @@ class Lidar:
         return world.drive_pose(time, self.config.height, self.config.real.sway) @ self.T_level_lidar
 
     def drive_scan(self, world: World, T_world_lidar: Array, time: float, rng: np.random.Generator) -> Scan:
-        """One turn at a pose (4, 4), moving as the drive does at a time, s, with what a driver leaves of the motion
+        """One revolution at a pose (4, 4) and time, s, with the drive's motion and the de-skewing error of a driver
         (`Imperfections.skew`)."""
         if not self.config.real.skew:
             return self.scan(world, T_world_lidar, time, rng)
@@ -127,7 +127,7 @@ class Lidar:
     def _paint(
         self, world: World, T_world_lidar: Array, aim: Float, returns: Returns, label: NDArray[np.uint32]
     ) -> None:
-        """Brightens and labels the returns from lane markings, in place."""
+        """Brighten and label the returns from lane markings, in place."""
         road = np.flatnonzero(returns.back & (label == Label.ROAD))
         at = aim[road] * returns.distance[road, None]
         xy = at @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
@@ -137,7 +137,7 @@ class Lidar:
         returns.intensity[painted] = np.minimum(returns.intensity[painted] * np.float32(1.7), 1)
 
     def _rays(self, T_world_lidar: Array, aim: Float, twist: Array | None) -> tuple[Float, Float]:
-        """Origins and directions (R, 3) in the world."""
+        """Origins and directions (R, 3) in the world frame."""
         height = self.errors.origin_height[:, None]
         if twist is None:
             directions = rotated(aim, T_world_lidar[:3, :3])
@@ -151,7 +151,7 @@ class Lidar:
         return T[:, :3, 3].astype(np.float32)[self.beams.column] + height * R[:, :, 2], directions
 
     def _points(self, aim: Float, returns: Returns, believed: Array | None) -> Float:
-        """(N, 4) of the pulses that came back, at the stamp if the motion is `believed`."""
+        """(N, 4) of the pulses that returned, de-skewed to the stamp if the motion is `believed`."""
         back = returns.back
         points = np.empty((int(back.sum()), 4), np.float32)
         points[:, :3] = aim[back] * returns.distance[back, None]
@@ -170,7 +170,7 @@ class Lidar:
         jitter: Float,
         which: NDArray[np.intp] | slice = slice(None),
     ) -> Returns:
-        """What the pulses (R,) that hit something bring back."""
+        """Returns of the pulses (R,) on a mesh, given their hits."""
         config, real = self.config, self.config.real
         face = np.maximum(hits.face, 0)
         material = mesh.material[face]
@@ -179,10 +179,10 @@ class Lidar:
         paint = mesh.color[face].sum(1, dtype=np.float32) / np.float32(3 * 150)
         reflectance = REFLECTANCE[material] * (np.float32(0.55) + np.float32(0.45) * np.minimum(paint, np.float32(1.6)))
         distance = np.where(hits.face >= 0, hits.distance, config.range).astype(np.float32)
-        # What is left of the pulse against what the receiver needs.
+        # Strength of the returned pulse relative to the receiver's threshold.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
         strength *= self.errors.clear[which]
-        # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once a quad.
+        # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once per quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
         gone = panel < MISS[material] if real.panes else MISS[material] * 2 * panel
         lost = config.dropout + gone + np.exp(-strength / np.float32(0.006 * (1 + real.weak)))

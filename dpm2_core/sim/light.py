@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the light of an image comes from."""
+"""Light sources of an image: sun, sky and lamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.sim.shading import Textures, VisiblePoints
 
 
 class Light:
-    """Sun and sky of a world, by its seed; in a tunnel only the lamps.
+    """Sun and sky of a world, from its seed; in a tunnel only the lamps.
 
     Attributes:
         sun: (3,) unit vector towards it. overcast: 0..1. exposure: of the camera, about 1.
@@ -33,7 +33,7 @@ class Light:
         self.textures = Textures(seed)
 
     def later(self, hours: float) -> Light:
-        """The same day so many hours later: the sun 15 deg an hour further round and 5 deg lower, 8 to 75 deg high."""
+        """The same day some hours later: the sun moves 15 deg and sinks 5 deg per hour, 8 to 75 deg high."""
         if not hours or self.tunnel:
             return self
         out = copy.copy(self)
@@ -43,7 +43,7 @@ class Light:
         return out
 
     def sky(self, view: Float) -> Float:
-        """(P, 3) color of the sky along directions (P, 3): a gradient, clouds, the glow round the sun."""
+        """(P, 3) color of the sky along directions (P, 3): a gradient, clouds, and the glow around the sun."""
         if self.tunnel:
             return np.full((len(view), 3), 1.4, np.float32)
         up = np.clip(view[:, 2], 0.0, 1)[:, None]
@@ -57,7 +57,7 @@ class Light:
         return 1.5 * (blue * (1 - cover) + gray * cover) + glow
 
     def shine(self, surface: VisiblePoints, lit: Float) -> Float:
-        """(P, 3) light on each point, of which the sun's share reaches `lit` (P,)."""
+        """(P, 3) light on each point; `lit` (P,) is the share of the sunlight that reaches it."""
         if self.tunnel:
             falloff = 0.35 + 0.5 * np.clip(-surface.normal[:, 2] * 0.3 + np.abs(surface.normal[:, 2]), 0, 1)
             return falloff[:, None] * np.array([1.15, 1.0, 0.78], np.float32)
@@ -69,6 +69,6 @@ class Light:
 
 
 def _towards(elevation: float, azimuth: float) -> Float:
-    """(3,) unit vector there; both rad."""
+    """(3,) unit vector in a direction; both angles in rad."""
     level = np.cos(elevation)
     return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)

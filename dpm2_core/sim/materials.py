@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What things are (SemanticKITTI classes) and what they are made of (optical properties)."""
+"""Classes of objects (SemanticKITTI) and their materials (optical properties)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 
 class Label(IntEnum):
-    """SemanticKITTI class ids, those that the worlds contain."""
+    """SemanticKITTI class ids, as far as the worlds contain them."""
 
     OUTLIER = 1
     CAR = 10
@@ -36,7 +36,7 @@ class Label(IntEnum):
 
 
 MOVING_LABEL = np.arange(100, dtype=np.uint32)
-"""(100,) the SemanticKITTI id of a class when it moves: 10 becomes 252."""
+"""(100,) SemanticKITTI id of a class when it moves: 10 becomes 252."""
 for _still, _moving in {10: 252, 18: 258, 30: 254, 31: 253}.items():
     MOVING_LABEL[_still] = _moving
 
@@ -66,7 +66,7 @@ class Material(IntEnum):
 
 
 class Surface(NamedTuple):
-    """What a solid is, what it is made of, and its color (3,) 0..255."""
+    """Class, material and color (3,) 0..255 of a solid."""
 
     label: Label
     material: Material
@@ -75,12 +75,12 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class _Optics:
-    """Of one material.
+    """Optical properties of one material.
 
     Attributes:
-        reflectance: LiDAR intensity at normal incidence. miss: fraction of pulses that vanish. dark: fraction of
-            returns too weak to measure their intensity (0 then). roughness: extra range noise, m. retro: bright at any
-            incidence.
+        reflectance: LiDAR intensity at normal incidence. miss: fraction of pulses without a return. dark: fraction of
+            returns too weak to measure their intensity, which is then 0. roughness: additional range noise, m. retro:
+            bright at any incidence.
     """
 
     reflectance: float

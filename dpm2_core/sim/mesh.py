@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes with class, material, color and surface coordinates on every triangle, and ray casting."""
+"""Triangle meshes with class, material, color and surface coordinates for every triangle, and ray casting."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Mesh:
     Attributes:
         vertices: (V, 3) float32 m. faces: (F, 3) int32.
         label: (F,) uint8 `Label`. material: (F,) uint8 `Material`. color: (F, 3) uint8 RGB.
-        uv: (F, 3, 2) float32, surface coordinates of the corners, m. texture: (F,) uint16, what sets patterns apart.
+        uv: (F, 3, 2) float32, surface coordinates of the corners, m. texture: (F,) uint16, seed of the pattern.
     """
 
     vertices: Float
@@ -39,7 +39,7 @@ class Mesh:
         return len(self.faces)
 
     def part(self, keep: NDArray[np.bool_]) -> Mesh:
-        """Some of the triangles; the vertices stay."""
+        """The mesh with a part of the triangles; the vertices stay."""
         columns = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "vertices"}
         return Mesh(self.vertices, **columns)
 
@@ -52,9 +52,9 @@ def make(
     color: ArrayLike = (128, 128, 128),
     uv: Float | None = None,
 ) -> Mesh:
-    """A mesh from (V, 3) vertices and (F, 3) faces; the other values are for all triangles or one each.
+    """A mesh from (V, 3) vertices and (F, 3) faces; the other values are for all triangles or one for each.
 
-    Without `uv` each triangle is projected along the axis that its normal is nearest to.
+    Without `uv` each triangle is projected along the axis nearest to its normal.
     """
     vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
     n = len(faces)
@@ -69,8 +69,8 @@ def make(
     )
 
 
-# A world is made of thousands of small meshes: what numpy's functions of many arguments do before they compute took
-# a quarter of the time that it takes.
+# A world consists of thousands of small meshes: the overhead of numpy's general functions took a quarter of the time
+# for building it.
 
 
 def _bytes(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -80,7 +80,7 @@ def _bytes(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-_ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the axes across each axis
+_ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the two other axes of each axis
 _CORNER = np.arange(3)[:, None]
 
 
@@ -103,9 +103,9 @@ def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: Array
     """Copies of a template.
 
     Args:
-        poses: (N, 3, 4) or (N, 4, 4) affine maps template to world (scales and mirrors allowed).
+        poses: (N, 3, 4) or (N, 4, 4) affine maps from template to world (may scale and mirror).
         texture: (N,) pattern numbers.
-        tint: (N, 3) color factors, 1 leaves the color; None for all 1.
+        tint: (N, 3) color factors, 1 keeps the color; None for all 1.
     """
     poses = np.asarray(poses, np.float32)
     n, v = len(poses), len(template.vertices)
@@ -127,7 +127,7 @@ def placed(template: Mesh, poses: ArrayLike, texture: ArrayLike = 0, tint: Array
 
 
 def pose(xy: ArrayLike, z: ArrayLike, yaw: ArrayLike, scale: ArrayLike = 1.0) -> NDArray[np.float64]:
-    """(N, 3, 4) maps: scale by `scale` (N,) or (N, 3), turn about z by `yaw` (N,) rad, move to xy (N, 2) and z (N,)."""
+    """(N, 3, 4) maps: scale by `scale` (N,) or (N, 3), rotate by `yaw` (N,) rad about z, move to xy (N, 2), z (N,)."""
     xy, yaw = np.atleast_2d(np.asarray(xy, float)), np.atleast_1d(np.asarray(yaw, float))
     n = len(xy)
     out = np.zeros((n, 3, 4))
@@ -142,7 +142,7 @@ def pose(xy: ArrayLike, z: ArrayLike, yaw: ArrayLike, scale: ArrayLike = 1.0) ->
 
 
 def rotated(directions: Float, R: ArrayLike) -> Float:
-    """Directions (N, 3) float32 turned by a rotation (3, 3); faster than the product with so narrow a matrix."""
+    """Directions (N, 3) float32 rotated by R (3, 3); faster than a product with such a narrow matrix."""
     R = np.asarray(R, np.float32)
     out = directions[:, :1] * R[:, 0]
     out += directions[:, 1:2] * R[:, 1]
@@ -152,10 +152,10 @@ def rotated(directions: Float, R: ArrayLike) -> Float:
 
 @dataclass(eq=False)
 class Rows:
-    """Arrays with a row each for the same things."""
+    """Arrays with one row per item."""
 
     def part(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
-        """Some of them."""
+        """The rows of some items."""
         return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
@@ -164,7 +164,7 @@ class Hits(Rows):
     """Nearest hits of R rays.
 
     Attributes:
-        distance: (R,) float32 m, inf where nothing was hit. face: (R,) int32 triangle, -1 where nothing was hit.
+        distance: (R,) float32 m, inf if nothing was hit. face: (R,) int32 triangle, -1 if nothing was hit.
         normal: (R, 3) float32, not normalized, either side. u, v: (R,) float32 barycentric, weights of corners 1 and 2.
     """
 
@@ -176,7 +176,7 @@ class Hits(Rows):
 
 
 class Scene:
-    """A mesh ready for ray casting. Casting is thread-safe and runs without the interpreter lock."""
+    """A mesh prepared for ray casting. Casting is thread-safe and releases the GIL."""
 
     def __init__(self, mesh: Mesh) -> None:
         with needs("sim", "the synthetic city"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees, bushes and grass: rough and partly see-through, as scanners find them."""
+"""Trees, bushes and grass: rough and partly transparent for a LiDAR, like real ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _green(rng: np.random.Generator) -> np.ndarray:
 def tree(rng: np.random.Generator, leafage: float = 1.0) -> Mesh:
     """A broad-leaved or a coniferous tree of 5 to 16 m, its foot at the origin.
 
-    `leafage` scales the number of leaf clusters, against their area: less of it will do farther away.
+    `leafage` scales the number of leaf clusters, and inversely their area: a lower value is enough farther away.
     """
     return _conifer(rng, leafage) if rng.random() < 0.2 else _broadleaf(rng, leafage)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the streets run and how the car drives on them. Plane coordinates in m; arc length `s` in m."""
+"""Paths of the streets and the car's motion on them. Plane coordinates in m; arc length `s` in m."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dpm2_core.sim.settings import Preset
 
 ROAD_KINDS = ("straight", "loop", "figure8", "random")
 STEP = 0.5
-"""Distance of the samples of a path, m."""
+"""Distance between the samples of a path, m."""
 
 
 class Path:
@@ -46,7 +46,7 @@ class Path:
         self.yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
 
     def at(self, s: ArrayLike, lateral: ArrayLike = 0.0) -> tuple[Array, Array]:
-        """Points (N, 2) and headings (N,) at arc lengths (N,), `lateral` m to the left; wraps round a closed path."""
+        """Points (N, 2) and headings (N,) at arc lengths (N,), `lateral` m to the left; wraps around a closed path."""
         at = np.atleast_1d(np.asarray(s, float))
         at = np.mod(at, self.length) if self.closed else np.clip(at, 0, self.length)
         yaw = np.interp(at, self.s, self.yaw)
@@ -66,9 +66,9 @@ class Road:
 
     Attributes:
         streets: center lines; the drive follows the first `main` of them, the others branch off.
-        drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one goes on.
-        heights: (M,) m of the samples of each main street, None where the terrain is free.
-        slip: (K,) rad, heading of the car relative to the direction of the drive; None: it heads where it goes.
+        drive: the path of the car. times: (K,) s and travelled: (K,) m, the drive's progress; a closed one continues.
+        heights: (M,) m of the samples of each main street; None if they are not given.
+        slip: (K,) rad, heading of the car relative to the direction of the drive; None: they are equal.
         plan: of the building that the drive leads through.
     """
 
@@ -82,7 +82,7 @@ class Road:
     plan: FloorPlan | None = None
 
     def slip_at(self, time: float) -> float:
-        """How far the car is turned to the left of where it goes, rad, at a time, s."""
+        """Rotation of the car to the left of its direction of motion, rad, at a time, s."""
         return 0.0 if self.slip is None else float(np.interp(time, self.times, self.slip))
 
     def distance(self, time: ArrayLike) -> Array:
@@ -95,13 +95,13 @@ class Road:
 
 
 def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float = 400.0) -> Road:
-    """A road of about `length` m (a lap, where it is closed) to drive on.
+    """A road of about `length` m (a lap, if it is closed) to drive on.
 
     Args:
-        kind: straight, loop, figure8, random, or a file of KITTI poses (camera frame, 12 numbers a line).
+        kind: straight, loop, figure8, random, or a file of KITTI poses (camera frame, 12 numbers per line).
 
     Raises:
-        UsageError: no such kind or file, or the file holds no drive.
+        UsageError: no such kind or file, or the file contains no drive.
     """
     if preset.indoor:
         return _indoors(kind, preset, rng, length)
@@ -115,7 +115,7 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
 
 
 def _indoors(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Road:
-    """The way through a building is a round: it leads through doors and comes back."""
+    """A closed path through a building: it leads through doors and comes back."""
     if kind not in ("loop", "random"):
         raise UsageError(f"--road {kind}: indoors the way leads through the rooms; want loop or random")
     plan = (office if preset.indoor == "rooms" else car_park)(length, rng)
@@ -126,7 +126,7 @@ def _indoors(kind: str, preset: Preset, rng: np.random.Generator, length: float)
 
 
 MARGIN = 110.0
-"""Road behind the start and beyond the end of an open drive, m: farther than the LiDAR sees."""
+"""Length of road behind the start and beyond the end of an open drive, m: beyond the LiDAR's range."""
 
 
 def _center(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
@@ -139,7 +139,7 @@ def _center(kind: str, preset: Preset, rng: np.random.Generator, length: float) 
     t = np.linspace(0, 1, 1024, endpoint=False)
     if kind == "straight":
         xy = np.stack([np.linspace(-MARGIN, length + MARGIN, 1024), np.zeros(1024)], -1)
-    elif kind == "arc":  # constant curvature: as degenerate as a straight
+    elif kind == "arc":  # constant curvature: as degenerate as a straight road
         radius = rng.choice([-1, 1]) * rng.uniform(400, 3000)
         a = np.linspace(-MARGIN, length + MARGIN, 4096) / radius
         xy = np.stack([np.sin(a), 1 - np.cos(a)], -1) * radius
@@ -182,7 +182,7 @@ def _smooth(xy: Array, sigma: float, closed: bool) -> Array:
 
 
 def _progress(path: Path, speed: float, start: float) -> tuple[Array, Array]:
-    """Times and arc lengths of a comfortable drive from `start`: 4 m/s^2 sideways, 1.5 m/s^2 along."""
+    """Times and arc lengths of a comfortable drive from `start`: 4 m/s^2 lateral, 1.5 m/s^2 longitudinal."""
     laps = 3 if path.closed else 1  # the middle lap of three is periodic
     curvature = np.abs(np.gradient(path.yaw, path.s))
     curvature = np.maximum(gaussian_filter1d(curvature, 4, mode="wrap" if path.closed else "nearest"), 1e-4)
@@ -202,7 +202,7 @@ def _progress(path: Path, speed: float, start: float) -> tuple[Array, Array]:
 
 
 def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator) -> list[Path]:
-    """Branches to one side or both; one that meets the main road again ends there."""
+    """Branches to one side or both; a branch that meets the main road again ends there."""
     tree = cKDTree(np.concatenate([p.xy for p in streets]))
     found: list[Path] = []
     for street in streets:
@@ -223,15 +223,15 @@ def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator)
 
 
 def read_drive(path: FilePath) -> Array:
-    """(N, 4) positions of a file of KITTI poses, x ahead at the start, y left, z up, m, and headings, rad.
+    """(N, 4) positions in a file of KITTI poses, x ahead at the start, y left, z up, m, and headings, rad.
 
     Raises:
-        UsageError: no such file, or not 12 finite numbers on each line, which is named.
+        UsageError: no such file, or a line without 12 finite numbers; the message names the line.
     """
     if not path.is_file():
         raise UsageError(f"--road {path}: want one of {', '.join(ROAD_KINDS)}, or a file of KITTI poses")
     rows = read_numbers(path, 12)
-    heading = np.arctan2(-rows[:, 2], rows[:, 10])  # of the camera's z axis, which looks ahead
+    heading = np.arctan2(-rows[:, 2], rows[:, 10])  # of the camera's z axis, which points ahead
     return np.concatenate([rows[:, [11, 3, 7]] * (1, -1, -1), np.unwrap(heading)[:, None]], 1)
 
 
@@ -240,7 +240,7 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
     moved = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
     if moved.sum() < 20:
         raise UsageError(f"--road {file}: a drive of {moved.sum():.0f} m; want at least 20 m")
-    # Standing frames are noise in heading: the path leaves them out, the progress keeps them.
+    # At standstill the heading is noise: the path leaves these frames out, the progress keeps them.
     keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(moved) / STEP)) > 0, [True]])
     raw = Path(position[keep, :2])
     smooth = _smooth(raw.xy, 2.0, False)
@@ -269,7 +269,7 @@ def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> 
 
 
 def _first_visits(xy: Array) -> Iterator[tuple[int, int]]:
-    """Runs [a, b) of samples that are no return to within 5 m of a place left more than 30 m ago."""
+    """Runs [a, b) of samples that do not return to within 5 m of a position passed more than 30 m earlier."""
     pairs = cKDTree(xy).query_pairs(5.0, output_type="ndarray")
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 30.0 / STEP]
     new = np.ones(len(xy), bool)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Highway and tunnel: one cross-section drawn along the road, so that no geometry constrains the motion along it."""
+"""Highway and tunnel: one cross-section along the whole road, so that no geometry constrains the motion along it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dpm2_core.sim.road import Path, Road
 from dpm2_core.sim.terrain import Terrain, sheet
 
 WALL = 5.5
-"""Height of the noise barriers, m: a beam at +2 deg cannot see over them within 80 m, a camera can: trees."""
+"""Height of the noise barriers, m: within 80 m a beam at +2 deg cannot see over them, but a camera sees trees there."""
 
 
 def swept(path: Path, terrain: Terrain, profile: ArrayLike, surface: Surface) -> Mesh:
-    """A profile (K, 2) of meters to the left and above the road, drawn along a path."""
+    """A profile (K, 2), m to the left and above the road, extruded along a path."""
     profile = np.asarray(profile, float)
     every = slice(None, None, 4)  # 2 m
     xy = np.stack([path.at(path.s, y)[0][every] for y in profile[:, 0]], 1)
@@ -29,7 +29,7 @@ def swept(path: Path, terrain: Terrain, profile: ArrayLike, surface: Surface) ->
 
 
 def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh]:
-    """The meshes without what would bar the drive, where a road from a file meets or crosses itself."""
+    """The meshes without triangles that would block the drive, where a road from a file meets or crosses itself."""
     drive = cKDTree(road.drive.xy)
     for mesh in meshes:
         xy = mesh.vertices[:, :2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors at random, for worlds to train on: none of them is quite like another."""
+"""Random sensors for training worlds: no two of them are alike."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _SPREAD = ("uneven", "angle_bias", "range_bias", "growth", "footprint", "skew")
 
 
 def real_sensor(clean: LidarConfig) -> LidarConfig:
-    """A LiDAR with the errors of the HDL-64E; the origins of its beams only where it has its 64 beams."""
+    """A LiDAR with the errors of the HDL-64E; the origins of its beams only if it has 64 spinning beams."""
     own_origins = clean.beams == 64 and clean.pattern == "spinning"
     real = HDL64E.real if own_origins else HDL64E.real.model_copy(update={"emitters": (0.0, 0.0)})
     return clean.model_copy(update={"noise": HDL64E.noise, "dropout": HDL64E.dropout, "real": real})
 
 
 def drawn_sensor(usual: LidarConfig, real: float, others: float, rng: np.random.Generator) -> LidarConfig:
-    """A world's LiDAR: not the usual one by a chance of `others`, with a real one's errors by a chance of `real`."""
+    """A world's LiDAR: with probability `others` not the usual one, with probability `real` with real errors."""
     config = _other(usual, rng) if rng.random() < others else usual
     if rng.random() >= real:
         return config
@@ -27,7 +27,7 @@ def drawn_sensor(usual: LidarConfig, real: float, others: float, rng: np.random.
 
 
 def _other(usual: LidarConfig, rng: np.random.Generator) -> LidarConfig:
-    """16 to 128 beams or a rosette, 0.4 to 3 m high, every third one tilted by up to 20 deg."""
+    """16 to 128 beams or a rosette, 0.4 to 3 m high, one in three tilted by up to 20 deg."""
     beams, columns = [(16, 1810), (32, 1810), (64, 1448), (128, 1024), (16, 1500)][kind := int(rng.integers(5))]
     height = float(np.exp(rng.uniform(np.log(0.4), np.log(3.0))))
     tilted = rng.random() < 0.33
@@ -41,7 +41,7 @@ def _other(usual: LidarConfig, rng: np.random.Generator) -> LidarConfig:
 
 
 def _errors(config: LidarConfig, rng: np.random.Generator) -> Imperfections:
-    """Those of the HDL-64E, half to twice as large; one in six in rain or dust, one in six behind a dirty window."""
+    """Errors of the HDL-64E, half to twice as large; one in six in rain or dust, one in six behind a dirty window."""
     usual = real_sensor(config).real
     changes = {name: getattr(usual, name) * _factor(rng) for name in _SPREAD}
     changes |= {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors and kinds of places of the synthetic city."""
+"""Sensors and environments of the synthetic city."""
 
 from __future__ import annotations
 
@@ -16,64 +16,64 @@ PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
 
 
 class Imperfections(Settings):
-    """What a real LiDAR adds to an exact one. By default nothing: the clean sensor."""
+    """Errors of a real LiDAR. All are 0 by default: an ideal sensor."""
 
     serial: int = Field(default=0, ge=0)
-    """Which sensor of its kind: the seed of what sets it apart."""
+    """Number of the individual sensor: seed of its own errors."""
     emitters: tuple[float, float] = (0.0, 0.0)
-    """Height of the origins of the upper and of the lower half of the beams over that of the sensor, m."""
+    """Height of the origins of the upper and of the lower half of the beams above the sensor's origin, m."""
     uneven: float = Field(default=0.0, ge=0, le=1)
-    """Deviation of the beams' elevations from even spacing, deg, as the driver knows it."""
+    """Standard deviation of the beams' elevations from even spacing, deg; the driver knows them."""
     angle_bias: float = Field(default=0.0, ge=0, le=1)
-    """Deviation of the beams' elevations and azimuths from what the driver believes, deg."""
+    """Standard deviation of the beams' elevations and azimuths from those that the driver assumes, deg."""
     range_bias: float = Field(default=0.0, ge=0, le=1)
-    """Deviation of the beams' errors of range, m."""
+    """Standard deviation of the range errors of the beams, m."""
     growth: float = Field(default=0.0, ge=0, le=0.1)
-    """Noise of a range, m, for each m of it."""
+    """Range noise, m, per m of range."""
     footprint: float = Field(default=0.0, ge=0, le=0.1)
-    """Divergence of a beam, rad: noise at grazing incidence, and ranges between two surfaces at edges."""
+    """Divergence of a beam, rad: causes noise at grazing incidence, and ranges between two surfaces at edges."""
     panes: bool = False
-    """Glass and paint swallow the pulses of a whole pane or panel, or of none of it, rather than single ones."""
+    """Glass and paint absorb the pulses on whole panes or panels, instead of single pulses."""
     weak: float = Field(default=0.0, ge=0, le=20)
-    """The receiver needs 1 + this times the light: dark, far and grazing surfaces are lost."""
+    """The receiver needs 1 + this times the light: returns from dark, far and grazing surfaces are lost."""
     glare: float = Field(default=0.0, ge=0, le=1)
-    """Probability that a pulse just beside a retro-reflector returns at its distance."""
+    """Probability that a pulse next to a retro-reflector returns at the distance of the retro-reflector."""
     drops: float = Field(default=0.0, ge=0, le=1)
-    """Rain, snow or dust: returns from drops for each m of a pulse's way."""
+    """Rain, snow or dust: returns from drops per m of a pulse's path."""
     dirt: float = Field(default=0.0, ge=0, lt=1)
-    """Fraction of the window with dirt on it."""
+    """Fraction of the window that is dirty."""
     skew: float = Field(default=0.0, ge=0, le=2)
-    """Deviation, as a fraction, of the motion during a turn that the points are corrected by."""
+    """Standard deviation, as a fraction, of the error of the motion with which a driver de-skews the points."""
     sway: float = Field(default=1.0, ge=0, le=20)
-    """Times the usual pitch and roll of the body."""
+    """Factor on the usual pitch and roll of the vehicle."""
 
 
 class LidarConfig(Settings):
     """A LiDAR on a car."""
 
     pattern: Literal["spinning", "rosette"] = "spinning"
-    """A turning row of beams, or a row of lasers behind two prisms that draws a rosette of 70 deg ahead and never
-    repeats it, as Livox sensors do."""
+    """spinning: a rotating row of beams. rosette: a row of lasers behind two prisms, with a non-repeating pattern of
+    70 deg ahead, as in Livox sensors."""
     beams: Literal[16, 32, 64, 128] = 64
-    """Number of beams, spinning with the angles of the VLP-16, HDL-32E, HDL-64E or, for 128, +15 to -25 deg."""
+    """Number of beams; spinning with the angles of the VLP-16, HDL-32E, HDL-64E or, for 128, +15 to -25 deg."""
     columns: int = Field(default=2170, ge=16, le=8192)
-    """Firings per turn of each beam; 2170 gives about 120 thousand returns with 64 beams, as KITTI has."""
+    """Firings per revolution of each beam; 2170 gives about 120 thousand returns with 64 beams, as in KITTI."""
     height: float = Field(default=1.73, gt=0, le=10)
-    """Of the sensor above the ground, m."""
+    """Height of the sensor above the ground, m."""
     range: float = Field(default=80.0, gt=1, le=300)
-    """Farthest return, m."""
+    """Largest range, m."""
     min_range: float = Field(default=1.2, ge=0)
-    """Nearest return, m."""
+    """Smallest range, m."""
     noise: float = Field(default=0.02, ge=0)
-    """Standard deviation of a range, m; rough surfaces add theirs."""
+    """Standard deviation of a range, m; rough surfaces add to it."""
     dropout: float = Field(default=0.01, ge=0, lt=1)
-    """Fraction of returns lost at random; glass, dark paint, leaves and grazing far surfaces lose more."""
+    """Fraction of returns lost at random; more are lost on glass, dark paint, leaves and grazing far surfaces."""
     car_body: bool = True
-    """The car's own roof hides the lowest beams ahead and behind, as on KITTI's car; of a spinning sensor."""
+    """The car's roof hides the lowest beams ahead and behind, as on KITTI's car; only for a spinning sensor."""
     roll: float = Field(default=0.0, ge=-180, le=180)
-    """Of the mount, deg, to the right."""
+    """Roll of the mount, deg, to the right."""
     pitch: float = Field(default=0.0, ge=-90, le=90)
-    """Of the mount, deg, downwards."""
+    """Pitch of the mount, deg, downwards."""
     real: Imperfections = Imperfections()
 
 
@@ -84,110 +84,110 @@ HDL64E = LidarConfig(
         panes=True, glare=0.3, skew=0.05, sway=0.4,
     ),
 )  # fmt: skip
-"""As KITTI's, by `dpm2 bench sensor`. Its lasers sit up to 0.2 m above the origin of the points, which the driver does
-not hide: how far down a beam looks depends on what it meets."""
+"""KITTI's sensor, matched with `dpm2 bench sensor`. Its lasers are up to 0.2 m above the origin of the points, and the
+driver does not correct that: the apparent elevation of a beam depends on the range."""
 
 
 class ImuConfig(Settings):
-    """An IMU in the LiDAR's housing, by default as the MEMS ones there are. Its errors are standard deviations."""
+    """An IMU in the LiDAR's housing, by default a typical MEMS one. Its errors are standard deviations."""
 
     gyro_noise: float = Field(default=0.002, ge=0)
-    """Of a sample, rad/s."""
+    """Noise of a sample, rad/s."""
     gyro_bias: float = Field(default=0.01, ge=0)
-    """Of the sensor, rad/s; it drifts by a hundredth of that in a second."""
+    """Bias of the sensor, rad/s; it drifts by a hundredth of that per second."""
     acceleration_noise: float = Field(default=0.03, ge=0)
-    """Of a sample, m/s2."""
+    """Noise of a sample, m/s2."""
     acceleration_bias: float = Field(default=0.05, ge=0)
-    """Of the sensor, m/s2."""
+    """Bias of the sensor, m/s2."""
     scale: float = Field(default=0.005, ge=0)
-    """Of each axis, as a fraction."""
+    """Scale error of each axis, as a fraction."""
     misaligned: float = Field(default=0.3, ge=0)
-    """Of the mount from what the calibration says, deg about each axis."""
+    """Error of the calibrated orientation of the mount, deg about each axis."""
 
 
 class GnssConfig(Settings):
-    """A receiver of satellites, by default a plain one. Errors are standard deviations, twice as large in height."""
+    """A GNSS receiver, by default a plain one. Errors are standard deviations, twice as large in height."""
 
     rate: float = Field(default=5.0, gt=0, le=10)
     """Fixes per second."""
     noise: float = Field(default=0.3, ge=0)
-    """Of each fix, m."""
+    """White noise of each fix, m."""
     wander: float = Field(default=1.5, ge=0)
-    """Of an error that stays for a while, m."""
+    """Slowly changing error, m."""
     wander_time: float = Field(default=60.0, gt=0)
-    """s in which it becomes another one."""
+    """Correlation time of the slowly changing error, s."""
     antenna: tuple[float, float, float] = (-0.4, 0.0, 0.2)
-    """In the LiDAR's frame, m."""
+    """Position of the antenna in the LiDAR frame, m."""
 
 
 class CameraConfig(Settings):
     """A forward-looking rectified color camera, 0.27 m ahead of and 0.08 m below the LiDAR."""
 
     width: int = Field(default=1241, ge=16, le=8192)
-    """Pixels."""
+    """Width, pixels."""
     height: int = Field(default=376, ge=16, le=8192)
-    """Pixels."""
+    """Height, pixels."""
     focal: float = Field(default=720.0, gt=0)
     """Focal length, pixels."""
     noise: float = Field(default=2.0, ge=0)
-    """Standard deviation of a pixel value, of 255."""
+    """Standard deviation of a pixel value, out of 255."""
     wet: float = Field(default=0.0, ge=0, le=0.8)
-    """Fraction of the lens behind drops of water."""
+    """Fraction of the lens covered by water drops."""
     lens: int = Field(default=0, ge=0)
     """Seed of the drops."""
 
 
 class DriveConfig(Settings):
-    """A drive through a world: with the version of this program, all that its files depend on."""
+    """A drive through a world. Together with the program's version, it determines all files of the drive."""
 
     frames: int | None = None
-    """At 10 Hz; None for 150, or all of a file of poses."""
+    """Number, at 10 Hz; None for 150, or for all in a file of poses."""
     seed: int = 0
-    """Of the world and the noise."""
+    """Seed of the world and the noise."""
     road: str = "loop"
-    """straight, loop, figure8, random, or a file of KITTI poses. The lap of a closed road is chosen so that the drive
-    ends where it began."""
+    """straight, loop, figure8, random, or a file of KITTI poses. The lap length of a closed road is chosen so that the
+    drive ends where it began."""
     preset: PresetName = "city"
-    """Kind of place."""
+    """Type of environment."""
     images: bool = True
     """Render the images of the camera."""
     traffic: float = 1.0
-    """Times that of the preset; see `with_traffic`."""
+    """Factor on the preset's traffic; see `with_traffic`."""
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
     imu: ImuConfig | None = None
-    """None: there is none."""
+    """None for no IMU."""
     gnss: GnssConfig | None = None
-    """Likewise."""
+    """None for no receiver."""
 
 
 class Preset(Settings):
-    """A kind of place. Densities are means: `varied` draws each world's own."""
+    """A type of environment. Densities are means: `varied` draws the values of each world."""
 
     half_width: float
-    """Center line to kerb, m."""
+    """Center line to curb, m."""
     lane: float = 1.8
     """Center line to the middle of the driven lane, m."""
     sidewalk: float = 0.0
     """Width, m; 0 for a grass verge."""
     setback: float = 6.0
-    """Kerb to facade, m."""
+    """Curb to facade, m."""
     buildings: float = 0.0
     """Fraction of the frontage that is built."""
     floors: tuple[int, int] = (1, 3)
-    """Fewest and most."""
+    """Smallest and largest number."""
     side_streets: float = 0.0
     """Crossings per 100 m."""
     trees: float = 0.0
-    """Per 100 m and side, near the road; as many again behind."""
+    """Per 100 m and side, near the road; the same number again behind."""
     forest: float = 0.0
-    """Per 100 m and side, of belts of trees and bushes."""
+    """Of belts of trees and bushes, per 100 m and side."""
     bushes: float = 0.0
     """Per 100 m and side."""
     boundaries: float = 0.0
     """Fraction of the frontage with hedge, wall or fence."""
     parked: float = 0.0
-    """Fraction of the kerb with parked cars."""
+    """Fraction of the curb with parked cars."""
     poles: float = 0.0
     """Lamps, signs, bollards and boxes per 100 m and side."""
     clutter: float = 0.0
@@ -195,21 +195,21 @@ class Preset(Settings):
     tufts: float = 0.0
     """Of grass, per m and side."""
     people: float = 0.0
-    """Walking or cycling, per 100 m."""
+    """Pedestrians and cyclists, per 100 m."""
     traffic: float = 0.0
     """Moving cars per 100 m."""
     columns: bool = False
-    """Two lanes each way, and bumper to bumper on them as `traffic` says; else single cars on one or two."""
+    """Two lanes each way with columns of cars, whose density is `traffic`; else single cars on one or two lanes."""
     speed: float = 10.0
-    """Of the drive on a straight, m/s."""
+    """Speed of the drive on a straight, m/s."""
     hills: float = 1.0
     """Amplitude of the terrain, m."""
     roughness: float = 0.05
-    """Amplitude of unevenness beside the road, m."""
+    """Amplitude of unevenness next to the road, m."""
     degenerate: bool = False
-    """Constant section: nothing in the geometry constrains the motion along the road."""
+    """Constant cross-section: nothing in the geometry constrains the motion along the road."""
     indoor: Literal["", "rooms", "deck"] = ""
-    """Inside a building: the way leads through rooms or along a deck, and nothing is beside it but them."""
+    """Inside a building: the path leads through rooms or along a deck, and there is nothing outside them."""
 
     @property
     def wide(self) -> bool:
@@ -245,7 +245,7 @@ _DENSITIES = (
 
 
 def varied(preset: Preset, rng: np.random.Generator) -> Preset:
-    """One world's own values: variety of worlds is what makes a network trained on them work elsewhere."""
+    """The values of one world. Networks generalize because the worlds that they are trained on differ."""
     if preset.indoor:
         return preset
     if preset.degenerate:
@@ -255,7 +255,7 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
     half_width = preset.half_width * rng.uniform(0.65, 1.25)
     sidewalk = preset.sidewalk * rng.uniform(0.6, 1.5)
     own |= {"half_width": half_width, "sidewalk": sidewalk}
-    # past the parked cars, in a narrow street in its middle
+    # past the parked cars; in the middle of a narrow street
     own["lane"] = float(np.clip(half_width - (3.0 if preset.parked else 1.7), 0.3, 1.8))
     own["setback"] = max(preset.setback * rng.uniform(0.5, 1.5), sidewalk + 0.5)
     return preset.model_copy(update=own)
@@ -264,11 +264,11 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
 def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
     """A world's own preset with `factor` times the traffic: 0 for none, 20 fills every lane.
 
-    Above 1 the cars drive in columns, ahead, behind, alongside and oncoming, on a road that is wide enough for them,
-    and as many of them in each world: then the world is not the one of factor 1.
+    Above 1 the cars drive in columns, ahead, behind, alongside and oncoming, on a road that is wide enough for them.
+    Their number is then the same in each world; the world differs from the one of factor 1.
 
     Raises:
-        UsageError: a factor that cannot be.
+        UsageError: the factor is out of range.
     """
     if not 0 <= factor <= 1000:
         raise UsageError(f"--traffic {factor:g}: want 0 to 1000 times the preset's")

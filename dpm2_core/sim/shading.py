@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What surfaces look like: procedural textures, nowhere periodic, that fade out as a pixel outgrows them.
+"""Appearance of surfaces: procedural, non-periodic textures that fade out where a pixel is larger than their detail.
 
-All functions work on P visible points at once. Noise comes from one tile of random numbers, sampled at wavelengths that
-do not divide one another and with an own offset for each object.
+All functions process P visible points at once. Noise comes from one tile of random numbers. It is sampled at
+wavelengths that are not multiples of each other, and with a different offset for each object.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class VisiblePoints(Rows):
     Attributes:
         position: (P, 3) m in the world. normal: (P, 3) unit, towards the eye. view: (P, 3) unit, from the eye.
         uv: (P, 2) m on the surface. texture: (P,) number of the object's pattern. material: (P,).
-        color: (P, 3) 0..1, its paint. footprint: (P,) m, what a pixel covers on the surface.
+        color: (P, 3) 0..1, its paint. footprint: (P,) m, extent of a pixel on the surface.
     """
 
     position: Float
@@ -42,7 +42,7 @@ class VisiblePoints(Rows):
 
 
 class Textures:
-    """The textures of a world, by its seed."""
+    """The textures of a world, from its seed."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 77])
@@ -56,7 +56,7 @@ class Textures:
     def noise(self, at: Float, wavelength: float, channels: int = 1) -> Float:
         """(P,) or (P, 3) smooth noise of unit variance at (P, 2) m."""
         n = len(at)
-        # as an image of 1024 columns, which is what remap takes
+        # remap takes images of limited size: here 1024 columns
         xy = np.zeros((max(-(-n // 1024), 1) * 1024, 2), np.float32)
         scaled = at * np.float32(3.0 / wavelength / _TILE)
         xy[:n] = (scaled - np.floor(scaled)) * np.float32(_TILE)
@@ -109,14 +109,14 @@ def _unit(h: NDArray[np.uint32], k: int = 0) -> Float:
 
 
 def _vivid(h: NDArray[np.uint32]) -> Float:
-    """(P, 3) a saturated color of a hash."""
+    """(P, 3) saturated colors from a hash."""
     hue = _unit(h, 0)[:, None] * 6
     rgb = np.clip(np.abs(np.remainder(hue + np.array([0, 4, 2], np.float32), 6) - 3) - 1, 0, 1)
     return (0.15 + 0.8 * _unit(h, 1)[:, None]) * (0.25 + 0.75 * rgb)
 
 
 def _lines(at: Float, spacing: float, width: float, footprint: Float) -> Float:
-    """(P,) how much of a pixel lines cover that run `spacing` m apart, `width` m wide."""
+    """(P,) fraction of a pixel covered by lines that are `spacing` m apart and `width` m wide."""
     soft = np.maximum(footprint, 0.25 * width)
     distance = np.abs(np.remainder(at + 0.5 * spacing, spacing) - 0.5 * spacing)
     inside = np.clip((0.5 * width - distance) / soft + 0.5, 0, 1)
@@ -125,7 +125,7 @@ def _lines(at: Float, spacing: float, width: float, footprint: Float) -> Float:
 
 def _asphalt(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrain) -> Float:
     lateral, along, crossing = terrain.lane_coordinates(s.position[:, :2])
-    # repairs: rectangles of another mix; cracks: the zero crossings of a slow noise
+    # repairs: rectangles of another mix; cracks: the zero crossings of a slowly varying noise
     h = _hash(np.floor(along / 3.1), np.floor(lateral / 1.7), s.texture)
     out = out * (0.82 + 0.3 * _unit(h))[:, None] ** (_unit(h, 1) < 0.22)[:, None]
     crack = np.abs(t.noise(uv + 5, 2.3) + 0.4 * t.noise(uv + 9, 0.4)) < 0.05
@@ -138,7 +138,7 @@ def _asphalt(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terr
 def road_marking(
     lateral: Float, along: Float, crossing: NDArray[np.bool_], footprint: Float, terrain: Terrain
 ) -> Float:
-    """(P,) 0..1 how much paint lies at lane coordinates (P,) each: edge lines, a dashed middle, arrows now and then."""
+    """(P,) 0..1 how much paint is at lane coordinates (P,) each: edge lines, a dashed center line, some arrows."""
     preset = terrain.preset
     half = preset.half_width
     soft = np.maximum(footprint, 0.02)
@@ -209,8 +209,8 @@ def _wood(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> F
 
 
 def _panels(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
-    """Barriers and tunnel walls: panels of many tints, dirt, graffiti: the image's only hold in these places."""
-    # panels of unequal width: a slowly varying stretch keeps the seams from repeating
+    """Barriers and tunnel walls: panels of many tints, dirt, graffiti: the only image texture in these environments."""
+    # panels of unequal width: slowly varying stretching keeps the seams from repeating
     along, up = s.uv[:, 0], s.uv[:, 1]
     along = along + 0.9 * np.sin(along / 3.7) + 1.3 * np.sin(along / 6.1 + 1) + 2.1 * np.sin(along / 17.3 + 2)
     h = _hash(np.floor(along / 2.5), np.floor(up / 1.35), s.texture)
@@ -227,7 +227,7 @@ def _panels(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) ->
 
 
 def _glass(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
-    """Frames, and the sky and street that a pane mirrors the more the flatter one looks at it."""
+    """Frames, and reflections of sky and street, which are stronger at grazing angles."""
     slope = np.abs(np.einsum("ij,ij->i", s.normal, s.view))
     mirror = 0.12 + 0.6 * (1 - slope) ** 3
     up = s.view[:, 2] - 2 * np.einsum("ij,ij->i", s.normal, s.view) * s.normal[:, 2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solids that props are made of, in m, z up."""
+"""Solids of which objects are composed, in m, z up."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _sphere() -> tuple[np.ndarray, np.ndarray]:
 
 
 def leaves(centers: ArrayLike, size: float, rng: np.random.Generator, color: ArrayLike) -> Mesh:
-    """One randomly turned triangle of about `size` m at each of the centers (N, 3), its brightness random."""
+    """One randomly rotated triangle of about `size` m at each of the centers (N, 3), with random brightness."""
     centers = np.asarray(centers, float)
     n = len(centers)
     corners = centers[:, None] + rng.normal(0, 0.6 * size, (n, 3, 3))
@@ -71,7 +71,7 @@ def leaves(centers: ArrayLike, size: float, rng: np.random.Generator, color: Arr
 
 
 def extrusion(profile: ArrayLike, y: ArrayLike, surface: Surface) -> Mesh:
-    """A closed convex-ish side profile (N, 2) of x, z, stretched across: half widths `y` (N,) at its corners."""
+    """A closed, nearly convex side profile (N, 2) of x, z, with half widths `y` (N,) at its corners."""
     profile = np.asarray(profile, float)
     n = len(profile)
     y = np.broadcast_to(np.asarray(y, float), n)
@@ -88,13 +88,13 @@ def extrusion(profile: ArrayLike, y: ArrayLike, surface: Surface) -> Mesh:
 
 
 def relief(x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, color: ArrayLike) -> Mesh:
-    """A wall in the xz plane with recesses and bays: what a facade is.
+    """A wall in the xz plane with recesses and bays, used for facades.
 
     Args:
         x: (N+1,) and z: (M+1,) borders of its cells, m.
         depth: (N, M) m, towards +y. material: (N, M). color: (N, M, 3).
 
-    The steps between cells of different depth are walls of the shallower cell's neighbor's color.
+    The steps between cells of different depth are walls with the color of the shallower cell's neighbor.
     """
     x, z, depth = np.asarray(x, float), np.asarray(z, float), np.asarray(depth, float)
     material, color = np.asarray(material), np.asarray(color)
@@ -130,7 +130,7 @@ def _quads(*columns: np.ndarray) -> np.ndarray:
 
 
 def turned(mesh: Mesh, yaw: float, to: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
-    """The mesh turned about z by `yaw` rad and moved; its surface coordinates stay."""
+    """The mesh rotated about z by `yaw` rad and moved; its surface coordinates stay."""
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
     return replace(mesh, vertices=mesh.vertices @ R.T + np.asarray(to, np.float32))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives through synthetic worlds as sources of frames that are simulated when they are asked for: no disk."""
+"""Drives through synthetic worlds as sources of frames, simulated on request without files."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
 
-_STREAM, _IMU_STREAM = 12, 13  # of random numbers, beside those of the other parts of a world
-_STEP = 0.01  # s between two poses of a robot; evenly in between
+_STREAM, _IMU_STREAM = 12, 13  # of random numbers, different from those of the other parts of a world
+_STEP = 0.01  # s between two poses of a robot, with interpolation in between
 _FASTEST = np.radians(100.0)  # rad/s
-_RAMP = 0.25  # s in which it begins to turn
-_CYCLE = 12.0  # s from one speed to the same again
+_RAMP = 0.25  # s, duration of a change of the angular rate
+_CYCLE = 12.0  # s, period of the speed
 
 
 class _Simulated(IndexedSource):
-    """A LiDAR alone.
+    """A drive with a LiDAR and no other sensor.
 
     Attributes:
-        world: what it drives through. times: (N,) s. poses: (N, 4, 4) T_world_lidar at these times, exact.
+        world: the world of the drive. times: (N,) s. poses: (N, 4, 4) exact T_world_lidar at these times.
     """
 
     truth = "simulation"
@@ -54,7 +54,7 @@ class SimulatedDrive(_Simulated):
     """The drive along a road, with traffic, at 10 Hz."""
 
     def __init__(self, road: str, preset: PresetName, seed: int, name: str) -> None:
-        """`road`, `preset` and `seed` as in `build_world`, `name` what reports call it.
+        """`road`, `preset` and `seed` as in `build_world`, `name` as in `Source`.
 
         Raises:
             UsageError: no such road or preset.
@@ -65,7 +65,7 @@ class SimulatedDrive(_Simulated):
         self.poses = np.stack([self._lidar.pose(world, float(t)) for t in self.times])
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`."""
+        """See `IndexedSource`."""
         time = float(self.times[position])
         rng = np.random.default_rng([self.world.seed, _STREAM, position])
         scan = self._lidar.scan(self.world, self.poses[position], time, rng)
@@ -74,12 +74,12 @@ class SimulatedDrive(_Simulated):
 
 @dataclass(frozen=True)
 class Ride:
-    """How a LiDAR is carried along a road.
+    """Motion of a LiDAR along a road.
 
     Attributes:
-        speed: m/s, at most. turns: deg, to either side now and then; 0: not.
+        speed: largest speed, m/s. turns: occasional rotations to either side, deg; 0: none.
         shakes: amplitudes (rad and m) and frequencies (Hz) of a sine about and along each axis, x to z.
-        slows: by this share of the speed it brakes and speeds up again every 12 s.
+        slows: share of the speed by which it slows down and speeds up again every 12 s.
     """
 
     speed: float
@@ -88,7 +88,7 @@ class Ride:
     slows: float = 0.0
 
     def shaken(self, times: Array) -> Array:
-        """(N, 4, 4) at times (N,), s, as seen from where it would be without shakes; they begin as it sets off."""
+        """(N, 4, 4) deviations at times (N,), s, from the pose without shakes; they begin when the motion begins."""
         amplitudes, frequencies = (np.array(part) for part in self.shakes)
         swing = amplitudes * np.sin(2 * np.pi * frequencies * times[:, None] + np.arange(6))
         return se3.exp(_moving(times)[:, None] * swing)
@@ -101,12 +101,12 @@ RIDES = {
     "legged": Ride(1.0, shakes=((0.03, 0.02, 0.03, 0.006, 0.015, 0.012), (2.0, 4.0, 2.0, 4.0, 2.0, 4.0))),
     "drone": Ride(5.0, shakes=((0.15, 0.15, 0.2, 0.3, 0.4, 0.2), (0.4, 0.35, 0.2, 0.3, 0.3, 0.25))),
 }
-"""On a car, carried by a walker, waved by hand, on four legs that trot, and below a drone."""
+"""On a car, carried by a walker, waved by hand, on a trotting four-legged robot, and below a drone."""
 
 
 class TurningRobot(_Simulated):
-    """A robot that drives along a road and turns fast. Scans are as a driver delivers them, with the time of each
-    point, from poses that change within a sweep, stamped in its middle; an IMU measures beside."""
+    """A robot that drives along a road and rotates fast. Scans are raw, with the time of each point, from poses that
+    change within a sweep, stamped in the middle of the sweep; there may be an IMU."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class TurningRobot(_Simulated):
         lidar: LidarConfig,
         imu: ImuConfig | None = None,
     ) -> None:
-        """Stands for 1 s, then drives, slower in curves: but for its shakes no turn is faster than 100 deg/s."""
+        """Stands for 1 s, then drives, slower in curves: without shakes no rotation is faster than 100 deg/s."""
         rng = np.random.default_rng([world.seed, _IMU_STREAM])
         end = frames * FRAME_PERIOD + 1
         world = replace(world, road=_robot_progress(world.road, end, ride, rng))
@@ -139,7 +139,7 @@ class TurningRobot(_Simulated):
         return se3.interpolated(self._T[k], self._T[k + 1], times / _STEP - k)
 
     def frame(self, position: int) -> Frame:
-        """As `IndexedSource`; its samples are those since the sweep before."""
+        """See `IndexedSource`; its IMU samples are those since the sweep before."""
         time, T = float(self.times[position]), self.poses[position]
         offsets = self._lidar.beams.column_time.astype(float)
         turning = se3.inverse(T) @ self.pose(time + offsets)
@@ -156,12 +156,12 @@ class TurningRobot(_Simulated):
 
 
 def _moving(time: ArrayLike) -> Array:
-    """0 while it stands, 1 from when it has begun to drive, at times s."""
+    """0 while the robot stands, 1 after its start, at times s."""
     return np.clip((np.asarray(time) - 1.5) / 1.0, 0, 1)
 
 
 def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator) -> Road:
-    """The road with the progress and the heading of a robot that drives for `end` s."""
+    """The road with the progress and heading of a robot that drives for `end` s."""
     times = np.arange(0.0, end + 1, _STEP)
     s, curvature = road.drive.s, np.abs(np.diff(road.drive.yaw) / np.diff(road.drive.s))
     paces = np.minimum(ride.speed, _FASTEST / np.maximum(curvature, 1e-3))
@@ -176,7 +176,7 @@ def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator
         turn = np.radians(ride.turns) * rng.uniform(0.5, 1)
         ramp, steady = round(_RAMP / _STEP), max(round((turn / _FASTEST - _RAMP) / _STEP), 1)
         shape = np.concatenate([np.linspace(0, 1, ramp), np.ones(steady), np.linspace(1, 0, ramp)]) * _FASTEST
-        for sign in (side, -side):  # there and back
+        for sign in (side, -side):  # to the side and back
             part = rate[k : k + len(shape)]
             part += sign * shape[: len(part)]
             k += len(shape) + round(rng.uniform(0.2, 1.0) / _STEP)
@@ -185,8 +185,8 @@ def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator
 
 
 def wheel_odometry(T_world_base: Array, slip: float = 0.0, jump: float = 0.0) -> Array:
-    """Poses (N, 4, 4) of an odometry from an origin of its own: each step too long by `slip`, that to the middle frame
-    by `jump` m more."""
+    """Poses (N, 4, 4) of an odometry with its own origin: each step is longer by the fraction `slip`, and the step to
+    the middle frame by `jump` m more."""
     poses = [se3.exp([0.0, 0.0, 2.0, 50.0, -20.0, 0.0])]
     for n, (before, now) in enumerate(pairwise(T_world_base), 1):
         step = se3.way(before, now)

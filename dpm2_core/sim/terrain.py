@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ground: how far each place is from the streets, how high it lies, and its mesh.
+"""The ground: distance of each position from the streets, height, and mesh.
 
-Everything that stands in a world is placed by one raster, the distance to the kerb of the nearest street. It treats
-crossings, loops and streets that are driven twice alike: nothing can stand on a road, whichever pass made it.
+All static objects are placed with one raster, the distance to the curb of the nearest street. It treats crossings,
+loops and streets that are driven twice alike: nothing can be placed on a road, on whichever pass.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import Preset
 
 RESOLUTION = 0.5
-"""Of the rasters, m."""
+"""Cell size of the rasters, m."""
 MARGIN = 100.0
 """Ground beyond the streets, m."""
 FINE = 14.0
-"""The ground mesh has triangles of 1 m up to this distance from a kerb, of 4 m beyond, m."""
+"""The ground mesh has triangles of 1 m up to this distance from a curb, m, and of 4 m beyond."""
 KERB = 0.12
 """Height of a sidewalk above the road, m."""
 
 
 @dataclass(eq=False)
 class Kerbline:
-    """A line at a constant distance from the kerb.
+    """A line at a constant distance from the curb.
 
     Attributes:
         xy: (N, 2) m, points 1 m apart. outward: (N, 2) unit vectors away from the road. junction: (N,) near a crossing.
@@ -54,8 +54,8 @@ class Terrain:
 
     Attributes:
         origin: (2,) m, center of cell [0, 0]; cells are `RESOLUTION` apart, rows along y.
-        edge: (H, W) float32 m, distance to the nearest kerb, negative on a road.
-        height: (H, W) float32 m, without kerbs. nearest: (H, W) int32, sample of the nearest street.
+        edge: (H, W) float32 m, distance to the nearest curb, negative on a road.
+        height: (H, W) float32 m, without curbs. nearest: (H, W) int32, nearest street sample.
         center: (S, 2) m and yaw, along: (S,) of all street samples; junction: (S,) near another street.
     """
 
@@ -102,7 +102,7 @@ class Terrain:
 
     def _heights(self, road: Road, rng: np.random.Generator) -> NDArray[np.float32]:
         preset, shape = self.preset, self.edge.shape
-        # long waves are high, short ones low: grades stay such as streets have
+        # long waves are high, short ones low: grades are as on real streets
         waves = zip(rng.normal(0, 0.001, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
         z = preset.hills * sum(
             steep * w * np.sin(2 * np.pi / w * (self.center @ (np.cos(turn), np.sin(turn))) + phase)
@@ -114,13 +114,13 @@ class Terrain:
             z = np.concatenate([known, known[beside]])
         height = gaussian_filter(np.asarray(z, np.float32)[self.nearest], 5 / RESOLUTION)
         if preset.roughness > 0:
-            # a crowned carriageway that is not quite even
+            # a cambered and slightly uneven road surface
             height -= 0.02 * np.clip(self.edge + preset.half_width, 0, preset.half_width)
             height += 0.012 * (_value_noise(shape, 5.0, rng) + _value_noise(shape, 14.0, rng))
             beside = np.clip(self.edge - max(preset.sidewalk, 0.3), 0, None)
             rough = sum(a * _value_noise(shape, w, rng) for a, w in ((1.0, 2.5), (1.6, 8.0), (4.0, 30.0)))
             height += preset.roughness * np.minimum(beside / 3, 1) * rough
-            # slopes, banks and ditches that come and go along the road
+            # slopes, banks and ditches that vary along the road
             bank = _value_noise(shape, 45.0, rng) * preset.hills * 0.05
             height += bank * np.clip(self.edge - 3, 0, 40)
             if not preset.sidewalk:
@@ -129,16 +129,16 @@ class Terrain:
         return height.astype(np.float32)
 
     def cell(self, xy: ArrayLike) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Rows and columns (N,) of the rasters at points (N, 2); beyond them, at their borders."""
+        """Rows and columns (N,) of the rasters at points (N, 2); points outside are moved to the border."""
         at = np.rint((np.asarray(xy) - self.origin.astype(np.asarray(xy).dtype)) / RESOLUTION).astype(np.int32)
         return at[..., 1].clip(0, self.edge.shape[0] - 1), at[..., 0].clip(0, self.edge.shape[1] - 1)
 
     def edge_at(self, xy: ArrayLike) -> NDArray[np.float32]:
-        """Distance to the kerb, m, at points (N, 2)."""
+        """Distance to the curb, m, at points (N, 2)."""
         return self.edge[self.cell(xy)]
 
     def height_at(self, xy: ArrayLike) -> Array:
-        """Ground height, m, at points (N, 2), bilinear between the 1 m nodes of the mesh, without kerbs."""
+        """Ground height, m, at points (N, 2), bilinear between the 1 m nodes of the mesh, without curbs."""
         at = (np.asarray(xy, float) - self.origin) / (2 * RESOLUTION)
         grid = self.height[::2, ::2]
         cell = np.floor(at).astype(int)
@@ -148,12 +148,12 @@ class Terrain:
         return low * (1 - v) + (grid[i + 1, j] * (1 - u) + grid[i + 1, j + 1] * u) * v
 
     def surface_at(self, xy: ArrayLike) -> Array:
-        """Height of what one stands on, kerbs included, m, at points (N, 2)."""
+        """Height of the surface, curbs included, m, at points (N, 2)."""
         edge = self.edge_at(xy)
         return self.height_at(xy) + KERB * ((edge > 0) & (edge < self.preset.sidewalk))
 
     def elevation(self) -> NDArray[np.float32]:
-        """(H, W) m, what one stands on at the cells, kerbs included; NaN beyond the mesh."""
+        """(H, W) m, height of the surface in the cells, curbs included; NaN beyond the mesh."""
         y, x = (
             self.origin[k] + np.arange(n) * RESOLUTION for k, n in ((1, self.edge.shape[0]), (0, self.edge.shape[1]))
         )
@@ -164,7 +164,7 @@ class Terrain:
         return out
 
     def lane_coordinates(self, xy: NDArray[np.floating]) -> tuple[NDArray, NDArray, NDArray[np.bool_]]:
-        """Of points (N, 2): m to the left of the nearest street's center, m along it, and whether at a crossing."""
+        """For points (N, 2): m to the left of the nearest street's center, m along it, and whether at a crossing."""
         sample = self.nearest[self.cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
         away = xy - self.center[sample].astype(xy.dtype)
@@ -173,7 +173,7 @@ class Terrain:
         return c * away[:, 1] - s * away[:, 0], along, self.junction[sample]
 
     def contour(self, level: float) -> Iterator[Kerbline]:
-        """The lines `level` m outside the kerb (negative: on the road), streets' ends included."""
+        """The lines `level` m outside the curb (negative: on the road), including the ends of streets."""
         for line in self._lines(level):
             length = arc_lengths(line)
             if length[-1] < 6:
@@ -190,7 +190,7 @@ class Terrain:
 
     @cached_property
     def _lines(self) -> Callable[[float], list[Array]]:
-        """(N, 2) lines at which `edge` has a value, m."""
+        """Function that returns the (N, 2) lines on which `edge` has a value, m."""
         with needs("sim", "the synthetic city"):
             import contourpy
 
@@ -214,7 +214,7 @@ class Terrain:
         yield self._cells(xy[::4, ::4], coarse, ~blocks & (coarse[:-1, :-1] < MARGIN - 10))
 
     def _cells(self, xy: Array, edge: NDArray, keep: NDArray[np.bool_]) -> Mesh:
-        """Two triangles for each kept cell between nodes (H, W, 2), classified by the mean distance to the kerb."""
+        """Two triangles for each kept cell between nodes (H, W, 2), classified by their mean distance to the curb."""
         i, j = np.nonzero(keep)
         used = np.zeros(edge.shape, bool)
         for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -240,7 +240,7 @@ class Terrain:
 
 
 def kerbside_ribbon(terrain: Terrain, line: Kerbline, profile: ArrayLike, surface: Surface) -> Mesh:
-    """A section of (offset outward, height over the ground) points, m, drawn along a line on the terrain."""
+    """A profile of (offset outward, height above the ground) points, m, extruded along a line on the terrain."""
     section = np.asarray(profile, float)
     xy = line.xy[:, None] + line.outward[:, None] * section[:, :1]
     z = terrain.height_at(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + section[:, 1]
@@ -248,7 +248,7 @@ def kerbside_ribbon(terrain: Terrain, line: Kerbline, profile: ArrayLike, surfac
 
 
 def sheet(points: ArrayLike, surface: Surface) -> Mesh:
-    """A surface through a grid (N, M, 3) of points; surface coordinates are meters along its columns and rows."""
+    """A surface through a grid (N, M, 3) of points; its surface coordinates are m along its columns and rows."""
     points = np.asarray(points, float)
     n, m = points.shape[:2]
     node = np.arange(n * m).reshape(n, m)
@@ -260,9 +260,9 @@ def sheet(points: ArrayLike, surface: Surface) -> Mesh:
 
 
 def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
-    """Nodes (H, W, 2) of a grid of 1 m, those next to a kerb moved onto it, and their distances (H, W) to it, m.
+    """Nodes (H, W, 2) of a 1 m grid, with those next to a curb moved onto it, and their distances (H, W) to it, m.
 
-    A road then has a straight rim instead of a staircase.
+    A road then has a straight border instead of a staircase.
     """
     down, across = np.gradient(edge)
     slope = np.hypot(down, across) + 1e-6

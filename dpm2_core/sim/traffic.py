@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves: cars ahead and oncoming, people and cyclists beside the road."""
+"""Moving objects: cars ahead and oncoming, pedestrians and cyclists next to the road."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from dpm2_core.sim.vehicles import car, cyclist, person, truck
 SIGHT = 110.0
 """Dynamic objects farther from the sensor are left out, m."""
 GAP = 6.5
-"""Dynamic objects nearer to the sensor are left out, m: a drive that leaves its lane must not find itself inside a
-car."""
+"""Dynamic objects nearer to the sensor are left out, m: a drive that leaves its lane must not get inside a car."""
 ALONGSIDE = 2.4
 """The same for the columns of dense traffic, which keep to lanes 3.5 m apart, m."""
 
@@ -30,8 +29,8 @@ class Traffic:
 
     Attributes:
         models: one mesh each. start, speed, lateral: (M,) m, m/s and m to the left of the drive; a negative speed is
-            against it. follows: (M,) it is `start` ahead of the car instead, and `speed` is relative to the car's.
-            phase: (M,) of its small variations. gap: (M,) m, nearer to the sensor it is left out.
+            oncoming. follows: (M,) whether it is `start` m ahead of the car instead, with `speed` relative to the car.
+            phase: (M,) of its small variations. gap: (M,) m, if it is nearer to the sensor it is left out.
     """
 
     road: Road
@@ -45,7 +44,7 @@ class Traffic:
     gap: Array
 
     def poses(self, time: float) -> tuple[Array, Array]:
-        """Places (M, 2) and headings (M,) at a time, s."""
+        """Positions (M, 2) and headings (M,) at a time, s."""
         drive = self.road.drive
         own = float(self.road.distance(time))
         s = self.start + self.speed * time + np.where(self.follows, own + 2.0 * np.sin(0.3 * time + self.phase), 0.0)
@@ -54,7 +53,7 @@ class Traffic:
         return xy, yaw + np.where((self.speed < 0) & ~self.follows, np.pi, 0.0)
 
     def dynamic_objects(self, time: float, around: ArrayLike) -> DynamicObjects | None:
-        """What is in sight of a place (2 or 3,) at a time, s; None if nothing is."""
+        """The objects in sight of a position (2 or 3,) at a time, s; None if there are none."""
         if not self.models:
             return None
         xy, yaw = self.poses(time)
@@ -69,14 +68,13 @@ class Traffic:
 
 @dataclass(eq=False)
 class DynamicObjects:
-    """What moves, at one time: a scene, and the number (F,) of the dynamic object that each of its triangles belongs
-    to."""
+    """Moving objects at one time: a scene, and for each of its triangles (F,) the number of its dynamic object."""
 
     scene: Scene
     number: NDArray[np.uint16]
 
     def cast(self, origin: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
-        """Hits of those K rays that can meet a dynamic object, and which (K,) they are, of R from (3,) or (R, 3)."""
+        """Hits of the K of R rays from (3,) or (R, 3) that can meet a dynamic object, and their indices (K,)."""
         all_rays = origin.ndim == 2
         toward = np.arange(len(directions)) if all_rays else _towards(self.scene.mesh, origin, directions)
         origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape)[toward])
@@ -84,7 +82,7 @@ class DynamicObjects:
 
 
 def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
-    """Which rays (R, 3) lie within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
+    """Indices of the rays (R, 3) within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
     bins = 720
     away = mesh.vertices - origin
     flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
@@ -92,7 +90,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
     spread = np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
     first = np.floor((corners[:, 0] + spread.min(1) - 0.01) / (2 * np.pi) * bins).astype(int)
     last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
-    # +1 where a triangle begins, -1 after its end, over three turns folded into one
+    # +1 where a triangle begins, -1 after its end, over three revolutions folded into one
     steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
     covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).max(0) > 0
     slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
@@ -102,7 +100,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
 
 
 def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> Traffic:
-    """As many dynamic objects as the preset has on that length."""
+    """The number of dynamic objects that the preset has on that length."""
     if preset.columns:
         walking = make_traffic(road, terrain, preset.model_copy(update={"traffic": 0.0, "columns": False}), rng)
         return _with_columns(walking, preset, rng)
@@ -138,7 +136,7 @@ def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Ge
 
 
 def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> Traffic:
-    """The same and columns on two lanes each way: ahead and behind, alongside at nearly the car's speed, oncoming."""
+    """Add columns on two lanes each way: ahead and behind, alongside at nearly the car's speed, and oncoming."""
     length, lane = others.road.drive.length, 3.5
     library = [car(rng) for _ in range(12)] + [truck(rng) for _ in range(8)]
     lengths = np.array([np.ptp(mesh.vertices[:, 0]) for mesh in library])
@@ -149,7 +147,7 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
         kind, at = _queue(lengths, trucks, 400 / preset.traffic, length, rng)
         same_way = lane_at in (0.0, beside)
         pace = rng.uniform(-1.5, 1.5) if same_way else -preset.speed * rng.uniform(0.7, 1.0)
-        if lane_at == 0:  # room for the car itself, and for those ahead and behind to come 2 m nearer
+        if lane_at == 0:  # space for the car itself, and for cars ahead and behind to come 2 m nearer
             pace = 0.0
             at = np.remainder(at + length / 2, length) - length / 2
             apart = np.abs(at) > 9 + lengths[kind] / 2
@@ -165,10 +163,10 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
 def _queue(
     lengths: Array, trucks: float, spacing: float, road: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.intp], Array]:
-    """Which of 12 cars and then trucks with those `lengths`, and where (K,) m, on a lane of `road` m.
+    """Types of 12 cars and then trucks with those `lengths`, and their positions (K,) m, on a lane of `road` m.
 
-    `trucks` is their share; from one middle to the next it is `spacing` m on average, and never so close that they
-    touch when both are 2 m off their places.
+    `trucks` is the share of trucks. The mean distance between centers is `spacing` m, and never so small that they
+    touch when both are 2 m off their positions.
     """
     n = int(road / 5) + 1  # more than fit
     kind = np.where(rng.random(n) < trucks, rng.integers(12, len(lengths), n), rng.integers(0, 12, n))

@@ -84,7 +84,7 @@ def _lights(length: float, width: float, height: float) -> list[Mesh]:
 
 
 def truck(rng: np.random.Generator) -> Mesh:
-    """A lorry or a bus of 7 to 12 m."""
+    """A truck or a bus of 7 to 12 m."""
     length, height = rng.uniform(7, 12), rng.uniform(2.9, 3.8)
     paint, load = (Surface(Label.TRUCK, Material.PAINT, PAINTS[rng.integers(len(PAINTS))]) for _ in range(2))
     tire = Surface(Label.TRUCK, Material.RUBBER, (26,) * 3)

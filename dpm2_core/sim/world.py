@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A world: streets, ground, what stands beside them, and what moves.
+"""A world: streets, ground, static objects next to them, and moving objects.
 
 world = build_world("random", "suburb", seed=7)
 T_world_lidar, time = world.sample_pose(np.random.default_rng(0))
@@ -29,11 +29,11 @@ from dpm2_core.sim.traffic import Traffic, make_traffic
 
 @dataclass(eq=False)
 class World:
-    """Everything a sensor can see. x and y are level, z up, m.
+    """Everything that sensors can measure. x and y are horizontal, z up, m.
 
     Attributes:
         preset: its name. seed: with road and preset it determines the world. road, terrain, traffic: its parts.
-        scene: what does not move, ready for ray casting. light: sun and sky.
+        scene: static objects, ready for ray casting. light: sun and sky.
     """
 
     preset: PresetName
@@ -46,11 +46,11 @@ class World:
 
     @property
     def static(self) -> Mesh:
-        """The mesh of what does not move."""
+        """The mesh of the static objects."""
         return self.scene.mesh
 
     def pose_at(self, s: float, lateral: float = 0.0, heading: float = 0.0, height: float = 1.73) -> Array:
-        """T_world_lidar (4, 4) at arc length `s` m of the drive, `lateral` m to the left, turned by `heading` rad.
+        """T_world_lidar (4, 4) at arc length `s` m of the drive, `lateral` m to the left, rotated by `heading` rad.
 
         The car stands on the ground under its wheels; the sensor is `height` m above it, x ahead, y left, z up.
         """
@@ -67,7 +67,7 @@ class World:
         return se3.make(R, np.array([*xy, z.mean()]) + height * R[:, 2])
 
     def drive_pose(self, time: float, height: float = 1.73, sway: float = 1.0) -> Array:
-        """T_world_lidar (4, 4) of the drive at a time, s, with `sway` times the small motions of its suspension."""
+        """T_world_lidar (4, 4) of the drive at a time, s; `sway` is a factor on the small motions of its suspension."""
         t = time * 2 * np.pi
         turn = np.array([np.sin(0.9 * t) + 0.6 * np.sin(1.7 * t + 1), np.sin(1.1 * t + 2) + 0.5 * np.sin(2.3 * t), 0])
         bounce = sway * (0.006 * np.sin(1.3 * t) + 0.004 * np.sin(2.1 * t + 1))
@@ -86,8 +86,8 @@ class World:
         height: float = 1.73,
         sway: float = 1.0,
     ) -> tuple[Array, float]:
-        """T_world_lidar (4, 4) at a random place, up to 1 m, indoors 0.15 m, and `heading` rad off the drive; its
-        time, s. It is tilted by as much as the suspension does, `sway` times."""
+        """T_world_lidar (4, 4) at a random position, up to 1 m (indoors 0.15 m) and `heading` rad off the drive; its
+        time, s. It is tilted as much as by the suspension, times `sway`."""
         lateral = 0.15 if self.road.plan else 1.0
         time = float(rng.uniform(0, self.road.times[-1]))
         tilt = Rotation.from_rotvec([*rng.normal(0, 0.006 * sway, 2), 0]).as_matrix()
@@ -103,16 +103,16 @@ class World:
 def build_world(
     road: str = "random", preset: PresetName = "city", seed: int = 0, length: float = 400.0, traffic: float = 1.0
 ) -> World:
-    """A world, the same for the same arguments.
+    """A world, identical for identical arguments.
 
     Args:
         road: straight, loop, figure8, random, or a file of KITTI poses.
         preset: city, suburb, rural, highway, tunnel, indoor or car_park.
-        length: of the road (a lap, where it is closed), m; a file has its own.
-        traffic: times that of the preset; see `with_traffic`.
+        length: of the road (a lap, if it is closed), m; a file has its own length.
+        traffic: factor on that of the preset; see `with_traffic`.
 
     Raises:
-        UsageError: no such road or preset, or a length, seed or traffic that cannot be.
+        UsageError: no such road or preset, or an invalid length, seed or traffic.
     """
     if not 60 <= length <= 20000:
         raise UsageError(f"length {length:g} m of road: want 60 to 20000")
@@ -142,10 +142,10 @@ def build_world(
 
 
 def own_preset(preset: PresetName, seed: int, traffic: float = 1.0) -> Preset:
-    """The preset as the world of a seed has it, with that many times its traffic.
+    """The preset with the values of the world with that seed, and with its traffic scaled.
 
     Raises:
-        UsageError: no such preset, or a seed or traffic that cannot be.
+        UsageError: no such preset, or an invalid seed or traffic.
     """
     if preset not in PRESETS:
         raise UsageError(f"--preset {preset}: want one of {', '.join(PRESET_NAMES)}")
