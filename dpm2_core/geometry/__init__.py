@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid motions, rays, point sampling, and properties of a scan's shape; depends only on frames."""
+"""Rigid motions, rays, point sampling, and what the shape of a scan shows; depends only on frames."""
