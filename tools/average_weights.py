@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of the weights of stages that follow each other: python -m tools.average_weights OUT IN...
+"""Averages the weights of consecutive training stages: python -m tools.average_weights OUT IN...
 
-Stages of one training lie in one valley of the loss, and their mean errs less than each (M. Wortsman et al., "Model
-soups", ICML 2022). Its network is the preset, whatever a stage has changed for its training.
+The stages of one training are in one basin of the loss, and their mean has a smaller error than each (M. Wortsman et
+al., "Model soups", ICML 2022). The resulting network is the preset, whatever a stage has changed for its training.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dpm2_core.network.weights import load_fitting, network_settings, read_metad
 
 
 def average(files: Sequence[Path]) -> DeepPointMap2:
-    """The network of the preset with the mean of the weights; what does not fit in all files is that of the last one.
+    """The preset's network with the mean of the weights; tensors that do not fit in all files are from the last file.
 
     Raises:
-        UsageError: one is not readable weights, or none of it fits.
+        UsageError: a file is not readable weights, or none of its weights fit.
     """
     model = DeepPointMap2(preset(network_settings(files[-1]).preset))
     states, partly = [], set[str]()
@@ -42,7 +42,7 @@ def average_weights(
     files: Annotated[list[Path], typer.Argument(metavar="IN...", help="Weights of the stages, the last one last.")],
     encoder: Annotated[Path | None, typer.Option(help="Weights whose encoder it has instead of the mean.")] = None,
 ) -> None:
-    """Write the mean of weights; what a decoder has learned may go with the descriptors of another stage."""
+    """Write the mean of weights; the averaged decoder may be combined with the encoder of another stage."""
     model = average(files)
     if encoder is not None:
         model.encoder.load_state_dict(average([encoder]).encoder.state_dict())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A browser without a screen for the pages that are written: which program, and rendered in software."""
+"""A headless browser for generated pages: which program, and the arguments for software rendering."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ SOFTWARE = ("--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--
 
 
 def chromium() -> str | None:
-    """The program; None where there is none."""
+    """Path of the program; None if there is none."""
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

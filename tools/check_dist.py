@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of `make dist` as a user gets them: installed into fresh environments, and the programs started there.
+"""Checks the files of `make dist` as users install them: in fresh environments, where the programs are started.
 
 `python -m tools.check_dist`: wheel and sdist with the base install, then the wheel with each extra.
 """
@@ -24,16 +24,16 @@ NODES = ("slam_node", "mapper_node", "bag_player")
 
 
 def check(distribution: Path, extra: str, work: Path) -> None:
-    """Install a wheel or sdist with an extra ("" for none), and start everything.
+    """Install a wheel or sdist with an extra ("" for none), and start all programs.
 
     Raises:
-        CalledProcessError: something does not start.
+        CalledProcessError: a program does not start.
     """
     place = work / f"{distribution.suffix.strip('.')}-{extra or 'base'}"
     venv.create(place, with_pip=True)
     run = place / "bin"
     wanted = f"{distribution}[{extra}]" if extra else str(distribution)
-    # The torch that is here already, so that each environment need not fetch its own.
+    # The version of torch that is installed here, so that no environment downloads another one.
     torch = version("torch").partition("+")[0]
     (place / "constraints.txt").write_text(f"torch=={torch}\n", encoding="utf-8")
     pip = [str(run / "pip"), "install", "-qq", "--disable-pip-version-check", "-c", str(place / "constraints.txt")]

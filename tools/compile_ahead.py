@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the machine code of all loops (`geometry.compiled`), by as many processes as there are processors.
+"""Compile all loops (`geometry.compiled`) ahead of use, with as many processes as there are processors.
 
-Each process that needs it and finds none makes it for itself: half a minute, in every one of those that start together.
+A process that finds no compiled code compiles it itself: half a minute, in each of several processes started together.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import dpm2_core
 
 
 def compiled_modules() -> list[str]:
-    """Names of the modules with loops that are compiled, those with most of them first."""
+    """Names of the modules with compiled loops, those with the most loops first."""
     package = Path(dpm2_core.__file__).parent
     loops = {path: path.read_text().count("\n@compiled(") for path in package.rglob("*.py")}
     paths = sorted((path for path, count in loops.items() if count), key=lambda path: -loops[path])
@@ -23,7 +23,7 @@ def compiled_modules() -> list[str]:
 
 
 def compile_module(name: str) -> None:
-    """By importing it."""
+    """Compile a module's loops by importing it."""
     importlib.import_module(name)
 
 

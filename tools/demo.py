@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make demo`: a drive through bag, player and slam_node, checked and shown. Without a drive, one is simulated."""
+"""`make demo`: a drive through bag, player and slam_node, checked and plotted. Without a drive, one is simulated."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from dpm2_ros.tf_message import TFMessage
 from tools.replay import Replay, replay
 
 QUEUE = 50
-"""Clouds that slam_node may hold here: a machine that stalls for a moment shows latency, and loses nothing."""
+"""Queue depth of slam_node here: if the machine stalls for a moment, latency rises but no cloud is lost."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures (the content of summary.json), and what was checked: text to whether it holds."""
+    """Figures (the content of summary.json), and the checks: text to whether it passed."""
 
     summary: dict[str, float | int | None]
     checks: dict[str, bool]
@@ -48,7 +48,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("out/demo"),
     rate: Annotated[float, typer.Option(help="speed of playing; 1: that of the recording", min=0.05)] = 1.0,
 ) -> int:
-    """Replay a drive into slam_node and check what comes out. Exit code 1 if a check fails."""
+    """Replay a drive into slam_node and check its output. Exit code 1 if a check fails."""
     console = Console()
     out.mkdir(parents=True, exist_ok=True)
     bag = prepare(src, out, console)
@@ -69,10 +69,10 @@ def demo(
 
 
 def prepare(src: Path | None, out: Path, console: Console) -> Path:
-    """The bag to play: `src` itself, another recording converted, or a simulated one; what was made before is reused.
+    """The bag to play: `src` itself, another recording converted, or a simulated one; earlier output is reused.
 
     Raises:
-        UsageError: `src` is nothing that can be read.
+        UsageError: `src` cannot be read.
     """
     if src is not None and not src.exists():
         raise UsageError(f"{src}: no such file or folder")
@@ -80,10 +80,10 @@ def prepare(src: Path | None, out: Path, console: Console) -> Path:
         return src
     if src is None:
         src = out / "city"
-        if not src.is_dir():  # it is there when it is whole
+        if not src.is_dir():  # the folder exists only when it is complete
             _simulate(src)
     bag = out / f"bag_{src.resolve().name}"
-    made_from = bag.with_suffix(".source")  # the same name elsewhere is another drive
+    made_from = bag.with_suffix(".source")  # a drive of the same name in another folder is a different one
     if not (bag / "metadata.yaml").is_file() or made_from.read_text() != str(src.resolve()):
         with console.status(f"converting {src} to {bag}"):
             for note in convert(open_source(src), bag, overwrite=True):
@@ -99,7 +99,7 @@ def _simulate(out: Path) -> None:
 
 
 def evaluate_replay(source: BagSource, result: Replay, out: Path) -> Evaluation:
-    """Compare what came out with what went in, and with the ground truth where there is some; draws the image."""
+    """Compare output with input, and with the ground truth if there is any; draws the image."""
     stamps = source.stamps
     found = [stamp for stamp in dict.fromkeys(stamps.tolist()) if stamp in result.poses]
     summary: dict[str, float | int | None] = {
@@ -161,7 +161,7 @@ def _check_poses(
 
 
 def map_poses(source: BagSource, result: Replay, found: list[int]) -> Array:
-    """(N, 4, 4) poses of the LiDAR for the stamps `found`, corrected as the saved map's keyframes were."""
+    """(N, 4, 4) poses of the LiDAR for the stamps `found`, with the corrections of the saved map's keyframes."""
     T_odom_base = np.array([result.poses[stamp] for stamp in found])
     if result.saved is not None:
         keyframes = read_trajectory(result.saved / "trajectory.tum")

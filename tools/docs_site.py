@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hooks of mkdocs: pages link to files outside docs/ as in the repository, and those become part of the site."""
+"""Hooks for mkdocs: files outside docs/ that pages link to, as in the repository, become part of the site."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dpm2_core.extras import needs
 
 ROOT = Path(__file__).resolve().parents[1]
 PLACE = "repository"
-"""Folder of the site for files of the repository that are not in docs/."""
+"""Folder of the site for files of the repository outside docs/."""
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>(?:#[^)\s]*)?)\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Take in what the pages link to, and what that links to."""
+    """Add the files that the pages link to, and the files that those link to."""
     with needs("docs", "the site"):
         from mkdocs.structure.files import File
     wanted = [page.src_uri for page in files.documentation_pages()]
@@ -33,14 +33,14 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links of a page to where their targets are in the site."""
+    """Replace the links of a page by the targets' paths in the site."""
     here = page.file.src_uri
 
     def there(match: re.Match[str]) -> str:
         target = _in_repository(here, match["target"])
         if target is None:
             return match[0]
-        if (ROOT / target).is_dir():  # which a site cannot show
+        if (ROOT / target).is_dir():  # a site cannot show a folder
             return match["text"]
         uri = target.removeprefix("docs/") if target.startswith("docs/") else f"{PLACE}/{target}"
         relative = posixpath.relpath(uri, posixpath.dirname(here) or ".")
@@ -56,7 +56,7 @@ def _linked(page: str) -> list[str]:
 
 
 def _in_repository(page: str, link: str) -> str | None:
-    """Path below the root that a link of a page means; None for an address elsewhere."""
+    """Path, relative to the root, of the target of a page's link; None for an address elsewhere."""
     if "://" in link or link.startswith("mailto:"):
         return None
     own = page.removeprefix(f"{PLACE}/") if page.startswith(f"{PLACE}/") else f"docs/{page}"

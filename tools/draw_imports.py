@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws the diagrams of docs/architecture.md from the imports themselves: `make diagrams`.
 
-An arrow says "imports". What other arrows imply is left out; imports inside functions and for types count like others.
+An arrow means "imports". Arrows implied by others are left out; imports inside functions and for types count, too.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "architecture.md"
 BASE = "base"
 Arrows = dict[str, set[str]]
-"""Each unit of a diagram with those that it imports."""
+"""Each unit of a diagram, with the units that it imports."""
 
 
 def diagrams() -> dict[str, str]:
-    """Mermaid text of every diagram by its name in the document.
+    """Mermaid text of every diagram, by its name in the document.
 
     Raises:
         MissingPackageError: grimp, which reads the imports, is not installed.
@@ -40,7 +40,7 @@ def diagrams() -> dict[str, str]:
 
 
 def packages(graph: ImportGraph) -> Arrows:
-    """The packages; single files that import nothing but each other are drawn as one, `BASE`."""
+    """The packages; single files that import only each other are drawn as one, `BASE`."""
     arrows = children(graph, "dpm2_core", "dpm2_ros")
     files = {u for u in arrows if not graph.find_children(u) and graph.find_modules_that_directly_import(u)}
     base: set[str] = set()
@@ -54,7 +54,7 @@ def packages(graph: ImportGraph) -> Arrows:
 
 
 def children(graph: ImportGraph, parent: str, *others: str) -> Arrows:
-    """The modules and packages right below `parent`, and `others`, with the imports between them."""
+    """The modules and packages directly below `parent`, and `others`, with the imports between them."""
     units = sorted(graph.find_children(parent) | set(others))
     out: Arrows = {unit: set() for unit in units}
     for unit in units:
@@ -66,7 +66,7 @@ def children(graph: ImportGraph, parent: str, *others: str) -> Arrows:
 
 
 def reachable(arrows: Mapping[str, set[str]], start: str) -> set[str]:
-    """All that `start` imports, also through others."""
+    """All units that `start` imports, directly or indirectly."""
     seen: set[str] = set()
     waiting = [start]
     while waiting:
@@ -77,10 +77,10 @@ def reachable(arrows: Mapping[str, set[str]], start: str) -> set[str]:
 
 
 def reduced(arrows: Mapping[str, set[str]]) -> Arrows:
-    """The fewest arrows from which the same can be reached.
+    """The smallest set of arrows with the same reachability.
 
     Raises:
-        Dpm2Error: imports run in a circle.
+        Dpm2Error: there is an import cycle.
     """
     below = {unit: reachable(arrows, unit) for unit in arrows}
     if circle := sorted(unit for unit in arrows if unit in below[unit]):
@@ -92,10 +92,10 @@ def reduced(arrows: Mapping[str, set[str]]) -> Arrows:
 
 
 def replaced(text: str, drawn: Mapping[str, str]) -> str:
-    """A document with its diagrams drawn anew; each stands between `<!-- imports: NAME -->` and `<!-- end -->`.
+    """A document with its diagrams replaced; each is between `<!-- imports: NAME -->` and `<!-- end -->`.
 
     Raises:
-        UsageError: a diagram has no place in the document.
+        UsageError: the document has no place for a diagram.
     """
     for name, mermaid in drawn.items():
         place = re.search(rf"(?<=<!-- imports: {name} -->\n).*?(?=<!-- end -->)", text, re.DOTALL)
@@ -106,9 +106,9 @@ def replaced(text: str, drawn: Mapping[str, str]) -> str:
 
 
 def _mermaid(arrows: Arrows) -> str:
-    """Top down, in an order that depends on the names alone."""
+    """A top-down diagram, in an order that depends only on the names."""
     lines = ["flowchart TD"]
-    # "graph" and "end" are words of Mermaid: the names of nodes get an underscore.
+    # "graph" and "end" are keywords of Mermaid: the names of nodes get an underscore.
     lines += [f'    {_node(unit)}["{_label(unit, arrows)}"]' for unit in sorted(arrows)]
     for unit, imported in sorted(reduced(arrows).items()):
         lines += [f"    {_node(unit)} --> {_node(other)}" for other in sorted(imported)]
@@ -120,7 +120,7 @@ def _node(unit: str) -> str:
 
 
 def _label(unit: str, arrows: Arrows) -> str:
-    """The name, and for a package the first words of its docstring."""
+    """The name, and for a package also the first words of its docstring."""
     path = ROOT.joinpath(*unit.split("."))
     if unit == BASE:
         return "frame, estimates, config, errors, files, ...<br/>the nouns, settings, files"
@@ -132,7 +132,7 @@ def _label(unit: str, arrows: Arrows) -> str:
 
 
 def main() -> None:
-    """Write the document with its diagrams as the imports are now."""
+    """Update the diagrams in the document to the current imports."""
     text = DOCUMENT.read_text(encoding="utf-8")
     with atomic_write(DOCUMENT) as file:
         file.write(replaced(text, diagrams()))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The moving picture of the README (APNG; `make picture`).
+"""The animated image of the README (APNG; `make picture`).
 
-Each drive goes through the SLAM; what is drawn is the map as it grows, seen from above, and the way. No data of a drive
-but this view of it gets into the picture.
+Each drive is processed by the SLAM; the image shows the growing map, seen from above, and the trajectory. The image
+contains no other data of a drive.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
 
 SIZE = (420, 320)
-"""Width and height of each drive's part."""
+"""Width and height of each drive's part, pixels."""
 MOMENTS = 44
-"""Images of the whole."""
+"""Number of images in the animation."""
 MOST = 3_000_000
-"""Bytes that the file may have."""
-_MARGIN, _SPACING, _HOLD = 25.0, 0.35, 2000  # m around the way, m between points, ms of the last image
+"""Largest size of the file, bytes."""
+_MARGIN, _SPACING, _HOLD = 25.0, 0.35, 2000  # m around the trajectory, m between points, ms of the last image
 _INK, _GROUND = (16, 21, 26), (0.0, 5.0)  # background; heights between which colors change, m above the lowest points
 
 Picture = NDArray[np.uint8]
@@ -65,7 +65,7 @@ def moments(drive: Path, title: str) -> list[Picture]:
 
 
 class _View:
-    """A map from above, whose longer side lies along the longer side of the image."""
+    """A map from above, rotated so that its longer side is along the longer side of the image."""
 
     def __init__(self, way: NDArray[np.float64]) -> None:
         middle = way[:, :2].mean(0)
@@ -85,13 +85,13 @@ class _View:
         return np.column_stack([SIZE[0] / 2 + local[:, 0], SIZE[1] / 2 - local[:, 1]])
 
     def add(self, points: NDArray[np.float64]) -> None:
-        """Points (N, 3) of the map: each pixel keeps the highest."""
+        """Add points (N, 3) to the map: each pixel keeps the highest."""
         at = np.floor(self.pixels(points[:, :2])).astype(int)
         inside = ((at >= 0) & (at < SIZE)).all(1)
         np.maximum.at(self._height, (at[inside, 1], at[inside, 0]), points[inside, 2].astype(np.float32) - self._floor)
 
     def draw(self, way: NDArray[np.float64], text: str) -> Picture:
-        """RGB."""
+        """The image, RGB."""
         level = np.clip((self._height - _GROUND[0]) / (_GROUND[1] - _GROUND[0]), 0, 1)
         level = np.round(np.where(np.isfinite(level), level, 0) * 12) / 12  # few colors: a small file
         seen = np.isfinite(self._height)[..., None]
@@ -105,7 +105,7 @@ class _View:
 
 
 def write_apng(path: Path, images: list[Picture]) -> None:
-    """All images one after the other, the last for longer; at most `MOST` bytes.
+    """Write all images in sequence, the last one shown longer; at most `MOST` bytes.
 
     Raises:
         Dpm2Error: it is larger, or could not be written.
@@ -126,7 +126,7 @@ def make_picture(
     out: Annotated[Path, typer.Argument(metavar="OUT.png")],
     drives: Annotated[list[str], typer.Argument(metavar="[TITLE=]DRIVE...")],
 ) -> None:
-    """Drives beside each other."""
+    """Draw drives side by side."""
     parts = []
     for argument in drives:
         title, _, drive = argument.rpartition("=")

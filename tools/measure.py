@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records that stand on the weights, measured again (`make measure`).
+"""Repeats the measurements of records that depend on the weights (`make measure`).
 
-What was stopped goes on: a record is whole if the code has not changed since the commit that it names.
+An interrupted run can be continued: a record is current if the code has not changed since the commit in the record.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ COMMANDS: dict[str, Sequence[str]] = {
     "pose-graph": (), "map": (), "roads": (), "fleet": (), "indoor": (), "motion": (), "beside": (),
     "imu": ("--threads", "1"), "finetune": (),
 }  # fmt: skip
-"""Benchmarks and their options, the quick ones first."""
+"""Benchmarks and their options, fast ones first."""
 TARGETS = {"livox": "bench-livox"}
-"""Records that a target of the Makefile makes."""
+"""Records that are made by a target of the Makefile."""
 
 
 def remaining(names: Sequence[str]) -> list[str]:
-    """Those of the records that are of other code, or not there.
+    """The records that are missing or were measured with other code.
 
     Raises:
         UsageError: no such record.
@@ -45,7 +45,7 @@ def remaining(names: Sequence[str]) -> list[str]:
 
 
 def measured_at(path: Path) -> str | None:
-    """The commit that a record names; None where there is no record that can be read."""
+    """The commit named in a record; None if there is no readable record."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -55,13 +55,13 @@ def measured_at(path: Path) -> str | None:
 
 
 def _is_current(commit: str | None) -> bool:
-    """Whether the code is that of a commit."""
+    """Whether the measured code is the same as at a commit."""
     command = ["git", "diff", "--quiet", f"{commit}", "HEAD", "--", *MEASURED]
     return commit is not None and not subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode
 
 
 def measure(names: Annotated[list[str] | None, typer.Argument(help="Records; all without.")] = None) -> None:
-    """Measure what is left, one after the other."""
+    """Measure what is missing, one benchmark after the other."""
     commit = git_commit()
     if commit is None or commit.endswith("+"):
         raise UsageError("a record names the commit that it is of: commit what has changed first")

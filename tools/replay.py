@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag through bag_player and slam_node, two processes over real DDS, and a subscriber that notes what arrives."""
+"""Plays a bag with bag_player into slam_node, two processes over real DDS, and records the output with a subscriber."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ Nanoseconds = NDArray[np.int64]
 
 @dataclass(eq=False)
 class Replay:
-    """What went in and what came out.
+    """Input and output of a replay.
 
     Attributes:
         published: time at which each cloud was published, ns of the monotonic clock, in the order of the bag.
-        poses: stamp (ns) to T_odom_base (4, 4), and `received`: stamp to the time at which it arrived, ns likewise.
+        poses: stamp (ns) to T_odom_base (4, 4). received: stamp to the time of arrival, ns of the monotonic clock.
         keyframes: stamps of the keyframes.
-        map: the last /dpm2/map; None if none came.
-        maps, loops: messages on /dpm2/map and /dpm2/loop_closure.
-        tf: "parent -> child" seen on /tf.
+        map: the last /dpm2/map; None if none arrived.
+        maps, loops: number of messages on /dpm2/map and /dpm2/loop_closure.
+        tf: "parent -> child" received on /tf.
         diagnostics: the last values of the odometry's status.
         base_frame: child_frame_id of the odometry.
         saved: folder of the map that the node has saved; None if it has not.
-        exit_codes: of the processes, by name.
+        exit_codes: exit codes of the processes, by name.
     """
 
     published: Nanoseconds = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -62,7 +62,7 @@ class Replay:
 
 
 def ros_environment(domain: int | None = None) -> dict[str, str]:
-    """This process' environment, on this machine only, in a domain that others hardly use."""
+    """The environment of this process, limited to this machine, in a domain that is hardly used by others."""
     return os.environ | {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(random.randint(1, 100) if domain is None else domain),
@@ -71,14 +71,14 @@ def ros_environment(domain: int | None = None) -> dict[str, str]:
 
 
 def start(name: str, arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> subprocess.Popen[bytes]:
-    """One of the executables as a process; its output goes to `log`."""
+    """Start one of the executables as a process; its output is written to `log`."""
     with log.open("wb") as file:
         command = [sys.executable, "-m", "dpm2_ros.executables", name, *arguments]
         return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
 
 
 def stop(process: subprocess.Popen[bytes], timeout: float = 60.0) -> int:
-    """SIGINT, and the exit code; killed if it does not end."""
+    """Send SIGINT and return the exit code; the process is killed if it does not end."""
     with suppress(ProcessLookupError):
         process.send_signal(signal.SIGINT)
     try:
@@ -96,17 +96,17 @@ def replay(
     progress: Callable[[int], None] = lambda frames: None,
     watched: bool = False,
 ) -> Replay:
-    """Play the bag into slam_node; returns when both processes have ended. Logs and the map go to `out`.
+    """Play the bag into slam_node; returns when both processes have ended. Logs and the map are written to `out`.
 
     Args:
         source: the bag.
-        rate: speed of playing.
-        parameters: of slam_node.
-        progress: called with the number of frames that have come out, now and then.
-        watched: everything that slam_node publishes has a subscriber, so that everything is made.
+        rate: playback rate.
+        parameters: parameters of slam_node.
+        progress: called from time to time with the number of poses received.
+        watched: subscribe to every topic of slam_node, so that it computes all its output.
 
     Raises:
-        Dpm2Error: a process ended before its time; the message gives the end of its log.
+        Dpm2Error: a process ended too early; the message has the end of its log.
     """
     environment = ros_environment()
     os.environ.update(environment)  # the subscriber in this process reads it when rclpy starts
@@ -119,7 +119,7 @@ def replay(
     result, maps = Replay(), set((out / "map").glob("*/map.ply"))
     try:
         with closing(_Listener(result)) as listener:
-            while not listener.connected():  # or the first poses would be sent before there is a subscriber
+            while not listener.connected():  # else the first poses would be sent before there is a subscriber
                 _check_alive(slam, out)
                 listener.spin(0.1)
             if watched:
@@ -144,13 +144,13 @@ def replay(
 
 
 def _check_alive(slam: subprocess.Popen[bytes], out: Path) -> None:
-    """Raise where it has ended."""
+    """Raise an error if slam_node has ended."""
     if slam.poll() is not None:
         raise Dpm2Error(f"slam_node ended with {slam.returncode}: {_tail(out / 'slam_node.log')}")
 
 
 def _drain(listener: _Listener, result: Replay) -> None:
-    """Until everything that was published has come out, or nothing more does; then for the map with the last of it."""
+    """Spin until all published clouds have a pose, or no more poses arrive; then until the last map has arrived."""
     before, quiet = -1, 0.0
     while len(result.poses) < len(result.published) and quiet < 3.0:
         quiet = 0.0 if len(result.poses) > before else quiet + 0.2
@@ -162,10 +162,10 @@ def _drain(listener: _Listener, result: Replay) -> None:
 
 
 class SpunNode:
-    """A node of this process, which is spun between other work."""
+    """A node in this process that is spun between other work."""
 
     def __init__(self, name: str) -> None:
-        """With a context of its own, by what `os.environ` holds."""
+        """Create it with its own context, configured by `os.environ`."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
@@ -175,19 +175,19 @@ class SpunNode:
         self._executor.add_node(self._node)
 
     def spin(self, seconds: float) -> None:
-        """Take what arrives during that time."""
+        """Process messages that arrive during that time."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
     def close(self) -> None:
-        """Destroy it, and end ROS in this process."""
+        """Destroy the node, and shut down ROS in this process."""
         self._executor.shutdown()
         end_ros(self._node)
 
 
 class _Listener(SpunNode):
-    """Subscribes to what slam_node publishes."""
+    """Subscribes to the output of slam_node."""
 
     def __init__(self, result: Replay) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -210,7 +210,7 @@ class _Listener(SpunNode):
             subscribe(TFMessage, "/tf", self._on_tf, 1000)
 
     def watch_all(self) -> None:
-        """Subscribe to the other topics of slam_node, too, and leave their messages as the bytes that they came as."""
+        """Subscribe to the other topics of slam_node, too, without deserializing their messages."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         profile = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -223,12 +223,12 @@ class _Listener(SpunNode):
             self._node.create_subscription(message, topic, lambda _: None, profile, raw=True)
 
     def connected(self) -> bool:
-        """Whether slam_node is heard, and its other topics have been found too."""
+        """Whether slam_node's diagnostics are received, and its other topics are discovered."""
         topics = ("/dpm2/odom", "/dpm2/keyframe_odom", "/dpm2/loop_closure", "/dpm2/map")
         return bool(self._result.diagnostics) and all(self._node.count_publishers(topic) for topic in topics)
 
     def map_is_complete(self) -> bool:
-        """Whether the last map holds the last keyframe."""
+        """Whether the last map contains the last keyframe."""
         return bool(self._result.keyframes) and self._map_stamp == self._result.keyframes[-1]
 
     def _on_odom(self, message: Any) -> None:

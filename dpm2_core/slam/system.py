@@ -112,7 +112,7 @@ class Slam:
     def odometry_step(self, frame: Frame) -> OdometryResult:
         """The frame's pose in the odometry frame, and a keyframe if enough is new or a localizer needs one.
 
-        Frames that are parts of a sweep are joined: the pose of the last part is registered, the earlier ones are predicted.
+        Frames that are parts of a sweep are joined. The pose of the last part is registered; the others are predicted.
         May run in another thread than `map_step`.
         """
         sweep = self._parts.join(frame)
