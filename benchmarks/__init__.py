@@ -37,22 +37,22 @@ BENCHES = {
     "traffic": "repetitions threads set only",
     "views": "source threads set",
 }
-"""By the name that `dpm2 bench NAME` and `benchmarks/NAME.json` share: what of `Options` each makes use of beside
-`out`, by the names of the command line."""
+"""By the name in `dpm2 bench NAME` and `benchmarks/NAME.json`: the `Options` that the benchmark uses in addition to
+`out`, by their names on the command line."""
 
 
 def run(name: str, options: Options) -> Report:
-    """The outcome of a benchmark, whose module is imported now: what one needs is slow to import."""
+    """Run a benchmark; its module is imported only now, since its imports may be slow."""
     module = name.replace("-", "_")
     report: Report = getattr(import_module(f"{__name__}.{module}"), f"bench_{module}")(options)
     return report
 
 
 def check_options(names: Collection[str], given: Collection[str]) -> None:
-    """Reject names of benchmarks that do not exist, and options that one of them would ignore.
+    """Reject unknown names of benchmarks, and options that one of them would ignore.
 
     Raises:
-        UsageError: says which.
+        UsageError: there is such a name or option; the message names it.
     """
     for name in names:
         if name not in BENCHES:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the covariance of a registration that of its errors? Pairs of frames near and far, real and simulated."""
+"""Does the covariance of a registration match its errors? Pairs of frames near and far, real and simulated."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _FRAMES = 60
 _SPANS = {"pose": slice(0, 6), "rotation": slice(0, 3), "translation": slice(3, 6)}
 
 Found = dict[tuple[int, int], tuple[Array, Registration]]
-"""By the positions of a pair: its true pose (4, 4), and the registration that was accepted."""
+"""By positions of a pair: its true pose (4, 4), and the accepted registration."""
 
 
 def bench_covariance(options: Options) -> Report:
-    """Points and network on every drive; `--only` chooses the real drives or the simulated ones.
+    """Geometric and neural registration on every drive; `--only` chooses the real drives or the simulated ones.
 
-    The truth counts as exact: what it is off itself is held against the covariance. How far the two methods are apart,
-    which share no error but those of the sensor, says how much that is.
+    The ground truth is taken as exact: its own errors count against the covariance. The distance between the two
+    methods, which share no errors but those of the sensor, shows how large these are.
 
     Raises:
         UsageError: there is no drive, or one has no ground truth.
@@ -57,7 +57,7 @@ def bench_covariance(options: Options) -> Report:
 
 @contextmanager
 def _simulated(options: Options) -> Iterator[dict[str, Source]]:
-    """Drives whose truth is exact, of sensors that have noise but no error of calibration."""
+    """Drives with exact ground truth, of sensors with noise but without calibration errors."""
     sources: dict[str, Source] = {}
     for number, (preset, beams) in enumerate(_WORLDS):
         out = options.cache / "covariance" / f"{preset}_{beams}"
@@ -84,7 +84,7 @@ def _registered(
 ) -> Found:
     """Pairs registered to a map of one scan.
 
-    The points start at the truth, as from a good prediction: whether they find the place is another question. The
+    The geometric registration starts at the truth, as from a good prediction: its convergence is not tested here. The
     network has no prior.
     """
     settings = settings_of(options, f"slam.registration={method}", "slam.visual.enabled=false")
@@ -104,7 +104,7 @@ def _registered(
 
 
 def calibration(rows: Sequence[tuple[Array, Registration]]) -> dict[str, Any]:
-    """Median errors, and the medians of xi^T S^-1 xi by what they should be, of the pose, its rotation and translation.
+    """Median errors, and medians of xi^T S^-1 xi over the expected value, for the pose, its rotation and translation.
 
     Args:
         rows: true pose (4, 4), and a registration with its covariance S (6, 6). 1 is right; more: S is too small.

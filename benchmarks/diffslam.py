@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differentiable SLAM: convergence of every gate, gradients against each other and finite differences, and the cost."""
+"""Differentiable SLAM: convergence of every gate, gradients against each other and finite differences, and cost."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from dpm2_core.tables import FigureTable
 SCANS, POINTS = 8, 2048
 MOTION = se3.exp(np.array([0.002, -0.003, np.radians(1.2), 0.8, 0.1, 0.02]))
 """T_target_source of the known motion: 0.81 m, 1.2 deg."""
-_CONVERGED = 60  # iterations after which nothing moves
+_CONVERGED = 60  # iterations, after which nothing changes
 _STEP = 1e-4  # m, of the finite difference
-_RANKS = (0, 1, 10, 100, 1000)  # of the points that are moved for it, by the length of their slope
-_NOISE = 0.01  # m, that a predicted scan differs by from its target
+_RANKS = (0, 1, 10, 100, 1000)  # ranks, by gradient length, of the points that are moved for it
+_NOISE = 0.01  # m, difference of a predicted scan from its target
 
 
 def bench_diffslam(options: Options) -> Report:
@@ -53,7 +53,7 @@ def bench_diffslam(options: Options) -> Report:
 
 
 def street_scans() -> tuple[list[Tensor], Tensor]:
-    """Eight scans (N, 3) of a drive, traffic included, and their exact trajectory (8, 4, 4)."""
+    """Eight scans (N, 3) of a drive, with traffic, and their exact trajectory (8, 4, 4)."""
     world, lidar = build_world("straight", "suburb", seed=8, length=100.0), Lidar()
     times = 2.0 + 0.1 * np.arange(SCANS)
     poses = np.stack([lidar.pose(world, float(t)) for t in times])
@@ -65,7 +65,7 @@ def street_scans() -> tuple[list[Tensor], Tensor]:
 
 
 def with_solver(settings: SlamLossSettings, **changes: Any) -> SlamLossSettings:
-    """Settings with another solver of the registration."""
+    """Settings with changes to the solver of the registration."""
     solver = settings.icp.solver.model_copy(update=changes)
     return settings.model_copy(update={"icp": settings.icp.model_copy(update={"solver": solver})})
 
@@ -86,7 +86,7 @@ def known_motion(scan: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
 
 
 def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
-    """Scans of their own (T, N, 3): how far the trajectory and its gradient are from those at convergence."""
+    """Independent scans (T, N, 3): distance of the trajectory and its gradient from those at convergence."""
     end, slope = _by_points(points, truth, with_solver(settings, iterations=_CONVERGED, gate="none"))
     rows: dict[str, dict[str, Any]] = {}
     variants: dict[str, dict[str, Any]] = {
@@ -116,7 +116,7 @@ def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str
 
 
 def _by_points(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> tuple[Tensor, Tensor]:
-    """Trajectory, and the gradient of its error by all points."""
+    """Trajectory, and the gradient of its error with respect to all points."""
     leaf = points.clone().requires_grad_()
     poses = odometry(leaf, settings=settings)
     (gradient,) = torch.autograd.grad(trajectory_loss(poses, truth), leaf)
@@ -124,7 +124,7 @@ def _by_points(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> tup
 
 
 def gradients(points: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
-    """Of the loss of noisy scans against the scans: by single points against finite differences, and of both kinds."""
+    """Gradients of the loss of noisy scans against clean ones: single points against finite differences; both kinds."""
     noisy = points + _NOISE * torch.randn(points.shape, generator=torch.Generator().manual_seed(0), dtype=points.dtype)
     frames = [("drive", t) for t in range(len(points))]
     out: dict[str, Any] = {"iterations": _CONVERGED, "rank_of_slope": list(_RANKS)}
@@ -153,7 +153,7 @@ def gradients(points: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
 
 
 def cost(points: Tensor, settings: SlamLossSettings, repetitions: int) -> dict[str, Any]:
-    """Seconds of `SlamLoss`, forward (both branches) and backward, and what the graph holds between them."""
+    """Seconds of `SlamLoss`, forward (both branches) and backward, and the memory of the graph in between."""
     noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(0), dtype=points.dtype).to(points)
     rows = {}
     for gradient in ("unrolled", "implicit"):
@@ -162,7 +162,7 @@ def cost(points: Tensor, settings: SlamLossSettings, repetitions: int) -> dict[s
         leaf = (points + _NOISE * noise).requires_grad_()
         row: dict[str, Any] = {}
         for name, named in (("reference_anew", None), ("reference_cached", frames)):
-            loss(leaf, points, frames=named)  # warm, and fills the cache
+            loss(leaf, points, frames=named)  # warm-up, and fills the cache
             forward, backward = [], []
             for _ in range(repetitions):
                 _wait(points)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pypose where it does the same as `diffslam`: registration of a known motion, by its ICP and by its LM optimizer."""
+"""pypose on the same task as `diffslam`: registration of a known motion, with its ICP and its LM optimizer."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _REPETITIONS = 3
 def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
     """Error and time of each for a scan (N, 3) registered to itself, moved by T_target_source (4, 4), from identity.
 
-    pypose's ICP is point-to-point with all distances at once, its LM is given our matches and residuals; neither has
-    weights of points, and the optimizer has no gradient and finds its Jacobian by autograd. All do `iterations` steps.
+    pypose's ICP is point-to-point with all distances at once; its LM uses our matches and residuals. Neither has point
+    weights, and the LM has no gradient and computes its Jacobian by autograd. All do `iterations` steps.
     """
     try:
         import pypose
@@ -59,7 +59,7 @@ def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
 
 
 def _by_optimizer(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
-    """Point-to-plane by `pypose.optim.LM`: its adaptive damping (up 2, down 0.5), each step matched anew."""
+    """Point-to-plane with `pypose.optim.LM`: its adaptive damping (up 2, down 0.5), new matches at each step."""
     cloud = Cloud(target[None])
 
     class Plane(torch.nn.Module):

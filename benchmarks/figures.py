@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of the benchmarks: how often methods register pairs, and tables by color."""
+"""Plots of the benchmarks: success rates on pairs, lines, bars, and tables with colors."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _VERDICTS = {
 
 
 def success_png(path: Path | str, kinds: Mapping[str, Mapping[str, Mapping[str, Any]]], title: str = "") -> None:
-    """Bars of the fraction of pairs that each method registers, one group a kind of pair, with the median errors.
+    """Bars of the fraction of pairs that each method registers, grouped by kind of pair, with the median errors.
 
     Args:
-        kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None where most have no result).
+        kinds: kind, method, and its figures `success` 0..1 and `median_m`, m (None if most pairs have no result).
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -50,7 +50,7 @@ def lines_png(
     panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float | None]]]],
     title: str = "",
 ) -> None:
-    """Panels beside one another, each with a line a name.
+    """Panels side by side, each with one line per name.
 
     Args:
         panels: title of a panel, name of a line, and its values along x and y; None: a gap.
@@ -74,7 +74,7 @@ def lines_png(
 
 
 def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title: str = "") -> None:
-    """Groups of bars, a color a name.
+    """Groups of bars, with one color per name.
 
     Args:
         groups: name of a group, name of a bar, and its length; a group need not have every bar.
@@ -102,11 +102,11 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
 def verdicts_png(
     path: Path | str, panels: Mapping[str, Mapping[str, Mapping[str, tuple[str, float]]]], title: str = ""
 ) -> None:
-    """Tables beside one another whose colors say at one look who was right, and who was wrong without a word.
+    """Tables side by side; the colors show which methods were right, and which were wrong without reporting it.
 
     Args:
         panels: title of a table, name of a row, name of a column, and the verdict (`right`, `said`, `silent`) with the
-            figure to write; rows are those of all tables.
+            figure to write; the rows are those of all tables.
 
     Raises:
         Dpm2Error: the file could not be written.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The geometric SLAM beside KISS-ICP: the same scans, processors and process, in turns."""
+"""The geometric SLAM compared with KISS-ICP: the same scans, processors and process, in turns."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable, record_table
 
 LENGTHS = (10.0, 20.0, 30.0, 40.0, 50.0)
-"""Segments of the KITTI metric, m: the excerpts are too short for those of the benchmark."""
+"""Segments of the KITTI metric, m: the excerpts are too short for the benchmark's own lengths."""
 
-OURS, NO_LOOPS, BASELINE = "dpm2", "dpm2 without loops", "kiss-icp"  # the second does what the third does
+OURS, NO_LOOPS, BASELINE = "dpm2", "dpm2 without loops", "kiss-icp"  # the last two do the same task
 
 _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent", "t_err_percent", "r_err_deg_per_100m")
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One method on one drive, once.
+    """One run of one method on one drive.
 
     Attributes:
-        poses: (N, 4, 4) of the LiDAR; ours as `dpm2 run` writes them, after optimization of the pose graph.
+        poses: (N, 4, 4) of the LiDAR; ours as written by `dpm2 run`, after optimization of the pose graph.
         seconds: (N,) wall time of each frame.
-        cpu_seconds: of all frames and threads; other programs disturb it less.
+        cpu_seconds: of all frames and threads; less affected by other programs.
         stages: (N,) wall time of each stage, s.
-        failed: frames without a registration.
-        states: of each frame; empty where the method has none.
+        failed: number of frames without a registration.
+        states: of each frame; empty if the method has none.
     """
 
     poses: Array
@@ -58,13 +58,13 @@ Method = Callable[[Sequence[Frame]], Trial]
 
 
 def dpm2(options: Options, *more: str) -> Method:
-    """This project's SLAM, its mapper included, with `more` settings."""
+    """This project's SLAM, including its mapper, with `more` settings."""
     settings = settings_of(options, *more)
     return lambda frames: mapped(settings, frames)[0]
 
 
 def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Trial, Mapper]:
-    """Frames through the SLAM: what came out, and the map."""
+    """Process frames with the SLAM; returns the result and the map."""
     slam = make_slam(settings)
     tracked, recorder, seconds = [], TrajectoryRecorder(), np.zeros(len(frames))
     cpu = process_time()
@@ -82,8 +82,8 @@ def mapped(settings: SlamSettings, frames: Sequence[Frame]) -> tuple[Trial, Mapp
 
 
 def kiss_icp(options: Options) -> Method:
-    """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs and times it. It deskews where ours does: scans
-    whose points have times, as those of most bags; KITTI's are deskewed already, and have none.
+    """I. Vizzo et al., "KISS-ICP", RA-L 2023, run and timed as in its own pipeline. It de-skews where ours does: scans
+    whose points have times, as in most bags. KITTI's scans are de-skewed already and have no times.
 
     Raises:
         MissingPackageError: it is not installed.
@@ -104,7 +104,7 @@ def kiss_icp(options: Options) -> Method:
             seconds[i] = perf_counter() - started
             poses[i] = odometry.last_pose
         cpu = process_time() - cpu
-        if deskew:  # then its poses are those at the last points, and the truth is that at the stamps
+        if deskew:  # its poses are then those at the last points, the truth is at the stamps
             poses = at_stamps(poses, [end_of(frame) for frame in frames], [frame.stamp for frame in frames])
         return Trial(poses, seconds, cpu)
 
@@ -112,7 +112,7 @@ def kiss_icp(options: Options) -> Method:
 
 
 def bench_geometric(options: Options) -> Report:
-    """Every method on every drive, `repetitions` times in turns; only processing is timed, the scans are in memory.
+    """Every method on every drive, `repetitions` times in turns; only processing is timed, scans are in memory.
 
     Raises:
         UsageError: there is no drive, or one has no ground truth.
@@ -142,7 +142,7 @@ def bench_geometric(options: Options) -> Report:
 
 
 def summary(truth: Array, trials: Sequence[Trial]) -> dict[str, Any]:
-    """Medians over the repetitions of errors and speed, and the spread of the latter."""
+    """Medians of errors and speed over the repetitions, and the spread of the speed."""
     checked = [evaluate(truth, trial.poses, LENGTHS, failed_frames=trial.failed) for trial in trials]
     fps = np.array([len(trial.seconds) / trial.seconds.sum() for trial in trials])
     seconds = np.concatenate([trial.seconds for trial in trials])
@@ -159,13 +159,13 @@ def summary(truth: Array, trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def _thirds(truth: Array, poses: Array) -> list[float | None]:
-    """APE of each third of the drive alone: an error all along, or a jump of estimate or truth?"""
+    """APE of each third of the drive by itself: distinguishes a steady error from a jump of estimate or truth."""
     edges = np.linspace(0, len(truth), 4).astype(int)
     return [evaluate(truth[a:b], poses[a:b]).ape_rmse_m if b - a > 1 else None for a, b in pairwise(edges.tolist())]
 
 
 def _median(checked: Sequence[Metrics]) -> dict[str, Any]:
-    """Each figure's median; multi-threaded sums may differ in the last digits from run to run."""
+    """The median of each figure; multi-threaded sums may differ in the last digits between runs."""
     medians: dict[str, Any] = {name: getattr(checked[0], name) for name in ("frames", "path_length_m", "segments")}
     for name in ("failed_frames", *_ERRORS):
         values = [getattr(metrics, name) for metrics in checked]
@@ -174,7 +174,7 @@ def _median(checked: Sequence[Metrics]) -> dict[str, Any]:
 
 
 def _compare(methods: dict[str, Any]) -> None:
-    """Add our figures over the baseline's; frames a second pairwise, because neighbors in time share the machine."""
+    """Add the ratios of our figures to the baseline's; frame rates pairwise, since conditions vary over time."""
     if BASELINE not in methods:
         return
     baseline = methods[BASELINE]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every benchmark needs: drives to run on, the same processors for all, and a record of how it was made."""
+"""Common parts of the benchmarks: drives to run on, the same processors for all methods, and the record."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Options:
-    """What `dpm2 bench` was asked for.
+    """Options of `dpm2 bench`.
 
     Attributes:
         sources: KITTI sequences or bags; by default the KITTI excerpt.
-        repetitions: of every method on every drive.
+        repetitions: number of runs of every method on every drive.
         threads: processors that every method may use.
         overrides: `key=value` settings of the SLAM, and of how drives are read.
-        unseen: packed drives of worlds that the network has not seen; None makes some.
-        pairs: of frames of each kind.
-        only: part of a benchmark that has several; None: all that are not in its file yet.
-        out: folder of NAME.json. cache: folder where simulated drives stay for a later run.
+        unseen: packed drives of worlds that the network has not been trained on; None makes some.
+        pairs: number of frame pairs of each kind.
+        only: part of a benchmark that has several; None: all parts that are not in its file yet.
+        out: folder of NAME.json. cache: folder where simulated drives are kept for later runs.
     """
 
     sources: Sequence[Path] = ()
@@ -58,26 +58,26 @@ class Options:
 
 
 def excerpt() -> Path:
-    """Where the KITTI excerpt should be, packed (it holds unpack.py) or in KITTI layout: $DPM2_KITTI, or beside the
+    """Folder of the KITTI excerpt, packed (with unpack.py) or in KITTI layout: $DPM2_KITTI, or a folder next to the
     repository."""
     return Path(os.environ.get("DPM2_KITTI", REPOSITORY.parent / "shared" / "kitti"))
 
 
 def settings_of(options: Options, *more: str) -> SlamSettings:
-    """Settings of the SLAM as asked for, with `more` of the kind `slam.registration=neural`."""
+    """Settings of the SLAM for the options, with `more` settings such as `slam.registration=neural`."""
     return configuration_of(options, *more).slam
 
 
 def configuration_of(options: Options, *more: str) -> Config:
-    """The same, and how drives are read."""
+    """The same, with the settings for reading drives."""
     return load_settings(Config, None, [f"slam.threads={options.threads}", *options.overrides, *more])
 
 
 def requested(options: Options, parts: Collection[str]) -> list[str]:
-    """The part of a benchmark that `--only` names, or all.
+    """The part of a benchmark that `--only` names, else all parts.
 
     Raises:
-        UsageError: it has no such part.
+        UsageError: there is no such part.
     """
     if options.only is None:
         return list(parts)
@@ -87,7 +87,7 @@ def requested(options: Options, parts: Collection[str]) -> list[str]:
 
 
 def installed(methods: Mapping[str, Callable[[], T]]) -> dict[str, T]:
-    """What makes each of the methods, called; those whose package is missing are left out."""
+    """Call the constructor of each method; methods whose package is missing are left out."""
     made: dict[str, T] = {}
     for name, make in methods.items():
         with suppress(MissingPackageError):
@@ -105,13 +105,12 @@ class Report:
 
 @contextmanager
 def drives(options: Options, more: Sequence[Source] = ()) -> Iterator[dict[str, Source]]:
-    """The drives to run on, by name, and `more` after them; an excerpt that is packed is unpacked for as long as the
-    block lasts.
+    """The drives to run on, by name, followed by `more`; a packed excerpt is unpacked for the duration of the block.
 
-    A drive of the name of one before it, such as a second folder `00`, is `00 (2)`.
+    A drive with the same name as an earlier one, such as a second folder `00`, is named `00 (2)`.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there are no drives.
     """
     how = configuration_of(options).input
     if options.sources:
@@ -139,7 +138,7 @@ def truth_of(source: Source) -> Array:
     """True poses (N, 4, 4) of a drive.
 
     Raises:
-        UsageError: it has none.
+        UsageError: the drive has no ground truth.
     """
     if source.poses is None:
         raise UsageError(f"{source.name}: the drive has no ground truth to compare with")
@@ -156,8 +155,8 @@ def _named(sources: Iterable[Source]) -> dict[str, Source]:
 
 @contextmanager
 def processors(number: int) -> Iterator[None]:
-    """Bind this process to `number` processors, so that no library can take more than another."""
-    if not hasattr(os, "sched_setaffinity"):  # not Linux: each method's own thread setting has to do
+    """Bind this process to `number` processors, so that every library has the same number."""
+    if not hasattr(os, "sched_setaffinity"):  # not Linux: only each method's own thread setting applies
         yield
         return
     before = os.sched_getaffinity(0)
@@ -170,7 +169,7 @@ def processors(number: int) -> Iterator[None]:
 
 @contextmanager
 def torch_threads(number: int) -> Iterator[None]:
-    """So many threads for torch while the block lasts."""
+    """Set the number of torch's threads for the duration of the block."""
     import torch
 
     before = torch.get_num_threads()
@@ -182,23 +181,23 @@ def torch_threads(number: int) -> Iterator[None]:
 
 
 def write_report(path: Path, report: Report, options: Options, program: str = "dpm2") -> None:
-    """The results of a benchmark; see `write_record`."""
+    """Write the results of a benchmark; see `write_record`."""
     results = {"overrides": list(options.overrides), **report.results}
     write_record(path, results, program, options.threads)
 
 
 def earlier(path: Path, key: str, **same: Any) -> dict[str, Any]:
-    """What an earlier run left under a key of its JSON; {} if it is not there, is damaged or differs in `same`."""
+    """The value of a key in the JSON of an earlier run; {} if it is missing, damaged, or differs in `same`."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        as_written = json.loads(json.dumps(same))  # where tuples are lists
+        as_written = json.loads(json.dumps(same))  # converts tuples to lists
         return dict(record[key]) if all(record[name] == value for name, value in as_written.items()) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
 def rounded(x: float) -> float:
-    """To four digits."""
+    """Round to four digits."""
     return float(f"{x:.4g}")
 
 

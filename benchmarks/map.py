@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map file: kills at random instants of a real `dpm2 run`, laps of one block, what moving things leave behind."""
+"""The map file: kills at random times of a real `dpm2 run`, laps of one block, and what moving objects leave in it."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ KILLS = 50
 SOURCE_KILLS = 20
 LAPS = 5
 _FRAMES = 120
-_DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, a keyframe, rad and m
+_DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, per keyframe, rad and m
 
-# `dpm2 run`, which says on a pipe when the mapper has taken a keyframe in: what must then be in the file.
+# `dpm2 run` that reports on a pipe when the mapper has added a keyframe, which must then be in the file.
 _CHILD = """
 import os, sys
 from dpm2_core.cli import main
@@ -68,7 +68,7 @@ main(sys.argv[2:])
 
 
 def bench_map(options: Options) -> Report:
-    """50 kills of a drive, and five laps of a block with traffic; of drives that are given 20 kills each."""
+    """50 kills of a drive, and five laps of a block with traffic; for given drives 20 kills each."""
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_map_") as folder:
         if options.sources:
             given = {str(path): crashes(Path(folder) / str(n), options, path) for n, path in enumerate(options.sources)}
@@ -79,10 +79,10 @@ def bench_map(options: Options) -> Report:
 
 
 def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[str, Any]:
-    """Drives that are killed at random instants and resumed until they end, beside one that is left alone.
+    """Drives that are killed at random times and resumed until they end, compared with an uninterrupted one.
 
     Args:
-        drive: with ground truth; None simulates a short one, which is driven without the network.
+        drive: a drive with ground truth; None simulates a short one, which is run without the network.
     """
     command, kills_wanted = ["run", "--out", str(folder / "out")], SOURCE_KILLS
     if drive is None:
@@ -110,7 +110,7 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
             added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0, 0.4 * duration)))
             if added is not None:
                 break
-            finals.append(path)  # it came to its end before the kill: the next drive begins
+            finals.append(path)  # it ended before the kill: start the next drive
             path = folder / f"killed{len(finals)}.dpm2map"
             before = 0
         result = check_map(path) if path.exists() else None
@@ -124,7 +124,7 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
         "keyframes": _keyframes(alone),
         "kills": len(kills),
         "maps_that_open": sum(kill["opens"] for kill in kills),
-        # Of the keyframes that the mapper had taken in; the one in flight is not among them, and may be there.
+        # Of the keyframes that the mapper had added; one that was being added is not counted, but may be in the file.
         "most_keyframes_lost": max(max(kill["lost"], 0) for kill in kills),
         "keyframes_in_flight_saved": sum(kill["lost"] < 0 for kill in kills),
         "drives": len(finals),
@@ -134,7 +134,7 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
 
 
 def _run(arguments: list[str], kill_after: float | None) -> int | None:
-    """Run `dpm2`; keyframes taken in before it was killed, so many s after its imports; None if it ended by itself.
+    """Run `dpm2` and kill it some s after its imports; returns the keyframes added, or None if it ended by itself.
 
     Raises:
         Dpm2Error: it failed.
@@ -167,7 +167,7 @@ def _keyframes(path: Path) -> int:
 
 
 def _ape(path: Path, truth: Array) -> float:
-    """Of the keyframes of a map, m, those that a resumed run made twice counted once."""
+    """APE of the keyframes of a map, m; those that a resumed run made twice are counted once."""
     with MapStore.open(path) as store:
         data = load_map(store, descriptors=False)
     rows = {keyframe.index: node for node, keyframe in enumerate(data.keyframes)}
@@ -175,7 +175,7 @@ def _ape(path: Path, truth: Array) -> float:
 
 
 def bench_laps(folder: Path, options: Options) -> dict[str, Any]:
-    """Laps of one block, other traffic each time: growth of the map, and what the traffic leaves in it."""
+    """Laps of one block with different traffic: growth of the map, and what the traffic leaves in it."""
     settings = load_settings(Config, None, ["slam.loops.descriptors=false", *options.overrides]).slam
     world = build_world("loop", "city", seed=3, length=250.0)
     path, growth = folder / "laps.dpm2map", []
@@ -230,7 +230,7 @@ def _lap_row(mapper: Mapper, path: Path, lap: int) -> dict[str, Any]:
 
 
 def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[str, float]:
-    """Fraction of the points of moving things in the map before and after, of them removed, of static ones removed."""
+    """Share of points on moving objects in the map before and after; share removed of these, and of static points."""
     own = np.flatnonzero(data.clouds.own).tolist()
     masks = {}
     for node in own:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resident memory of the SLAM over a long drive: whether it levels off."""
+"""Resident memory of the SLAM over a long drive, to see whether it levels off."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def bench_memory(options: Options) -> Report:
     """Run the SLAM over each drive, read frame by frame, and sample the resident set every 50 frames.
 
     Raises:
-        UsageError: no drive was given; the KITTI excerpt is too short to say anything.
+        UsageError: no drive was given; the KITTI excerpt is too short.
     """
     if not options.sources:
         raise UsageError("memory: give --source with a long drive; `dpm2 sim DIR --frames 2000 --no-images` makes one")
@@ -40,7 +40,7 @@ def bench_memory(options: Options) -> Report:
 
 
 def levelling(samples: list[tuple[int, float]]) -> dict[str, Any]:
-    """Growth of (frame, MB) samples over the second half, by a straight line, and over the whole."""
+    """Growth of (frame, MB) samples: linear fit over the second half, and values at start, half and end."""
     frames, megabytes = np.array(samples, np.float64).T
     late = frames >= frames[-1] / 2
     slope = float(np.polyfit(frames[late], megabytes[late], 1)[0]) if late.sum() > 1 else None

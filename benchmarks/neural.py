@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network: pairs of unseen synthetic and of real frames, odometry, and speed, beside classical methods."""
+"""The network: pairs of unseen synthetic and real frames, odometry, and speed, compared with classical methods."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ Part = Callable[[DeepPointMap2, Options], dict[str, Any]]
 
 
 def bench_neural(options: Options) -> Report:
-    """Part after part, each written to the JSON when it is there; a later run with the same weights, options and drives
-    adds the rest.
+    """Run the parts one by one; each is written to the JSON when it is complete. A later run with the same weights,
+    options and drives adds the missing parts.
 
     Raises:
         UsageError: no weights, no drive, one without ground truth, or no such part.
@@ -85,10 +85,10 @@ def bench_neural(options: Options) -> Report:
 
 
 def _options(options: Options) -> dict[str, Any]:
-    """What all parts of a record have in common: those of other options are no rows of the same tables."""
+    """Properties common to all parts of a record: parts with other options do not belong in the same tables."""
     return {
         "sources": [path.name for path in options.sources],
-        "unseen": options.unseen and options.unseen.name,  # a record names no folders of a machine
+        "unseen": options.unseen and options.unseen.name,  # a record must not name folders of a machine
         "content": _content(options),
         "overrides": list(options.overrides),
         "repetitions": options.repetitions,
@@ -98,8 +98,8 @@ def _options(options: Options) -> dict[str, Any]:
 
 
 def _content(options: Options) -> dict[str, str]:
-    """What the drives and worlds hold: others may have their names. Where there are none, the parts that want them say
-    so."""
+    """Digests of the drives and worlds: another one may have the same name. If some are missing, the parts that need
+    them report it."""
     found: dict[str, str] = {}
     with suppress(UsageError), drives(options) as sources:
         found |= {name: digest_of(source) for name, source in sources.items()}
@@ -117,7 +117,7 @@ def _weights(name: str) -> dict[str, Any]:
 
 
 def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any]) -> Part:
-    """A part that asks the same of every drive."""
+    """A part that runs the same function on every drive."""
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -134,8 +134,8 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
 
 
 def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Near pairs by the network, and refined by the points; those 10 m apart or more by every method; none with a
-    prior. The network's errors are also stated against poses that the points have fitted."""
+    """Near pairs with the network, alone and refined by point-to-plane registration; pairs 10 m apart or more with all
+    methods; none with a prior. The network's errors are also given against poses fitted with the points."""
     methods: dict[str, PairMethod] = {
         name: by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
         for name in ("neural", "refined", "geometric")
@@ -149,7 +149,7 @@ def real_pairs(poses: Array, frames: list[Frame], network: DeepPointMap2, option
 
 
 def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """As `dpm2 run` does it, by the network, refined and by the points alone, and KISS-ICP."""
+    """Odometry as in `dpm2 run`, with the network, refined and geometric registration, and KISS-ICP."""
     methods: dict[str, Method] = {
         name: dpm2(options, f"slam.registration={name}") for name in ("neural", "refined", "geometric")
     }
@@ -166,7 +166,7 @@ def odometry(poses: Array, frames: list[Frame], network: DeepPointMap2, options:
 
 
 def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Encode and register, raw points to pose, by stages; KISS-ICP in turns with it, and what the camera adds."""
+    """Encode and register, raw points to pose, by stages; alternating with KISS-ICP; and the camera's added time."""
     frames = frames[:60]
     peers, rounds = installed({BASELINE: partial(kiss_icp, options)}), []
     for _ in range(options.repetitions):
@@ -184,7 +184,7 @@ def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Op
 
 
 def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, Any]:
-    """Time of each stage from raw points to a pose, frame to frame, and the bytes of a frame's descriptors."""
+    """Time of each stage from raw points to a pose, frame to frame, and the size of a frame's descriptors, bytes."""
     encoder, points = network.encoder, network.settings.points
     clocks, before, size = [], None, 0
     for frame in frames:
@@ -219,4 +219,4 @@ PARTS: Mapping[str, Part] = {
     "reference": repeated,
     "speed": _of_drives(speed),
 }
-"""By the name that `--only` and the JSON share."""
+"""Parts by name, as in `--only` and the JSON."""

@@ -12,7 +12,7 @@ from dpm2_core.tables import FigureTable, record_table
 
 
 def view(parts: Mapping[str, Any]) -> Group:
-    """Every part that was measured; what could not be is noted below its table."""
+    """Tables of every measured part; what could not be measured is noted below its table."""
     shown: list[RenderableType] = []
     for name, title in (
         ("synthetic", "Unseen synthetic worlds"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of frames registered without any prior: errors of each method against the truth."""
+"""Pairs of frames registered without any prior: errors of each method against the ground truth."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 
 APART = {f"{low}-{low + 10} m": (low, low + 10) for low in (10, 20, 30, 40)}
-"""Distances of the far pairs, m, by their name."""
+"""Distances of the far pairs, m, by name."""
 MANY = 10
-"""Times as many pairs where no odometry asks for each: of frames that are described anyway they cost little, and
-medians of 45 pairs differ by a third."""
+"""Factor on the number of pairs if no odometry is run on each: described frames cost little more, and medians of 45
+pairs differ by a third."""
 
 PairMethod = Callable[[Frame, Frame], Array | None]
 """T_first_second (4, 4) of two frames; None: no result."""
 
 Pairs = Sequence[tuple[int, int]]
 FITTED = "neural, against fitted poses"
-"""The errors of `neural` against poses that the scans themselves have corrected: see `fitted_poses`."""
-_MOVED = 1.0, 3.0  # m, deg: what moves farther has found something else
+"""The errors of `neural` against poses corrected with the scans: see `fitted_poses`."""
+_MOVED = 1.0, 3.0  # m, deg: a larger correction is a wrong match
 
 
 def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
-    """Positions of pairs in a drive, at most so many of each kind, evenly spread.
+    """Positions of pairs in a drive, at most `most` of each kind, evenly spread.
 
     Args:
         poses: (N, 4, 4) truth; pairs with an unknown pose are left out.
@@ -60,8 +60,8 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
 
 
 def by_registration(registration: ScanRegistration) -> Callable[..., Array | None]:
-    """A `PairMethod`: what the odometry uses, with a map of one frame and the identity as prediction, or a third
-    argument; a frame is prepared once."""
+    """A `PairMethod`: the registration of the odometry, with a map of one frame. The prediction is the identity, or a
+    third argument; each frame is prepared once."""
     prepared: dict[int, Scan] = {}
 
     def scan_of(frame: Frame) -> Scan:
@@ -74,7 +74,7 @@ def by_registration(registration: ScanRegistration) -> Callable[..., Array | Non
         map_of_first.update(scan_of(first), np.eye(4))
         start = Prediction([np.eye(4)], widen=2.0)
         if T_first_second is not None:
-            start = Prediction([T_first_second], unique=True)  # from afar fewer of a scan's points fit
+            start = Prediction([T_first_second], unique=True)  # at a distance fewer points of a scan fit
         result = map_of_first.register(scan_of(second), start)
         return result.T_target_source if result.ok else None
 
@@ -99,7 +99,7 @@ def gicp_from_identity(threads: int) -> PairMethod:
 
 
 def kiss_from_identity(threads: int) -> PairMethod:
-    """KISS-ICP on a drive of two frames: with no motion known, it starts at the identity.
+    """KISS-ICP on a drive of two frames: without a known motion, it starts at the identity.
 
     Raises:
         MissingPackageError: it is not installed.
@@ -111,16 +111,16 @@ def kiss_from_identity(threads: int) -> PairMethod:
         odometry.add(second)
         return np.asarray(odometry.poses()[-1])
 
-    KissIcp(threads, deskew=False)  # it is installed
+    KissIcp(threads, deskew=False)  # raises an error if it is not installed
     return register
 
 
 def fitted_poses(registration: ScanRegistration, frames: Sequence[Frame], pairs: Pairs, poses: Array) -> list[Array]:
-    """T_first_second (4, 4) of each pair by the points, started at the poses (N, 4, 4); where the points find nothing
-    there, as the poses have it.
+    """T_first_second (4, 4) of each pair by point-to-plane registration, started at the poses (N, 4, 4); if that fails,
+    or leads too far away, the original pose.
 
-    KITTI's poses err by centimeters, and by 1.7 degrees over a corner of 00. So benchmarks of registration correct them
-    by the scans (C. Choy, J. Park, V. Koltun, "Fully Convolutional Geometric Features", ICCV 2019).
+    KITTI's poses have errors of centimeters, and of 1.7 degrees over a corner of 00. Registration benchmarks therefore
+    correct them with the scans (C. Choy, J. Park, V. Koltun, "Fully Convolutional Geometric Features", ICCV 2019).
     """
     register, out = by_registration(registration), list[Array]()
     for a, b in pairs:
@@ -132,7 +132,7 @@ def fitted_poses(registration: ScanRegistration, frames: Sequence[Frame], pairs:
 
 
 def pair_errors(found: Sequence[Array | None], truth: Sequence[Array | None]) -> Array:
-    """(len(found), 2) distance, m, and angle, deg, of poses from others; inf where there is none."""
+    """(len(found), 2) distance, m, and angle, deg, between poses and other poses; inf if one is missing."""
     errors = np.full((len(found), 2), np.inf)
     for row, T, other in zip(errors, found, truth, strict=True):
         if T is not None and other is not None:
@@ -141,7 +141,7 @@ def pair_errors(found: Sequence[Array | None], truth: Sequence[Array | None]) ->
 
 
 def summarized(errors: Array) -> dict[str, float | int | None]:
-    """Median errors and success rate of (N, 2) errors, m and deg; None where there is nothing to say."""
+    """Median errors and success rate of (N, 2) errors, m and deg; None if undefined."""
     if not len(errors):
         return {"pairs": 0, "median_m": None, "median_deg": None, "success": None}
     median = np.median(errors, axis=0)
@@ -157,7 +157,7 @@ def all_pairs(
     most: int,
     points: ScanRegistration,
 ) -> dict[str, dict[str, Any]]:
-    """Each kind of pair, at most so many of it, by its methods; `neural` against poses fitted by `points`, too."""
+    """Each kind of pair, at most `most` of it, with its methods; `neural` also against poses fitted by `points`."""
     out: dict[str, dict[str, Any]] = {}
     for kind, pairs in pairs_of(poses, most).items():
         truth = [se3.inverse(poses[a]) @ poses[b] for a, b in pairs]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What our deviations from DeepPointMap2's SLAM are worth: each of its ways put into ours, and all of them together."""
+"""Effect of our deviations from DeepPointMap2's SLAM: each of its methods put into ours, and all of them together."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ WAYS: dict[str, Sequence[str]] = {
 }  # fmt: skip
 _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m", "final_drift_percent")
 _LAPS = 1.35
-"""So much of a lap is driven in the synthetic suburb: the last third shows places seen before..."""
+"""Laps driven in the synthetic suburb: the last third revisits earlier places..."""
 _EVERY = 2
-"""...with so many steps of 0.5 m between two scans."""
+"""...with this many steps of 0.5 m between two scans."""
 
 
 def bench_paper(options: Options) -> Report:
-    """Every way on every drive, once, with the network alone and without images; `--only` chooses one way.
+    """Every variant on every drive, once, with the network alone and without images; `--only` chooses one variant.
 
     Raises:
         UsageError: there is no drive, or one has no ground truth.
@@ -61,7 +61,7 @@ def bench_paper(options: Options) -> Report:
 
 
 def lap() -> SimulatedDrive:
-    """Round a block, and on into the street where it began."""
+    """A drive around a block, continuing into the street where it began."""
     drive = SimulatedDrive("loop", "suburb", 950_000, "suburb")
     way = arc_lengths(drive.poses[:, :3, 3])
     again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)

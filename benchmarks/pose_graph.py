@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose graphs with wrong loops: what is kept, how good the poses are, how long it takes, and what odometry feels."""
+"""Pose graphs with wrong loops: loops kept, quality of the poses, solving time, and effect on a running odometry."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
 from dpm2_core.slam.graph.worker import GraphWorker
 from dpm2_core.tables import FigureTable, record_table
 
-_STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the made drive's odometry
+_STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the generated drive's odometry
 _LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
-_RIGHT = (5.0, np.radians(5.0))  # m, rad: a loop that is farther from the truth is wrong
-_FRAMES = 150  # of the loop that a solver disturbs
+_RIGHT = (5.0, np.radians(5.0))  # m, rad: a loop with a larger error is wrong
+_FRAMES = 150  # of the processing loop that a solver disturbs
 _INJECTED = (60, 120, 200, 300)
 _Mask = NDArray[np.bool_]
 
 
 def bench_pose_graph(options: Options) -> Report:
-    """KITTI 00 with detected loops at three thresholds, and a made drive of 5,000 poses with injected wrong loops.
+    """KITTI 00 with detected loops at three thresholds, and a generated drive of 5,000 poses with injected wrong loops.
 
     Raises:
         UsageError: there are no KITTI pose graphs.
@@ -60,16 +60,16 @@ def bench_pose_graph(options: Options) -> Report:
 
 
 def are_right(truth: Array, graph: GraphData) -> _Mask:
-    """(E,) loops within 5 m and 5 degrees of the true poses."""
+    """(E,) whether each loop is within 5 m and 5 degrees of the true poses."""
     a, b = graph.ends.T
     off = se3.inverse(graph.T_from_to) @ se3.inverse(truth[a]) @ truth[b]
     return np.asarray((np.linalg.norm(off[:, :3, 3], axis=1) < _RIGHT[0]) & (se3.angle(off) < _RIGHT[1]))
 
 
 def made_drive(wrong: int, count: int = 5000, right: int = 200) -> tuple[Array, GraphData]:
-    """True poses of a drive that revisits itself, and its graph with noise as its covariances say.
+    """True poses of a drive that revisits its path, and its graph with noise according to its covariances.
 
-    Wrong loops say that two places more than 20 m apart are one, as look-alike places do.
+    Wrong loops connect positions more than 20 m apart, as look-alike places do.
     """
     rng = np.random.default_rng(0)
     u = 2 * np.pi * np.arange(count) / 1250
@@ -100,7 +100,7 @@ def made_drive(wrong: int, count: int = 5000, right: int = 200) -> tuple[Array, 
 
 
 def disturbance(graph: GraphData) -> dict[str, Any]:
-    """p95 of a 10 Hz loop of 30 ms of work alone, and while a process solves the graph over and over."""
+    """p95 of a 10 Hz loop with 30 ms of work, alone and while a process solves the graph repeatedly."""
     work = np.random.default_rng(0).normal(size=(40_000, 3))
 
     def loop(worker: GraphWorker | None) -> tuple[list[float], int]:
@@ -116,7 +116,7 @@ def disturbance(graph: GraphData) -> dict[str, Any]:
             time.sleep(max(0.0, 0.1 - taken[-1]))
         return taken, solved
 
-    loop(None)  # warm
+    loop(None)  # warm-up
     alone, _ = loop(None)
     worker = GraphWorker()
     try:

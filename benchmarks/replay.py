@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.replay BAG`: slam_node and bag_player started together; what becomes of each cloud."""
+"""`python -m benchmarks.replay BAG`: starts slam_node and bag_player together and accounts for each cloud."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bench(
     bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap, such as that of `make demo`")],
     times: Annotated[int, typer.Option(min=1, help="Replays of each kind.")] = 5,
 ) -> int:
-    """Play a bag at its own speed, at twice that, and in lockstep. Exit code 1 if a cloud is not accounted for."""
+    """Play a bag at its own rate, at twice that, and in lockstep. Exit code 1 if a cloud is not accounted for."""
     figures = ("sent", "processed", "dropped", "lost", "sum", "playing s")
     title = f"{bag}, node and player started together"
     table = FigureTable(title, names=["played"], figures=figures, text=["remarks"])
@@ -45,7 +45,7 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
     """One replay into a node with its defaults, which saves nothing.
 
     Returns:
-        Clouds that the player sent; those that the node knows of, processed, dropped, lost; what else it says of them;
+        Clouds sent by the player; clouds counted by the node: all, processed, dropped, lost; its further remarks;
         seconds from the first message to the last.
 
     Raises:
@@ -59,7 +59,7 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
         player = start("bag_player", [str(bag), *played, "--log", str(times)], environment, logs / "bag_player")
         try:
             code = player.wait()
-            time.sleep(3.0)  # the queue of the node: ten clouds
+            time.sleep(3.0)  # for the node's queue: ten clouds
         finally:
             player.kill()
             ended = stop(node)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process has in memory. Apart: what is measured should not be what was imported to measure it."""
+"""Memory of a process. In a module of its own, so that importing it adds little to the measured memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def resident_mb() -> float:
 
 
 def peak_mb() -> int:
-    """The largest that it has had since the process began, MB."""
+    """Largest resident set since the process began, MB."""
     return _kilobytes("VmHWM") // 1024
 
 
