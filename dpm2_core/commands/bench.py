@@ -45,7 +45,7 @@ def bench(
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.
 
-    An option that a benchmark has no use for is an error, which names those that it has.
+    An option that a benchmark does not use is an error. The message lists the options that it uses.
     """
     _find_benchmarks()
     from benchmarks import check_options, run  # imports the whole SLAM
@@ -68,10 +68,10 @@ def bench(
 
 
 def _find_benchmarks() -> None:
-    """Make the package `benchmarks` importable: of the checkout that this code is in, or of the working directory.
+    """Make the package `benchmarks` importable, from the checkout of this code or from the working directory.
 
     Raises:
-        UsageError: there is none; an installed dpm2 comes without.
+        UsageError: neither has it; an installed dpm2 does not include it.
     """
     for root in (Path(__file__).resolve().parents[2], Path.cwd()):
         if (root / "benchmarks" / "harness.py").is_file():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 config`: what can be set, and what is."""
+"""`dpm2 config`: the settings and their values."""
 
 from __future__ import annotations
 

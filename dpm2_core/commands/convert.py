@@ -24,8 +24,8 @@ def convert(
 ) -> None:
     """Convert a recording to a rosbag2 (MCAP) folder.
 
-    KITTI odometry gets the topics of kitti2bag, other recordings /points, /camera/image_raw, /imu, ...; ground truth
-    is included where there is some.
+    KITTI odometry is written with the topics of kitti2bag, other recordings with /points, /camera/image_raw, /imu, ...
+    Ground truth is included if available.
     """
     from dpm2_core.data.convert import convert as write_bag  # rosbags is slow to import for the other commands
     from dpm2_core.data.open import open_source
@@ -33,7 +33,7 @@ def convert(
     from dpm2_core.data.source import parse_range
     from dpm2_core.slam.settings import Config
 
-    input_settings(settings or [])  # of the SLAM nothing is of use here
+    input_settings(settings or [])  # settings of the SLAM have no effect here: reject them
     chosen, span = load_settings(Config, config, settings or []).input, parse_range(frames)
     with counted(f"{src} -> {out}") as progress:
         notes = write_bag(open_source(src, chosen), out, span, zstd, overwrite, progress)

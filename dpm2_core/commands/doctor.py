@@ -22,7 +22,7 @@ def doctor(
 ) -> None:
     """Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then ten seconds of SLAM.
 
-    The exit code is 1 where something does not work; what is only missing or slow is said, and is no error.
+    The exit code is 1 if something does not work. What is only missing or slow is reported, but is not an error.
     """
     from dpm2_core.evaluation.machine import Finding, check_machine
     from dpm2_core.evaluation.self_test import self_test  # the self-test imports everything

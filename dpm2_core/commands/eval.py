@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`dpm2 eval`: evaluate a trajectory file against ground truth, and print how it was evaluated.
 
-What does the work is imported by the function that needs it: `--help` and the shell's completion are there at once.
+Modules that do the work are imported in the functions that need them, so that `--help` and shell completion are fast.
 """
 
 from __future__ import annotations
@@ -77,8 +77,10 @@ def eval_(
 
 
 def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
-    """True poses of all frames of a drive, NaN where there is none, as `dpm2 run` writes its own: by stamp, or by frame
-    number; of the LiDAR, or of the left camera where its place is known. And which of these, in words."""
+    """Ground truth of all frames of a drive, NaN for frames without a pose, and the name of the sensor.
+
+    As in the files that `dpm2 run` writes, keys are stamps or frame numbers, and poses those of the LiDAR, or of the
+    left camera if its extrinsics are known."""
     import numpy as np
 
     from dpm2_core.data.open import open_source
@@ -96,17 +98,17 @@ def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tu
     poses = camera_poses(source.poses, camera)
     sensor = "LiDAR" if camera is None else "left camera"
     if stamped:
-        stamps = getattr(source, "stamps", None)  # some sources have them with their frames alone
+        stamps = getattr(source, "stamps", None)  # some sources have stamps only in their frames
         stamps = [frame.stamp for frame in source.frames()] if stamps is None else stamps
         return Trajectory(poses, np.array(stamps, np.int64), "tum"), sensor
-    numbers = getattr(source, "numbers", None)  # those in the file names
+    numbers = getattr(source, "numbers", None)  # numbers in the file names
     numbers = np.arange(len(source)) if numbers is None else numbers
-    # Frames without a pose stay: a file with a line for each frame is matched line by line.
+    # Keep frames without a pose: a file with a line for each frame is matched line by line.
     return Trajectory(poses, numbers, "kitti-indexed"), sensor
 
 
 def in_camera_frame(trajectory: Trajectory, calib: Path) -> Trajectory:
-    """LiDAR poses to poses of the left camera; the world stays, which alignment makes up for."""
+    """Convert LiDAR poses to poses of the left camera. The world frame is kept; alignment compensates for that."""
     from dpm2_core.data.kitti import read_calib
     from dpm2_core.data.trajectory import Trajectory
     from dpm2_core.geometry import se3

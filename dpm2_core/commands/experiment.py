@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 experiment`: the tables and figures of the papers, each by one command."""
+"""`dpm2 experiment`: the tables and figures of the papers, each made by one command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def experiment(
 ) -> None:
     """Make a table or figure of the papers on your copy of the data, theirs beside it.
 
-    What was stopped goes on where it was: every part (a method on a sequence, a training) is done once.
+    A stopped experiment continues where it was: every part (a method on a sequence, a training) is done only once.
     """
     from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
     from dpm2_core.experiments.request import Request

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 finetune`: the network on a user's own drives and LiDAR, without ground truth."""
+"""`dpm2 finetune`: fine-tune the network on a user's own drives and LiDAR, without ground truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def finetune(
         data["content of rehearsal"] = packed_digest(open_packed(Path(chosen.rehearsal)))
     sources = [open_source(path, chosen.input) for path in src]  # before anything is written
     begin_or_resume(out, resume, chosen, [start], data)
-    slam = SlamSettings(threads=torch.get_num_threads())  # of the whole process: the training is to have them, too
+    slam = SlamSettings(threads=torch.get_num_threads())  # applies to the process, training included
     console = Console(stderr=True)
     with console.status("") as status:
         for text in finetune_data.prepare(sources, chosen, network_settings(start), slam, out, status.update):

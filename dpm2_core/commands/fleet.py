@@ -47,9 +47,9 @@ def run(
     settings: Overrides = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Run the SLAM on many drives; each has a folder of its own, with the files of `dpm2 run` and its map.
+    """Run the SLAM on many drives. Each drive has its own folder with the files of `dpm2 run` and its map.
 
-    What is whole is not done again: the same call goes on with what was stopped or has failed.
+    Complete drives are not run again: the same call runs only those that were stopped or have failed.
     """
     parts = parts_of(read_drives(drives), config, settings or ())
     _carry_out(parts, out, Cluster(address, workers), json_file, partial(summary_table, str(out)))
@@ -67,9 +67,9 @@ def merge(
     settings: Overrides = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Join the drives of a folder into one map, by the places that they share, wherever they are.
+    """Join the drives of a folder into one map by the places that they share. No initial poses are needed.
 
-    Drives that came since the last call are added to the map that is there, at the cost of what they touch.
+    Drives that are new since the last call are added to the existing map. The cost depends on what they touch there.
     """
     from dpm2_core.fleet.merge import merge as merged_map
 
@@ -98,7 +98,7 @@ def sweep(
     config: ConfigFile = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Run the same drives with other settings, and show their figures in one table, a row for each combination."""
+    """Run the same drives with each combination of settings, and show the figures in a table, a row per combination."""
     from dpm2_core.fleet.sweep import sweep_parts, sweep_table, variants
 
     values = variants(settings)
@@ -113,10 +113,10 @@ def _carry_out(
     json_file: Path | None,
     table: Callable[[Sequence[Outcome]], FigureTable],
 ) -> None:
-    """Do the parts and say what came out.
+    """Run the parts and show their outcomes.
 
     Raises:
-        Dpm2Error: some failed.
+        Dpm2Error: one or more parts failed.
     """
     with TerminalView(Console(stderr=True)) as view:
         outcomes = carry_out(parts, out, cluster, view)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 run SRC --localise MAP`: a recording in a map that stays as it is, byte for byte."""
+"""`dpm2 run SRC --localise MAP`: localize a recording in a map, which stays as it is, byte for byte."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def parse_hint(text: str) -> Array:
     """`x,y,yaw` (m, m, degrees) to T_map_lidar (4, 4).
 
     Raises:
-        UsageError: it is something else.
+        UsageError: the text has another form, or a number is not finite.
     """
     try:
         x, y, yaw = (float(part) for part in text.split(","))
@@ -41,10 +41,10 @@ def parse_hint(text: str) -> Array:
 
 
 class LocalizationReport:
-    """What became of each frame.
+    """States, poses and events of the frames of a localization run.
 
     Attributes:
-        stamps: ns, of the frames whose place in the map was known. poses: T_map_lidar (4, 4) of each of them.
+        stamps: of the frames whose pose in the map was known, ns. poses: T_map_lidar (4, 4) of each of them.
     """
 
     def __init__(self, localizer: Localizer) -> None:
@@ -55,11 +55,11 @@ class LocalizationReport:
         self._frames: Counter[State] = Counter()
         self._first: int | None = None
         self._events: list[dict[str, Any]] = []
-        self._reason = ""  # why the last keyframe was not found, where none has been
+        self._reason = ""  # why the last keyframe was not localized, as long as none was
         self._unreadable = ""  # why the map could not be read, the first time
 
     def add(self, result: SlamResult) -> str:
-        """Take in the result of the next frame; returns the event that it is, or an empty text."""
+        """Add the result of the next frame. Returns a line about its event, or an empty text if there is none."""
         before, self._before = self._before, self._localizer.state
         tracked, located = result.odometry, None if result.map is None else result.map.located
         state = State.LOST if tracked.state is State.LOST else self._localizer.state
@@ -90,8 +90,8 @@ class LocalizationReport:
         return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
 
     def summary(self) -> dict[str, Any]:
-        """Counts of frames by state, how many passed until the first result (None: there was none, and why), events;
-        why the map could not be read where it could not."""
+        """Content of localisation.json: frames by state, frames until the first localization (None if there was none,
+        with the reason), events, and why the map could not be read, if so."""
         return {
             "frames": self._frames.total(),
             "frames_until_found": self._first,
@@ -105,11 +105,11 @@ class LocalizationReport:
 
 
 def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Config) -> tuple[str, dict[str, Any]]:
-    """The drive through a map: localisation.json, trajectory.tum of the frames whose place was known, config.yaml.
+    """Localize a drive in a map and write localisation.json, trajectory.tum (frames with a known pose) and config.yaml.
 
-    Files that only a run that makes a map has are removed.
+    Files that only a mapping run writes are removed from the folder.
 
-    Returns what came out as a sentence, and the content of localisation.json.
+    Returns the outcome as a sentence, and the content of localisation.json.
     """
     localizer, name = drive.slam.localizer, drive.source.name
     assert localizer is not None

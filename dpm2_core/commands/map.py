@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 map`: look into map files, write them in other formats, join, thin out and mend them.
+"""`dpm2 map`: show, export, merge, prune, check and repair map files; optimize pose graphs.
 
-What does the work is imported by the function that needs it: `--help` and the shell's completion are there at once.
+Modules that do the work are imported in the functions that need them, so that `--help` and shell completion are fast.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MapFile = Annotated[Path, typer.Argument(metavar="MAP", help="Map file, as `dpm2
 
 @app.command()
 def info(path: MapFile, json_file: JsonFile = None) -> None:
-    """What is in a map."""
+    """Show what a map contains."""
     from dpm2_core.commands.map_figures import info_table
 
     show(*info_table(path), json_file)
@@ -81,9 +81,9 @@ def prune(
     path: MapFile,
     out: Annotated[Path, typer.Option(help="New map file.")],
 ) -> None:
-    """Take out the keyframes that revisits made redundant; what they constrain and where they were stays.
+    """Remove the keyframes that revisits made redundant. Their constraints and their poses are kept.
 
-    Redundant is one within 3 m (a meter of height counts for four) and 30 degrees of an older one.
+    A keyframe is redundant if it is within 3 m (a meter of height counts as four) and 30 degrees of an older one.
     """
     from dpm2_core.slam.mapping.prune import prune as pruned
     from dpm2_core.slam.mapping.prune import redundant_nodes
@@ -105,7 +105,7 @@ def check(
     path: MapFile,
     recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
 ) -> None:
-    """Look for damage: database, checksum of every row, dangling edges, invalid poses."""
+    """Check a map for damage: database, checksum of every row, dangling edges, invalid poses."""
     from dpm2_core.slam.mapping.parts import georeferenced
     from dpm2_core.slam.store.check import check_map
 

@@ -35,7 +35,7 @@ def export_map(
     """Write a map file in another format; the arguments are the options of the command.
 
     Raises:
-        UsageError: they do not go together, or the map has nothing of the kind.
+        UsageError: options that exclude each other, or the map has no data of that kind.
     """
     if tiles is not None:
         if format or voxel is not None or resolution is not None:
@@ -74,14 +74,14 @@ def _loaded(store: MapStore) -> MapData:
 
 
 def _tied(data: MapData, out: Path) -> MapData:
-    """What is tied to the first keyframe; says what is not, and is left out of a file."""
+    """The part of a map that is tied to the first keyframe. Prints a note about keyframes that the file lacks."""
     tied = first_part(data)
     _say_without(out, ways(data), ways(tied), "no loop ties them to the first keyframe")
     return tied
 
 
 def _say_without(out: Path, drives: Iterable[Way], written: Iterable[Way], reason: str) -> None:
-    """Say which keyframes of the drives are not in a file, which has those of `written`."""
+    """Note, per session, how many keyframes of `drives` are missing in a file that contains those of `written`."""
     whole, left = Counter[tuple[str, int]](), Counter[tuple[str, int]]()
     for count, some in ((whole, drives), (left, written)):
         for way in some:
@@ -124,7 +124,7 @@ def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
         note(f"{out}: {why}")
 
 
-_STEEP = 10.0  # degrees that the ground of a whole map may be tilted against the place where it begins
+_STEEP = 10.0  # degrees: largest tilt of the ground of a whole map against the frame at its start
 _SPACING = {"voxel": 0.3, "resolution": 0.1, "": 0.0}
 """Default of each option that is a spacing, m."""
 _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
@@ -138,7 +138,7 @@ _EXPORTS: dict[str, tuple[Callable[[MapData, Path, float], None], str]] = {
     "geojson": (lambda data, out, _: _export_geojson(data, out), ""),
     "g2o": (lambda data, out, _: graph_of(data).write_g2o(out), ""),
 }
-"""How each kind is written, and the option that is its spacing."""
+"""Function that writes each kind, and the option for its spacing."""
 _ENDINGS = {
     ".ply": "ply", ".pcd": "pcd", ".las": "las", ".yaml": "occupancy", ".pgm": "occupancy", ".tum": "tum",
     ".g2o": "g2o", ".geojson": "geojson", ".html": "html",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a map: the figures of `dpm2 map info`, its pose graph, and what a file of it lacks."""
+"""Content of a map: the figures of `dpm2 map info`, its pose graph, and what is missing in its file."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from dpm2_core.tables import FigureTable
 
 
 def say_what_is_missing(store: MapStore) -> None:
-    """Say that the last keyframes of a map may be in a file that is no longer beside it."""
+    """Print a note if the last keyframes of a map may be in a file that is no longer next to it."""
     if missing := missing_log(store.path):
         note(f"{store.path}: {missing}")
 
 
 def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
-    """What is in a map, for people and as figures."""
+    """Content of a map, as a table and as figures."""
     with MapStore.open(path) as store:
         say_what_is_missing(store)
         data = load_map(store, descriptors=False)
@@ -90,10 +90,10 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
 
 
 def _georeference_figures(data: MapData) -> dict[str, Any] | None:
-    """Where on Earth the map is, with what certainty; None where that is not known.
+    """Pose of the map on Earth, with standard deviations; None if it is not known.
 
-    The certainty is that of the whole graph, which is built for it: 0.8 s for 2,000 keyframes with a fix each. A file
-    that had it would have to have it anew with every keyframe.
+    The covariance is that of the whole graph, which is built for it: 0.8 s for 2,000 keyframes with a fix each. It is
+    not stored in the file, where it would have to be updated with every keyframe.
     """
     if data.georeference is None:
         return None
@@ -112,7 +112,7 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
 
 
 def unplaced(data: MapData) -> str:
-    """Why a map without a georeference has none, in words; empty where it has no fixes."""
+    """Why a map has no georeference, in words; empty if it has no fixes."""
     fixes = np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
     tied = int(fixes[placed(data)].sum())
     elsewhere = int(fixes.sum()) - tied
@@ -139,7 +139,7 @@ def georeference_text(figures: dict[str, Any] | None, unplaced: str) -> str:
 
 
 def graph_of(data: MapData) -> PoseGraph:
-    """The pose graph of a map, with the poses that it has."""
+    """The pose graph of a map, with its stored poses."""
     graph = PoseGraph(RobustSettings())
     restore_solved(graph, data)
     return graph

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 map optimize`: a pose graph of any program, robustly."""
+"""`dpm2 map optimize`: robust optimization of a pose graph of any program."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def optimize(
 ) -> None:
     """Optimize a pose graph and reject the loops that cannot be true.
 
-    --json has the result for each loop, and why.
+    --json also writes for each loop whether it was kept, and why.
     """
     from dpm2_core.slam.graph.calibrated import chi2_per_dof, optimize_calibrated, scaled
     from dpm2_core.slam.graph.g2o import read_g2o, require_connected, write_g2o
@@ -95,7 +95,7 @@ def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[s
             "the odometry is too loose to tell a wrong loop from a right one, and the loops do not check each other:"
             " wrong ones may have been kept"
         )
-    if fit is not None and fit > 2 * scale:  # about 0.5 where the loops kept fit
+    if fit is not None and fit > 2 * scale:  # about 0.5 if the kept loops fit
         out.append(
             f"what was kept does not fit: chi2 is {fit / scale:.3g} per degree of freedom; wrong loops among it?"
         )

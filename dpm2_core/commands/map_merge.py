@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 map merge`: one map of several."""
+"""`dpm2 map merge`: join several maps into one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_file import check_new
 from dpm2_core.slam.store.map_store import MapStore
 
-_OFF = 30.0  # m from where satellites have a map: receivers err by meters, and over its length so does a heading
+_OFF = 30.0  # m from the GNSS position of a map: fixes err by meters, and so does its heading over its length
 
 
 def merge_files(
@@ -36,7 +36,8 @@ def merge_files(
     """Join map files; the arguments are the options of the command.
 
     Raises:
-        UsageError: they do not go together. Dpm2Error: a map shares no place with the others.
+        UsageError: options that exclude each other, or descriptors of several weights. Dpm2Error: a map shares no place
+            with the others.
     """
     check_new(out)
     given = [parse_transform(text) for text in transform or ()]
@@ -65,7 +66,7 @@ def merge_files(
 
 
 def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
-    """Drives that several of the maps hold, as of a file that is named twice, or of two that were continued apart."""
+    """Note keyframes that several maps contain: a file is given twice, or copies of a map were extended separately."""
     known = set[tuple[str, int, bytes]]()
     for path, data in maps:
         own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
@@ -76,10 +77,10 @@ def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
 
 
 def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:
-    """The first map with the others, in the order in which they share places with what is joined already.
+    """Join the other maps to the first one. The next map is always one that shares places with those joined before.
 
     Raises:
-        Dpm2Error: one shares none.
+        Dpm2Error: a map shares no place with them.
     """
     from dpm2_core.slam.build import make_loops
 
@@ -105,7 +106,7 @@ def parse_transform(text: str) -> Array:
     """`x y z yaw` (m, degrees) or `x y z qx qy qz qw` to (4, 4).
 
     Raises:
-        UsageError: it is neither.
+        UsageError: the text is neither.
     """
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several commands have in common: options, and how they show what they found."""
+"""Shared by several commands: options, and the output of results."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ InputOverrides = Annotated[
 ]
 Workers = Annotated[int, typer.Option(min=1, help="At a time; they do not change the result.")]
 PROCESSORS = processors()
-"""The default."""
+"""Default of `Workers`."""
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: to stdout, alone.")
 ]
 
 
 def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | None) -> None:
-    """What a command found: a table or a sentence, and the figures as JSON where they are wanted.
+    """Print the result of a command, a table or a sentence, and write the figures as JSON if requested.
 
     Args:
-        table: printed to stdout; an empty text is not.
-        json_file: `--json`; "-" prints them instead of the table, so that stdout is JSON and nothing else.
+        table: printed to stdout, except an empty text.
+        json_file: `--json`; "-" prints the figures instead of the table, so that stdout contains only JSON.
 
     Raises:
         Dpm2Error: the file cannot be written.
@@ -51,12 +51,12 @@ def show(table: RenderableType, figures: Mapping[str, Any], json_file: Path | No
 
 
 def note(text: str, style: str = "") -> None:
-    """To the user, not among the results; nothing with `--quiet`."""
+    """Print a note for the user to stderr, apart from the results; nothing with `--quiet`."""
     Console(stderr=True).print(text, style=style, highlight=False, soft_wrap=True)
 
 
 def parse_names(text: str | None) -> tuple[str, ...]:
-    """`a, b` to names; none of None."""
+    """`a, b` to names; None to no names."""
     return () if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
 
 
@@ -72,7 +72,7 @@ def parse_lengths(text: str) -> tuple[float, ...]:
 
 
 def run_command(command: Callable[..., int | None]) -> int:
-    """Entry point of a program of one command: a function whose parameters are the options. Returns the exit code."""
+    """Entry point of a program with one command: a function whose parameters are the options. Returns the exit code."""
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command()(command)
     return exit_code(lambda: app(standalone_mode=False))

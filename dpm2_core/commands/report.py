@@ -25,7 +25,7 @@ def report(
     from dpm2_core.files import atomic_write
 
     tables_of = {folder: tables_in(folder) for folder in folders}
-    # Experiments with the tasks alone, and those of trainings that were not driven, leave tables and no run.
+    # Experiments on tasks only, and trainings without a run of the SLAM, write tables but no run.
     runs = find_runs([folder for folder in folders if any(folder.rglob(TRAJECTORY)) or not tables_of[folder]])
     tables = [table for found in tables_of.values() for table in found]
     text = runs_page(", ".join(folder.resolve().name for folder in folders), runs, tables)

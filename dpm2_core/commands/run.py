@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 run`: a recording through the SLAM at full speed, without ROS.
+"""`dpm2 run`: run the SLAM on a recording at full speed, without ROS.
 
-What does the work is imported by the function that needs it: `--help` and the shell's completion are there at once.
+Modules that do the work are imported in the functions that need them, so that `--help` and shell completion are fast.
 """
 
 from __future__ import annotations
@@ -101,14 +101,14 @@ def run(
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
-        make_folder(out)  # the recording may go there
+        make_folder(out)  # --record may write into it
         if resume:
             _keep_what_is_there(drive, out)
         _map(drive, chosen, out, (view, record), json_file)
 
 
 def _keep_what_is_there(drive: OfflineRun, out: Path) -> None:
-    """The results of the run that was cut off, beside those that are written now."""
+    """Move the results of the interrupted run to a subfolder, so that this run does not replace them."""
     from dpm2_core.evaluation.run_folder import TRAJECTORY, set_aside
 
     if (out / TRAJECTORY).exists():
@@ -118,7 +118,7 @@ def _keep_what_is_there(drive: OfflineRun, out: Path) -> None:
 
 
 def _map(drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path | None], json_file: Path | None) -> None:
-    """The drive from its first frame to its results; `shown`: in a viewer, and to a file."""
+    """Run the drive and write its results; `shown`: whether in a viewer, and to which file."""
     from dpm2_core.evaluation.live_view import LiveView
     from dpm2_core.evaluation.run_folder import TRAJECTORY
     from dpm2_core.evaluation.run_result import save_config
@@ -128,14 +128,14 @@ def _map(drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path |
         live = None
         if view or record is not None:
             live = open_things.enter_context(LiveView(drive.source.name, view, record))
-        if not (out / TRAJECTORY).exists():  # else it is beside the results of a run before until there are others
-            save_config(config, out)  # now: whatever becomes of the run, it says how it was made
-        with interrupt_deferred():  # after the drive, too: it would cost all that this gave
+        if not (out / TRAJECTORY).exists():  # else keep the config.yaml of the earlier results until they are replaced
+            save_config(config, out)  # before the run, so that a failed run has its configuration, too
+        with interrupt_deferred():  # after the drive, too: an interrupt would lose its results
             _report(_drive(drive, None if live is None else live.add), out, json_file)
 
 
 def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
-    """The run with a progress bar; says at once what fails."""
+    """Run the drive with a progress bar; failures are printed immediately."""
     name, problem, seen = drive.source.name, "", ""
     with progress_bar() as bar:
         task = bar.add_task(name, total=len(drive))
@@ -159,7 +159,7 @@ def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
 
 
 def _report(result: Result, out: Path, json_file: Path | None) -> None:
-    """Write the files, and say what came out.
+    """Write the result files, and print the outcome.
 
     Raises:
         Dpm2Error: the map file is not complete.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 show`: two scans with their matched descriptors and an image with attention, as the network sees them."""
+"""`dpm2 show`: draw two scans with their matched descriptors, and an image with the attention of the network."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def show(
 ) -> None:
     """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.
 
-    With weights that have a camera, also what the reference point nearest to the middle of the image reads there.
+    With weights that use a camera, also draw the image attention of the reference point nearest to the image center.
     """
     from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
     from dpm2_core.data.open import open_source

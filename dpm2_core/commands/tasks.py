@@ -34,7 +34,7 @@ def tasks_data(
     settings: SetOption = None,
     workers: Workers = PROCESSORS,
 ) -> None:
-    """Synthetic drives for all tasks, with exact labels and twins without traffic."""
+    """Simulate drives for all tasks, with exact labels and the same scans without traffic."""
     from dpm2_core.tasks.drives import TaskDriveSettings, make_task_drives
 
     chosen = load_settings(TaskDriveSettings, config, settings or [])
@@ -55,7 +55,7 @@ ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure 
 
 
 def _add(name: str, help_: str) -> None:
-    """`dpm2 train NAME`, the same for every task."""
+    """Add the command `dpm2 train NAME`, which is the same for every task."""
 
     def run(
         src: SourceArgument,
@@ -91,7 +91,7 @@ Scans = tuple[Path, Sequence[str]]
 
 
 def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tuple[Scans, Scans | None]) -> None:
-    """Train a task on the first scans, measuring on the second."""
+    """Train a task on the first set of scans; during training, measure it on the second, if given."""
     from dpm2_core.learning.begun import begin_or_resume, check_one_process
     from dpm2_core.learning.checkpoint import WEIGHTS
     from dpm2_core.tasks.open import open_scans, sequence_places  # torch is slow to import
@@ -109,7 +109,7 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     if val is not None:
         measured = open_scans(val[0], kind.needs, val[1])
         places = sequence_places(*val)
-        same = measured.digest() == data["content"]  # as of a copy
+        same = measured.digest() == data["content"]  # such as a copy
         say_learned(f"--val {val[0]} is what the task", places, places if same else sequence_places(src, sequences))
     train_task(new_task(name, settings), scans, out, measured)
     note(f"{out / WEIGHTS}: written")

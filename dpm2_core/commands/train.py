@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train`: training data (data, pack), image branch, registration (phase1), its judges (phase2), ablation."""
+"""`dpm2 train`: data (data, pack), image branch, registration (phase1), overlap and confidence (phase2), ablation."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def data(
     settings: SetOption = None,
     workers: Workers = PROCESSORS,
 ) -> None:
-    """Scans of many synthetic worlds, packed for training."""
+    """Simulate scans of many synthetic worlds, and pack them for training."""
     from dpm2_core.learning.generate import GenerateSettings, generate  # torch and embree are slow to import
 
     chosen = load_settings(GenerateSettings, config, settings or [])
@@ -54,14 +54,14 @@ def pack(
     ] = False,
     settings: InputOverrides = None,
 ) -> None:
-    """A recorded drive with ground truth, or all of a data set, packed for training frame by frame."""
+    """Pack a recorded drive with ground truth, or all drives of a data set, for training, frame by frame."""
     from dpm2_core.data.open import sequences_below
     from dpm2_core.data.settings import input_settings
     from dpm2_core.learning.generate import check_same  # torch and embree are slow to import
     from dpm2_core.network.settings import preset as network_preset
 
     overrides = settings or []
-    input_settings(overrides), network_preset(preset), parse_range(frames)  # what is wrong is so whatever the drive
+    input_settings(overrides), network_preset(preset), parse_range(frames)  # reject wrong options before any work
     given = sorted(setting for setting in overrides if not setting.startswith("input.sequence="))
     packing = {"frames": frames, "preset": preset, "input": given}
     if not every:
@@ -81,7 +81,7 @@ def pack(
             continue
         try:
             _pack_one(src, out / name, made_by, asked)
-        except UsageError as error:  # of this drive; a full disk ends them all
+        except UsageError as error:  # affects this drive only; a full disk ends the call
             typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
             left_out.append(name)
     if left_out:
@@ -89,7 +89,7 @@ def pack(
 
 
 def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str]) -> None:
-    """`packing`: what the packed drive is made by, beside its own frames; it keeps that."""
+    """Pack one drive; `packing`: the options that it is made with, which are stored with it."""
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import input_settings
     from dpm2_core.learning.generate import pack as write  # torch and embree are slow to import
@@ -111,7 +111,7 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
 
 
 def _content(src: Path, overrides: list[str]) -> dict[str, str]:
-    """What a drive holds, see `digest_of`; nothing where it cannot be read, as without its scans."""
+    """Digest of the content of a drive, see `digest_of`; empty if it cannot be read, e.g. without its scans."""
     from dpm2_core.data.open import open_source
     from dpm2_core.data.settings import input_settings
     from dpm2_core.data.source import digest_of
@@ -130,7 +130,7 @@ def image(
     out: OutOption = Path("out/image"),
     resume: ResumeOption = False,
 ) -> None:
-    """The image branch alone, before the registration training with images."""
+    """Train the image branch alone, before the registration training with images."""
     from dpm2_core.learning.train_image import ImageTrainingSettings, train_image
 
     chosen = load_settings(ImageTrainingSettings, config, settings or [])
@@ -145,7 +145,7 @@ def phase1(
     out: OutOption = Path("out/phase1"),
     resume: ResumeOption = False,
 ) -> None:
-    """Registration: encoder, decoder, similarity and offset heads."""
+    """Train the registration: encoder, decoder, similarity and offset heads."""
     from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 
     chosen = load_settings(RegistrationTrainingSettings, config, settings or [])
@@ -160,7 +160,7 @@ def phase2(
     out: OutOption = Path("out/phase2"),
     resume: ResumeOption = False,
 ) -> None:
-    """The heads that judge a pose, overlap and confidence, on the network of the registration training."""
+    """Train the heads that judge a pose, overlap and confidence, on the network of the registration training."""
     from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
     chosen = load_settings(OverlapTrainingSettings, config, settings or [])
@@ -174,9 +174,9 @@ def ablation(
     settings: SetOption = None,
     out: OutOption = Path("out/ablation"),
 ) -> None:
-    """The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike; continues.
+    """Make the paper's tables 3 and 4: alternatives of the fusion and its reference points, all trained the same way.
 
-    The figures are written to ablation.json in --out.
+    A stopped ablation continues. The figures are written to ablation.json in --out.
     """
     from dpm2_core.data.packed import open_packed, scans_of
     from dpm2_core.evaluation.record import write_record
@@ -204,7 +204,7 @@ def ablation(
 def _begin(
     out: Path, resume: bool, settings: ImageTrainingSettings | RegistrationTrainingSettings | OverlapTrainingSettings
 ) -> None:
-    """Ready `out` for a training on packed drives, see `begin_or_resume`."""
+    """Prepare `out` for a training on packed drives, see `begin_or_resume`."""
     from dpm2_core.data.packed import open_packed, packed_digest, scans_of
     from dpm2_core.learning.begun import begin_or_resume, is_first_process
     from dpm2_core.network.pretrained import weights_path
@@ -221,7 +221,7 @@ def _begin(
 
 
 def say_packed(what: str, folder: Path, learned: Collection[bytes]) -> None:
-    """Say which packed drives below a folder hold scans that are learned from, see `scans_of`."""
+    """Print which packed drives below a folder contain scans that are also used for training, see `scans_of`."""
     from dpm2_core.data.packed import open_packed, scans_of
 
     measured = open_packed(folder)
@@ -230,7 +230,7 @@ def say_packed(what: str, folder: Path, learned: Collection[bytes]) -> None:
 
 
 def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:
-    """Say which of what is measured on, names by folder, is learned from as well: its figures are no evidence."""
+    """Print which measured drives (name by folder) are also used for training: their figures are no evidence."""
     both = [name for folder, name in measured.items() if folder in learned]
     if both:
         which = "" if len(both) == len(measured) else f": {', '.join(both)}"
