@@ -13,7 +13,7 @@ from dpm2_core.network.precision import product_type
 
 
 def hiding(mask: Tensor | None) -> Tensor | None:
-    """The mask, or None where it hides nothing, as in one frame: passes less; a GPU would have to wait to know."""
+    """The mask, or None if it hides nothing, as for one frame: saves passes. A GPU would have to wait for the check."""
     return None if mask is not None and mask.device.type == "cpu" and bool(mask.all()) else mask
 
 
@@ -44,7 +44,7 @@ def sine_code(xyz: Tensor, width: int) -> Tensor:
 
 
 class RelativeBias(nn.Module):
-    """A learned attention bias from where one point lies in the view-aligned frame of the other."""
+    """A learned attention bias that depends on the position of one point in the view-aligned frame of the other."""
 
     REACH = (1.0, 2.5, 6.0, 15.0, 40.0)  # m, of the radial basis functions
 
@@ -55,7 +55,7 @@ class RelativeBias(nn.Module):
 
     @torch.no_grad()
     def basis(self, xyz: Tensor, axis: Tensor) -> Tensor:
-        """xyz (B, N, 3) m, axis (B, N, 2): fixed functions (B, K, N, N), row i about how j looks from i."""
+        """xyz (B, N, 3) m, axis (B, N, 2): fixed functions (B, K, N, N), row i of points j as seen from i."""
         x, y, z = (xyz[..., None, :, i] - xyz[..., :, None, i] for i in range(3))
         c, s = axis[..., None, 0], axis[..., None, 1]
         distance = (x * x + y * y + z * z + 1e-9).sqrt()
@@ -110,11 +110,11 @@ class Attention(nn.Module):
         return torch.where(readable, out, torch.zeros_like(out))
 
     def weights(self, x: Tensor, tokens: Tensor, bias: Tensor | None, mask: Tensor | None) -> Tensor:
-        """How much of each token is read, (B, heads, N, T), rows adding up to 1; as `forward`."""
+        """Attention weights (B, heads, N, T), rows adding up to 1; arguments as for `forward`."""
         query = key = None
         if self.query is not None and self.key is not None:
             query, key = self._split(self.query(x)), self._split(self.key(tokens))
-        # Written out: on the CPU and at these sizes twice as fast as the fused kernel, and bias can be learned. Softmax
+        # Written out: at these sizes twice as fast as the fused kernel on the CPU, and the bias can be learned. Softmax
         # stays in bf16 under autocast.
         with torch.autocast(x.device.type, enabled=False):
             if query is not None and key is not None:

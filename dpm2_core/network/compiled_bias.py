@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Attention biases as machine code, where no gradient is asked for: one pass, and no large tensors in between."""
+"""Attention biases as compiled code, if no gradient is needed: one pass, without large intermediate tensors."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from dpm2_core.geometry.compiled import compiled
 from dpm2_core.network.precision import product_type
 
 Array = NDArray[np.float32]
-Bits = NDArray[np.int16]  # of bfloat16, or twice as many of float32
+Bits = NDArray[np.int16]  # of bfloat16, or twice as many elements of float32
 
-DIRECTIONS, DISTANCES = 5, 5  # functions of where a point lies, and then of how far away it is
+DIRECTIONS, DISTANCES = 5, 5  # number of functions of direction, then of distance
 
 
 def applies(x: Tensor) -> bool:
-    """Whether biases of such a tensor are made here: on a CPU, without a gradient."""
+    """Whether the biases of this tensor are computed here: on a CPU, without a gradient."""
     return x.device.type == "cpu" and not torch.is_grad_enabled()
 
 
@@ -57,13 +57,13 @@ def _bits(biases: Tensor) -> Bits:
 
 
 def _rates(alphas: tuple[float, ...]) -> Array:
-    """exp(-alpha x) as 2^(rate x)."""
+    """Rates for which 2^(rate x) is exp(-alpha x)."""
     return np.array(alphas, np.float32) * np.float32(-math.log2(math.e))
 
 
 @compiled("void(f4[::1], f4, f4[::1])")
 def _power_of_two(x: Array, rate: float, out: Array) -> None:
-    """2^(rate x) of a rate that is negative, to 3e-7: the whole part as an exponent, the rest by a polynomial."""
+    """2^(rate x) for a negative rate, to 3e-7: the integer part as an exponent, the rest by a polynomial."""
     exponent = np.empty(len(out), np.int32)
     power = exponent.view(np.float32)
     for j in range(len(out)):
@@ -79,7 +79,7 @@ def _power_of_two(x: Array, rate: float, out: Array) -> None:
 
 @compiled("void(f4[::1], i2[::1])")
 def _write(values: Array, out: Bits) -> None:
-    """As they are, or rounded to the nearest bfloat16, of two the even one, where there is room for no more."""
+    """Copy the values as float32, or rounded to the nearest bfloat16 (ties to even) if `out` has no more room."""
     if len(out) > len(values):
         out.view(np.float32)[:] = values
         return
@@ -103,8 +103,8 @@ def _seen_from(xyz: Array, axis: Array, i: int, directions: Array, distance: Arr
 
 @compiled("void(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i2[:, :, ::1])")
 def _relative(xyz: Array, axis: Array, weight: Array, rates: Array, out: Bits) -> None:
-    """`relative_bias` of one set (3, N). Every inner loop is over the points, many of them at a time; the functions
-    are written out, as a loop over them would write each sum ten times."""
+    """`relative_bias` of one set (3, N). Every inner loop runs over the points, many at a time. The functions are
+    written out, because a loop over them would write each sum ten times."""
     n = len(axis)
     f = np.empty((DIRECTIONS + DISTANCES, n), np.float32)
     distance, total = np.empty(n, np.float32), np.empty(n, np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A first pose out of matches of which most may be wrong: those that keep each other's distances vote together."""
+"""A first pose from matches most of which may be wrong: matches whose mutual distances agree support each other."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ TOLERANCE = 1.0  # m, residual of a match that supports a pose
 HYPOTHESES = 12
 MEMBERS = 12  # matches that make up a hypothesis
 ROUNDS = 2  # of refitting each hypothesis to all that support it
-HEADS = 32  # matches that head the hypotheses of `alternatives`; none that an earlier one brings together
-APART_M, APART_DEG = 2.0, 10.0  # poses nearer than this are one: they lead to the same solution
+HEADS = 32  # matches that seed the hypotheses of `alternatives`; none that an earlier hypothesis brings together
+APART_M, APART_DEG = 2.0, 10.0  # poses nearer than this count as one: they lead to the same solution
 _POWER = 10  # iterations
 
 
 def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     """The pose that most matches support, by second-order spatial compatibility; without a gradient.
 
-    A rigid motion keeps distances: two right matches agree on theirs, and on a third that agrees with both; wrong ones
-    agree by chance alone. The matches with most support each head a hypothesis. (The idea is that of SC2-PCR,
-    CVPR 2022.)
+    A rigid motion preserves distances. So two right matches agree with each other, and share others that agree with
+    both; wrong ones agree only by chance. The matches with most support each seed a hypothesis. (The idea is that of
+    SC2-PCR, CVPR 2022.)
 
     Args:
         source, target: (B, K, 3), m, K >= 1. weight: (B, K) confidence, 0 where dropped.
@@ -41,10 +41,10 @@ def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def alternatives(source: Tensor, target: Tensor, weight: Tensor, known: Tensor, most: int) -> Tensor:
-    """Other poses (B, most, 4, 4) float64 than those known (B, 4, 4), and than each other: those that bring most
-    matches together, whatever the confidence of these. Where there are fewer, the known pose again.
+    """Poses (B, most, 4, 4) float64 that differ from those known (B, 4, 4) and from each other: those that bring the
+    most matches together, whatever their confidence. If there are fewer, the known pose is repeated.
 
-    Of two places that look alike from afar the wrong one can have the more confident matches, but hardly more of them.
+    Of two places that look alike from afar, the wrong one can have more confident matches, but hardly more of them.
     `source`, `target` and `weight` are those of `consensus`.
     """
     fields = (tensor.detach().float().cpu().numpy() for tensor in (source, target, weight))
@@ -58,7 +58,7 @@ def alternatives(source: Tensor, target: Tensor, weight: Tensor, known: Tensor, 
 
 @compiled("f4[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
 def _support(source: Array, target: Array, weight: Array) -> Array:
-    """(K, K), column i: how far each match agrees with match i, times what they agree with both of them."""
+    """(K, K), column i: agreement of each match with match i, times the weight of the matches that agree with both."""
     k = len(weight)
     agree, support, both = np.empty((k, k), np.float32), np.empty((k, k), np.float32), np.empty(k, np.float32)
     for i in range(k):
@@ -97,7 +97,7 @@ def _fitted(source: Array, target: Array, weight: Array) -> Array:
                 for b in range(3):
                     C[a, b] += weight[n] * (target[n, a] - there[a]) * (source[n, b] - here[b])
     U, _, Vt = np.linalg.svd(C)
-    for a in range(3):  # both right-handed: a reflection is no pose
+    for a in range(3):  # make both right-handed: a reflection is not a pose
         b, c = (a + 1) % 3, (a + 2) % 3
         U[a, 2] = U[b, 0] * U[c, 1] - U[c, 0] * U[b, 1]
         Vt[2, a] = Vt[0, b] * Vt[1, c] - Vt[0, c] * Vt[1, b]
@@ -123,8 +123,8 @@ def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Arra
 
 @compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
 def _refitted(source: Array, target: Array, weight: Array, score: Array) -> Array:
-    """The pose (4, 4) of the matches with a score (K,), refitted to all that support it; `score` becomes the weights
-    of these."""
+    """The pose (4, 4) fitted to matches with weights `score` (K,), then refitted to all matches that support it;
+    `score` is overwritten with the weights of these."""
     T = _fitted(source, target, score)
     for _ in range(ROUNDS):
         _supporting(T, source, target, weight, score)
@@ -134,8 +134,8 @@ def _refitted(source: Array, target: Array, weight: Array, score: Array) -> Arra
 
 
 def _hypothesis(support: Array, source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
-    """The pose (4, 4) that the matches vote for which agree most with one, by its `support` (K,), and the weights (K,)
-    of all that support this pose."""
+    """The pose (4, 4) of the matches that agree most with one match, given its `support` (K,), and the weights (K,) of
+    all matches that support this pose."""
     members = np.argsort(-support)[:MEMBERS]
     score = np.zeros_like(support)
     score[members] = support[members]
@@ -163,7 +163,7 @@ def _same(one: Array, other: Array) -> bool:
 def _alternatives(source: Array, target: Array, weight: Array, known: Array, most: int) -> Array:
     support = _support(source, target, weight)
     explained = weight <= 0
-    tried: list[tuple[int, Array]] = []  # how many matches a pose brings together
+    tried: list[tuple[int, Array]] = []  # number of matches that a pose brings together, and the pose
     for head in np.argsort(-support.sum(0)):
         if not explained[head] and len(tried) < HEADS:
             T, score = _hypothesis(support[:, head], source, target, weight)

@@ -70,7 +70,7 @@ class ConvNeXt(nn.Module):
 
 
 class ImagePyramid(nn.Module):
-    """Any backbone with `channels` and `strides`, then the top-down pathway of an FPN on the levels asked for."""
+    """Any backbone with `channels` and `strides`, then the top-down pathway of an FPN on the requested levels."""
 
     def __init__(self, backbone: nn.Module, settings: ImageSettings) -> None:
         super().__init__()

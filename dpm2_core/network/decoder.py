@@ -76,7 +76,7 @@ class Decoder(nn.Module):
         return self.correlate(self.prepare(source), self.prepare(target))
 
     def prepare(self, tokens: Tokens) -> Prepared:
-        """What a set's part in the correlation is before it has seen another one."""
+        """The part of the correlation that depends on one set alone."""
         code: Tensor | None = None
         biases: Sequence[Tensor | None] = [None] * len(self.layers)
         if self.relative is None:

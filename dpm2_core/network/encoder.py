@@ -55,7 +55,7 @@ class Encoder(nn.Module):
             raise ValueError(f"level {self.level} has {channels[self.level]} channels, descriptors {settings.channels}")
 
     def forward(self, points: PointBatch, views: Views | None = None) -> Encoded:
-        """Encode a batch; `views` None where no frame of it has an image."""
+        """Encode a batch; `views` is None if no frame of it has an image."""
         if self.image is None:
             views = None
         scales = self.points(points, self._colors(points, views)) if self.painted else self.points(points)
@@ -72,7 +72,7 @@ class Encoder(nn.Module):
 
     @staticmethod
     def _colors(points: PointBatch, views: Views | None) -> Tensor | None:
-        """Of every raw point of the first neighborhoods (B, n, k, 4); None without images."""
+        """Colors (B, n, k, 4) of every raw point of the first neighborhoods; None without images."""
         if views is None:
             return None
         raw = points.xyz[:, : points.patches.shape[1], None] + points.patches
@@ -82,8 +82,8 @@ class Encoder(nn.Module):
     def encode(self, frame: Frame) -> Descriptors:
         """Descriptors of one frame, from its raw points and its images, if any.
 
-        Those of a tilted sensor are made in level axes, by its mounting (`Frame.up`) and the ground; those of a room as
-        if it had the size of a street.
+        Those of a tilted sensor are computed in leveled axes, from its mounting (`Frame.up`) and the ground; those of a
+        room as if it had the size of a street.
 
         Raises:
             Dpm2Error: too few points in range, or the result is not finite.
@@ -120,7 +120,7 @@ class Encoder(nn.Module):
 
 
 def to_device(batch: Any, device: torch.device | str) -> Any:
-    """Move all in tuples and lists, nested at will, that can be moved."""
+    """Move all items that have a method `to`, in arbitrarily nested tuples and lists."""
     if isinstance(batch, tuple | list):
         moved = [to_device(item, device) for item in batch]
         return type(batch)(*moved) if hasattr(batch, "_fields") else type(batch)(moved)

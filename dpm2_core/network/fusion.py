@@ -24,11 +24,11 @@ from dpm2_core.network.spatial import (
 from dpm2_core.network.tokens import Tokens
 from dpm2_core.network.views import Views
 
-_WINDOW = 3  # side of the square of samples that roi_pooling has in the place of the image attention
+_WINDOW = 3  # side of the square of samples that roi_pooling reads instead of the image attention
 
 
 class ReferencePoints(nn.Module):
-    """The reference points generator (RPG): where descriptors sit, and their first features."""
+    """The reference points generator (RPG): positions of the descriptors, and their first features."""
 
     def __init__(self, settings: NetworkSettings, scale_channels: list[int]) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class ReferencePoints(nn.Module):
             if fusion.reference_features and sampled and stage.points >= fusion.points
         ]
         if not sampled:
-            noise = torch.Generator().manual_seed(0)  # the same places in every frame, as descriptors must recur
+            noise = torch.Generator().manual_seed(0)  # the same positions in every frame: descriptors must repeat
             if fusion.reference == "uniform":
                 xyz = torch.rand(self.n, 3, generator=noise) * 2 - 1
             else:
@@ -53,7 +53,7 @@ class ReferencePoints(nn.Module):
         self.view_aligned = points.view_aligned
 
     def forward(self, scales: list[Scale]) -> Tokens:
-        """Sampled reference points are the first ones of the finest scale; see `build_pyramid`."""
+        """The reference points. Sampled ones are the first points of the finest scale; see `build_pyramid`."""
         finest = scales[0]
         if self.sampled:
             xyz, mask = finest.xyz[:, : self.n], finest.mask[:, : self.n]
@@ -69,7 +69,7 @@ class ReferencePoints(nn.Module):
 class Branch(NamedTuple):
     """Tokens (B, T, C) of one modality, their spatial bias (B, h, N, T) or None, and mask (B, 1, N or 1, T).
 
-    rows: (N,) indices of the reference points that read them, if others need not be asked; None: all.
+    rows: (N,) indices of the reference points that read the tokens; None: all.
     """
 
     tokens: Tensor
@@ -79,7 +79,7 @@ class Branch(NamedTuple):
 
 
 class FusionLayer(nn.Module):
-    """Self-attention of reference points, one attention a modality, and an MLP over the three."""
+    """Self-attention of reference points, one attention per modality, and an MLP over the three."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ class FusionLayer(nn.Module):
         return self.norms[1](x + self.fuse(torch.cat(parts, -1)))
 
     def _read(self, x: Tensor, image: Branch) -> Tensor:
-        """What reference points x (B, N, C) find in the image; zeros for those that do not read it."""
+        """Image attention of reference points x (B, N, C); zeros for those that do not read the image."""
         assert self.image is not None
         bias = self._bias(1, image.bias)
         if image.rows is None:
@@ -149,11 +149,11 @@ class Fusion(nn.Module):
         if reads and fusion.pixel:
             self.pixel = nn.Linear(settings.image.pyramid, settings.channels)
             self.pixel_in = nn.Linear(settings.channels, settings.channels, bias=False)
-            nn.init.zeros_(self.pixel_in.weight)  # begins as the network without
+            nn.init.zeros_(self.pixel_in.weight)  # starts as the network without it
         self.texture = None
         if fusion.corners and fusion.reference == "salient":
             self.texture = nn.Linear(TEXTURE, settings.channels, bias=False)
-            nn.init.orthogonal_(self.texture.weight, 4.0)  # half of a descriptor's length: patches alike, so are they
+            nn.init.orthogonal_(self.texture.weight, 4.0)  # half of a descriptor's norm: like patches, like codes
         self.lidar_norm = nn.LayerNorm(width)
         self.layers = nn.ModuleList(FusionLayer(settings) for _ in range(fusion.layers))
         self.relative = RelativeBias(fusion.layers, fusion.heads) if fusion.relative else None
@@ -194,7 +194,7 @@ class Fusion(nn.Module):
         return Branch(features, bias, mask[:, None, None])
 
     def _image(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch | None:
-        """None where no reference point is in an image."""
+        """The branch of the images; None if no reference point is in an image."""
         batch, count = views.present.shape
         kind = self.settings.kind
         uv = token_pixels(maps)
@@ -206,7 +206,7 @@ class Fusion(nn.Module):
             and self.settings.image_mask == "view"
         ):
             visible = torch.stack([seen_from(xyz, views, view) for view in range(count)]).any(0)[0]
-            rows = visible.nonzero()[:, 0]  # in one image a fourth of them
+            rows = visible.nonzero()[:, 0]  # about a fourth of them with one image
             if not len(rows):
                 return None
             xyz = xyz[:, rows]

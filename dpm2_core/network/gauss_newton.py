@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The precision-weighted solve: with gradients, and as machine code for inference, the same steps without them."""
+"""The precision-weighted solve: with gradients, and compiled for inference, with the same steps but no gradients."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _DAMPING = 1e-6
 
 
 def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tensor]:
-    """Residuals in units of their deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
+    """Residuals in units of their standard deviation (B, 2K, 3) and their Jacobian (B, 2K, 3, 6) for T exp(xi)."""
     half = pairs.source.shape[1] // 2
     R, t = T[:, None, :3, :3], T[:, None, :3, 3]
     source, target, L = pairs.source.double(), pairs.target.double(), pairs.L.double()
     moved_back = ((target - t)[..., None, :] @ R)[..., 0, :]  # R^T (y - t)
     L = torch.cat([L[:, :half], R.transpose(-1, -2) @ L[:, half:]], 1)  # all in the source frame
-    # In the source frame the step turns the target's point, in the target frame the source's.
+    # In the source frame the step rotates the target's point, in the target frame the source's.
     lever_arm = torch.cat([moved_back[:, :half], source[:, half:]], 1)
     minus_hat = hat(-lever_arm)
     eye = torch.eye(3, dtype=source.dtype, device=source.device).expand_as(minus_hat)
@@ -34,10 +34,10 @@ def whitened_residuals(T: Tensor, pairs: Correspondences) -> tuple[Tensor, Tenso
 
 
 def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUNDS) -> tuple[Tensor, Tensor]:
-    """Iteratively reweighted Gauss-Newton on the residuals weighed with their predicted precision.
+    """Iteratively reweighted Gauss-Newton on the residuals, weighted with their predicted precision.
 
-    The weights are those of Geman and McClure: in a tunnel the points of a scan claim together, each unsure, that
-    nothing moved; what a few corners of an image say otherwise stands, if it is where the steps start.
+    The weights are those of Geman and McClure. In a tunnel all points of a scan, each with a low precision, indicate
+    that nothing moved. A few image corners that contradict them still prevail if the steps start at their solution.
 
     Args:
         T: (B, 4, 4) start. pairs: the correspondences.
@@ -60,7 +60,7 @@ def weighted_gauss_newton(T: Tensor, pairs: Correspondences, rounds: int = ROUND
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
 def _solve(A: Array, b: Array, x: Array) -> None:
-    """x (6,) with A x = b, A (6, 6) symmetric and positive definite, by Cholesky; NaN if it is not."""
+    """x (6,) with A x = b, A (6, 6) symmetric and positive definite, by Cholesky; NaN if A is not."""
     L = np.zeros((6, 6))
     for i in range(6):
         for j in range(i + 1):
@@ -106,8 +106,8 @@ def _move(T: Array, xi: Array) -> None:
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
 def _whiten(T: Array, source: Array, target: Array, L: Array, residual: Array, jacobian: Array) -> None:
-    """Residuals (N, 3) in units of their deviation and their Jacobian (N, 3, 6), of which the first half of the pairs
-    has its precision L L^T in the source frame, the other in the target frame."""
+    """Residuals (N, 3) in units of their standard deviation and their Jacobian (N, 3, 6). The precision L L^T of the
+    first half of the pairs is in the source frame, that of the other half in the target frame."""
     half, arm, back, P = len(source) // 2, np.empty(3), np.empty(3), np.empty((3, 3))
     for n in range(len(source)):
         x, y, z = target[n, 0] - T[0, 3], target[n, 1] - T[1, 3], target[n, 2] - T[2, 3]

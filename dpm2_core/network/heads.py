@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heads on (correlated) descriptors: similarity, offset with precision, and the coarse pairing of training; and on the
-poses that they lead to: confidence and overlap."""
+"""Heads on (correlated) descriptors: similarity, offset with precision, and the coarse pairing for training. Heads on
+the resulting poses: confidence and overlap."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class PointMLP(nn.Sequential):
 
 
 class OffsetHead(nn.Module):
-    """Where the point that corresponds to descriptor b lies as seen from descriptor a, and how sure that is.
+    """Offset from descriptor a to the point that corresponds to descriptor b, and its precision.
 
-    The offset is in a's view frame: its covariance then turns with the sensor, as the surfaces do.
+    The offset is in a's view frame, so that its covariance rotates with the surfaces when the sensor rotates.
     """
 
     def __init__(self, width: int, precision: bool) -> None:
@@ -34,7 +34,7 @@ class OffsetHead(nn.Module):
         self.out = nn.Linear(width // 4, 9 if precision else 3)
         nn.init.zeros_(
             self.out.weight
-        )  # no offset, 0.5 m: the likelihood's steep gradients wait until features mean something
+        )  # no offset, 0.5 m: no steep gradients of the likelihood before the features are trained
         nn.init.zeros_(self.out.bias)
 
     def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,9 +65,9 @@ CONFIDENCE_FEATURES = 5  # of `solved.confidence_features`
 
 
 class ConfidenceHead(nn.Linear):
-    """Logits (B,) of `solved.confidence_features` (B, CONFIDENCE_FEATURES): is the pose right?
+    """Logits (B,) that poses are right, from `solved.confidence_features` (B, CONFIDENCE_FEATURES).
 
-    It begins as what the shipped weights have learned, for a network that has had no overlap training.
+    Its initial values are those of the shipped weights, for a network without overlap training.
     """
 
     def __init__(self) -> None:
@@ -81,16 +81,16 @@ class ConfidenceHead(nn.Linear):
 
 
 POSE_FEATURES = 3  # of `solved.overlap_features`
-_MIDDLE, _SPREAD = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these, about where near and far pairs part
+_MIDDLE, _SPREAD = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these: near and far pairs separate about there
 
 
 class OverlapHead(nn.Module):
     """Probability that two frames are within 20 m.
 
-    `pose`: by what their registration says: how confident it is, how far apart it puts them, and how much of the pair
-    fits. False: by the descriptors, as in the paper: point-wise layers, mean over the valid points, classifier. That
-    head, trained alike, hardly got off the ground. One that asked both had an average precision of 0.961 where the
-    sensor was without errors, unlike in training; the registration alone has 0.996 there.
+    `pose`: from their registration: its confidence, the distance that it puts between them, and the share of pairs that
+    fits. False: from the descriptors, as in the paper: point-wise layers, mean over the valid points, classifier. That
+    head, trained the same way, hardly learned anything. One that read both had an average precision of 0.961 for a
+    sensor without errors, unlike in training; the registration alone has 0.996 there.
     """
 
     def __init__(self, width: int, pose: bool) -> None:
@@ -103,7 +103,7 @@ class OverlapHead(nn.Module):
         self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
     ) -> Tensor:
         """Logits (B,) of source (B, N, C) and target (B, M, C) with masks (B, N) and (B, M), and
-        `solved.overlap_features` (B, POSE_FEATURES); each mode reads what it asks alone."""
+        `solved.overlap_features` (B, POSE_FEATURES); each mode reads only its own inputs."""
         if self.points is None:
             middle, spread = (overlap_features.new_tensor(values) for values in (_MIDDLE, _SPREAD))
             return self.classify((overlap_features - middle) / spread)[..., 0].float()
@@ -120,6 +120,6 @@ def residuals_in_view(offset: Tensor, true: Tensor, axis: Tensor) -> Tensor:
 
 
 def into_set_frame(offset: Tensor, L: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn offset (..., 3) and L (..., 3, 3) from the view frame into the set's frame: R o and R L."""
+    """Rotate offset (..., 3) and L (..., 3, 3) from the view frame to the set's frame: R o and R L."""
     columns = from_view(L.transpose(-1, -2), axis[..., None, :])
     return from_view(offset, axis), columns.transpose(-1, -2)

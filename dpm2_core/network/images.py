@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images at the size, without the distortion and in the axes in which the network reads them. Imports no torch."""
+"""Images as the network reads them: resized, without distortion, and in its axes. Imports no torch."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from dpm2_core.network.settings import ImageSettings
 
 
 def in_encoded_axes(image: Image, R: NDArray[np.floating], scale: float) -> Image:
-    """An image whose camera stands in other axes, into which R (3, 3) turns the LiDAR's, in a scene that is enlarged by
-    `scale`."""
+    """The image with its camera pose in other axes, into which R (3, 3) rotates the LiDAR's, in a scene that is
+    enlarged by `scale`."""
     T_lidar_cam = se3.make(R, np.zeros(3)) @ image.camera.T_lidar_cam
     T_lidar_cam[:3, 3] *= scale
     return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 
 def small_image(image: Image, settings: ImageSettings) -> Image:
-    """The image as the network reads it: at its size, without distortion; itself, if it is so."""
+    """The image as the network reads it: resized and without distortion; the same object if it is so already."""
     camera, pixels, size = image.camera, image.pixels, settings.size[::-1]
     if not camera.distortion and camera.size == size:
         return image

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses of the network, every one masked and free of NaN for batches without a single positive."""
+"""Losses of the network. All of them are masked, and free of NaN for batches without a single positive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from dpm2_core.geometry import se3_torch
 
-RIGHT_M, RIGHT_DEG = 1.0, 3.0  # errors of a pose that is right; few lie between these and meters
+RIGHT_M, RIGHT_DEG = 1.0, 3.0  # largest errors of a right pose; few lie between these and several meters
 SOFT = 3.0  # degrees of freedom of the Student distribution of offset residuals
 
 
@@ -20,8 +20,8 @@ class Labels(NamedTuple):
 
     Attributes:
         distance: (B, N, M) m, inf at padding.
-        forward: (B, N) index of the nearest target of each source, -1 where it is farther than the limit.
-        backward: (B, M) the same of each target. The other pairs within the limit are neutral.
+        forward: (B, N) index of the nearest target of each source, -1 if it is farther than the limit.
+        backward: (B, M) the same for each target. The other pairs within the limit are neutral.
         near: (B, N, M) True within the limit.
     """
 
@@ -57,8 +57,8 @@ def info_nce(scores: Tensor, labels: Labels, neutral_is_negative: bool) -> Tenso
 
     Args:
         scores: similarities divided by the temperature.
-        neutral_is_negative: near-by targets other than the nearest count as negatives, as DeepPointMap does for
-            correlated descriptors; else they are left out, as for the encoder's.
+        neutral_is_negative: nearby targets other than the nearest count as negatives, as in DeepPointMap for the
+            correlated descriptors; else they are left out, as for those of the encoder.
     """
     scores = scores.masked_fill(labels.distance.isinf(), -1e4)
     losses = []
@@ -106,7 +106,7 @@ def overlap_loss(logits: Tensor, distance: Tensor, limit: float) -> Tensor:
 
 
 def confidence_loss(logits: Tensor, T: Tensor, true: Tensor) -> Tensor:
-    """Binary cross entropy of the logits (B,) that poses (B, 4, 4) are right, against whether they are: within
+    """Binary cross entropy of the logits (B,) that poses (B, 4, 4) are right, against whether they are within
     `RIGHT_M` and `RIGHT_DEG` of the true ones."""
     difference = se3_torch.log(se3_torch.inverse(true.double()) @ T.double())
     right = (difference[:, 3:].norm(dim=-1) < RIGHT_M) & (difference[:, :3].norm(dim=-1) < math.radians(RIGHT_DEG))

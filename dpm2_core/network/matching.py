@@ -14,7 +14,7 @@ from dpm2_core.network.heads import into_set_frame
 from dpm2_core.network.losses import cosine
 from dpm2_core.network.tokens import Tokens
 
-NEAR = 4.0  # m, what comes farther apart under a rough pose is no match
+NEAR = 4.0  # m, descriptors that are farther apart under a rough pose do not match
 
 
 class Correspondences(NamedTuple):
@@ -40,16 +40,16 @@ def softmax_both(scores: Tensor, source_mask: Tensor, target_mask: Tensor) -> Te
 
 
 def pairs_wanted(source_mask: Tensor, target_mask: Tensor, ratio: float) -> Tensor:
-    """Of how many pairs (B,) the pose of sets with masks (B, N) and (B, M) is made: floor(ratio (n + m)) // 2 of their
-    n and m descriptors."""
+    """Number of pairs (B,) for the pose of sets with masks (B, N) and (B, M): floor(ratio (n + m)) // 2 with their n
+    and m descriptors."""
     return (ratio * (source_mask.sum(1) + target_mask.sum(1))).long() // 2
 
 
 def best_pairs(
     probability: Tensor, source_mask: Tensor, target_mask: Tensor, ratio: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The `pairs_wanted` most probable pairs of (B, N, M): probability, row and column (B, K); after those of a set
-    that is smaller than others of the batch, pairs of probability 0."""
+    """The `pairs_wanted` most probable pairs of (B, N, M): probability, row and column (B, K). For sets smaller than
+    others of the batch, pairs of probability 0 follow."""
     _, n, m = probability.shape
     wanted = pairs_wanted(source_mask, target_mask, ratio)
     value, flat = probability.flatten(1).topk(min(int(ratio * (n + m)) // 2, n * m))
@@ -92,7 +92,7 @@ def correspond(
 def guided_scores(scores: Tensor, T: Tensor, source: Tokens, target: Tokens) -> Tensor:
     """Scores given a rough pose: only descriptors that it brings near each other can match.
 
-    The nearer ones are not preferred: that would confirm the rough pose, and made it worse where it was good.
+    Nearer ones are not preferred: that would confirm the rough pose, and made good poses worse.
     """
     distance = torch.cdist(transform(T, source.xyz), target.xyz)
     return scores.masked_fill(distance > NEAR, -1e4)

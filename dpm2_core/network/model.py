@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder and decoder as one model, and what can be asked of it: descriptors, poses, overlap."""
+"""Encoder and decoder as one model, which computes descriptors, poses and overlap."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from dpm2_core.network.registrations import register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 
-_KEPT = 4  # sets that are prepared: a scan, the map before a pause and the one after it
+_KEPT = 4  # prepared sets that are cached: a scan, the map before a pause and the one after it
 
 
 class DeepPointMap2(nn.Module):
     """The whole network.
 
     Attributes:
-        solver: how pairs of descriptors become a pose.
+        solver: method that computes a pose from pairs of descriptors.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -53,7 +53,7 @@ class DeepPointMap2(nn.Module):
     def register(self, source: Descriptors, target: Descriptors) -> Registration:
         """Pose of the source in the frame of the target; either may be merged from several frames.
 
-        What is done for each set alone is kept for the next calls with the same object, such as the map of an odometry.
+        The result for each set alone is cached for later calls with the same object, such as the map of an odometry.
         """
         with mixed_precision(self._device):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
@@ -61,7 +61,7 @@ class DeepPointMap2(nn.Module):
             return _of_sets(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
 
     def _prepare(self, descriptors: Descriptors) -> tuple[Tokens, Prepared]:
-        """A set for the decoder, made or kept."""
+        """A set prepared for the decoder, computed or from the cache."""
         entry = next((kept for kept in self._prepared if kept[0] is descriptors), None)
         if entry is None:
             tokens = self._tokens([descriptors])
@@ -72,7 +72,7 @@ class DeepPointMap2(nn.Module):
 
     @torch.inference_mode()
     def register_many(self, sources: list[Descriptors], targets: list[Descriptors]) -> list[Registration]:
-        """`register` for a batch of pairs; nothing is kept."""
+        """`register` for a batch of pairs; nothing is cached."""
         source, target = self._tokens(sources), self._tokens(targets)
         with mixed_precision(self._device):
             correlated = self.decoder(source, target)
@@ -81,7 +81,7 @@ class DeepPointMap2(nn.Module):
 
     @torch.inference_mode()
     def agreement(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[float]:
-        """0..1, how far a set and each of the others agree on a motion as they are: see `pose_solver.agreement`."""
+        """0..1, how far a set and each of the targets agree on a motion before correlation: `pose_solver.agreement`."""
         s, x = self.settings.decoder, self._tokens([source])
         return [
             float(agreement(x, self._tokens([target]), s.temperature, s.pair_ratio))
@@ -112,12 +112,12 @@ class DeepPointMap2(nn.Module):
         return next(self.parameters()).device
 
     def _tokens(self, sets: Sequence[Descriptors]) -> Tokens:
-        """A batch of sets as the network saw them."""
+        """A batch of sets in the axes and scale in which they were encoded."""
         return to_tokens([s.as_encoded() for s in sets], self.decoder.view_aligned, self._device)
 
 
 def _of_sets(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
-    """A registration of sets as the network saw them, in level axes and enlarged, as one of the sets themselves."""
+    """Convert a registration of encoded sets, in leveled axes and enlarged, to the sets' own axes and scale."""
     if source.scale != target.scale:
         return replace(encoded, ok=False, confidence=0.0, overlap=0.0, reason="one is a room, the other is not")
     if source.scale != 1:
@@ -131,7 +131,7 @@ def _of_sets(encoded: Registration, source: Descriptors, target: Descriptors) ->
 
 
 def _reduced(result: Registration, scale: float) -> Registration:
-    """A registration of a scene that was enlarged by `scale`."""
+    """The registration in true scale, from one of a scene that was enlarged by `scale`."""
     T, S = result.T_target_source.copy(), np.repeat([1.0, 1 / scale], 3)
     T[:3, 3] /= scale
     floor = result.floor[0], result.floor[1] / scale

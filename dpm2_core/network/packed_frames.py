@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of packed drives as a network sees its own: they were cropped, and their images made small, for another."""
+"""Frames of packed drives, adapted to a network: they were cropped, and their images resized, for another one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _CROP = ("near", "far", "voxel")
 
 
 def crop_of(points: PointsSettings) -> dict[str, float]:
-    """What `crop` goes by, for the `about` of a packed drive."""
+    """The settings that `crop` uses, for the `about` of a packed drive."""
     return {name: getattr(points, name) for name in _CROP}
 
 
 def check_fits(drive: PackedDrive, network: NetworkSettings, images: bool) -> None:
-    """Raise UsageError where a network wants more than was packed: of the clouds and, if they are read, the images."""
+    """Raise UsageError if a network needs more than was packed, in the clouds or, with `images`, in the images."""
     packed, wanted = _packed_crop(drive), crop_of(network.points)
     for name in _CROP:
         less = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
@@ -34,11 +34,11 @@ def check_fits(drive: PackedDrive, network: NetworkSettings, images: bool) -> No
 
 
 def _packed_crop(drive: PackedDrive) -> dict[str, float]:
-    return drive.about.get("crop", crop_of(PointsSettings()))  # one that does not say is of the presets
+    return drive.about.get("crop", crop_of(PointsSettings()))  # without an entry: packed with that of the presets
 
 
 def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
-    """Raise UsageError where a drive has images that are smaller than those that the network reads."""
+    """Raise UsageError if the images of a drive are smaller than those that the network reads."""
     (height, width), packed = network.image.size, drive.image_size
     if network.image.backbone != "none" and packed is not None and (packed[0] < height or packed[1] < width):
         raise UsageError(
@@ -48,13 +48,13 @@ def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
 
 
 def fitted(sample: Sample, drive: PackedDrive, points: PointsSettings) -> Sample:
-    """A sample of a drive as a network sees it, which may want less of its cloud than was packed."""
+    """A sample of a drive for a network, which may need less of its cloud than was packed."""
     if _packed_crop(drive) == crop_of(points):
         return sample
     return sample._replace(cloud=cropped_anew(sample.cloud, points))
 
 
 def cropped_anew(cloud: NDArray[np.float32], points: PointsSettings) -> NDArray[np.float32]:
-    """A packed cloud (N, 3) cropped for another network. Packed clouds are in the order of x: of the points of a voxel
-    the first would always be the one that lies behind."""
+    """A packed cloud (N, 3), cropped for another network. Packed clouds are sorted by x, so the points are shuffled:
+    the first point of a voxel would otherwise always be the rearmost one."""
     return crop(np.random.default_rng(0).permutation(cloud), points)

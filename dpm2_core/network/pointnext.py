@@ -35,7 +35,7 @@ def gather(values: Tensor, index: Tensor) -> Tensor:
 
 
 def view_axes(xyz: Tensor, view_aligned: bool = True) -> Tensor:
-    """Horizontal unit vectors (..., 2) from the sensor to points (..., 3); (1, 0) above it, or all if not aligned."""
+    """Horizontal unit vectors (..., 2) from sensor to points (..., 3); (1, 0) above it, and for all if not aligned."""
     xy = xyz[..., :2]
     length = xy.norm(dim=-1, keepdim=True)
     forward = torch.zeros_like(xy)
@@ -46,7 +46,7 @@ def view_axes(xyz: Tensor, view_aligned: bool = True) -> Tensor:
 
 
 def to_view(vectors: Tensor, axis: Tensor) -> Tensor:
-    """Turn vectors (..., 3) into the frames whose x axes are `axis` (..., 2); broadcasts."""
+    """Rotate vectors (..., 3) into the frames whose x axes are `axis` (..., 2); broadcasts."""
     c, s = axis[..., 0], axis[..., 1]
     x, y, z = vectors.unbind(-1)
     return torch.stack([c * x + s * y, c * y - s * x, z], -1)
@@ -70,7 +70,7 @@ class Pooled(nn.Module):
     """Linear layer, LayerNorm, ReLU and maximum over neighbors.
 
     `pool_first` takes the maximum right after the linear layer: k times less to normalize, and the part of the layer
-    that reads the neighbor's own features is computed once a point before it is gathered.
+    that reads the neighbor's own features is computed once per point, before it is gathered.
     """
 
     def __init__(self, channels_in: int, relative: int, channels_out: int, pool_first: bool) -> None:
@@ -81,7 +81,7 @@ class Pooled(nn.Module):
         self.norm = nn.LayerNorm(channels_out)
 
     def forward(self, features: Tensor, index: Tensor, relative: Tensor) -> Tensor:
-        """features (B, m, C), index (B, n, k) into m, places (B, n, k, P): (B, n, channels_out)."""
+        """features (B, m, C), index (B, n, k) into m, relative (B, n, k, P) positions: (B, n, channels_out)."""
         if not self.pool_first:
             joined = torch.cat([gather(features, index), relative.to(features.dtype)], -1)
             return torch.relu(self.norm(self.linear(joined))).amax(2)
@@ -91,9 +91,9 @@ class Pooled(nn.Module):
 
 
 def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
-    """Maximum over k of own[index] + weight @ places, without keeping the (n, k, C) sums for the gradient.
+    """Maximum over k of own[index] + weight @ relative, without keeping the (n, k, C) sums for the gradient.
 
-    own (B, m, C) and index (B, n, k), or None for places alone; places (B, n, k, P), weight (C, P): (B, n, C).
+    own (B, m, C) and index (B, n, k), or None for `relative` alone; relative (B, n, k, P), weight (C, P): (B, n, C).
     """
     if as_machine_code(relative):
         return largest_sums(own, index, relative, weight)
@@ -113,7 +113,7 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
 def argmax_neighbor(sums: Tensor) -> Tensor:
     """Index (B, n, C) of the largest of (B, n, k, C) over k < 256.
 
-    `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the index rides in the lowest bits.
+    `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the lowest bits store the index.
     """
     k = torch.arange(sums.shape[2], dtype=torch.int32, device=sums.device)[:, None]
     tagged = sums.float().view(torch.int32).bitwise_and(~255).bitwise_or(k)
@@ -121,7 +121,7 @@ def argmax_neighbor(sums: Tensor) -> Tensor:
 
 
 class Aggregation(nn.Module):
-    """Neighbor features with their relative places through one layer, then the maximum."""
+    """Neighbor features with their relative positions through one layer, then the maximum."""
 
     def __init__(self, channels_in: int, channels_out: int, radius: float, settings: PointsSettings) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ class Aggregation(nn.Module):
         if not self.view_aligned:
             return self.pooled(features, index, delta)
         axis = view_axes(centers)[:, :, None]
-        turn = gather(view_axes(xyz), index)  # the neighbor's own axis, seen in the center's
+        turn = gather(view_axes(xyz), index)  # the neighbor's own axis; next, in the center's frame
         turned = to_view(torch.cat([turn, turn[..., :1]], -1), axis)[..., :2]
         return self.pooled(features, index, torch.cat([to_view(delta, axis), turned], -1))
 
@@ -145,11 +145,11 @@ class Aggregation(nn.Module):
 class PatchAbstraction(nn.Module):
     """Stem and first set abstraction, on the neighborhoods of raw points.
 
-    The stem is linear, so it is applied to center and offset apart: the same result without a stem per neighbor.
+    The stem is linear, so it is applied to center and offset separately: the same result without a stem per neighbor.
     """
 
     def __init__(self, settings: PointsSettings, painted: bool = False) -> None:
-        """`painted`: every raw point comes with the color of its pixel, which counts for nothing before training."""
+        """`painted`: every raw point comes with the color of its pixel, whose weights are zero before training."""
         super().__init__()
         stage = settings.stages[0]
         self.radius, self.far = stage.radius, settings.far

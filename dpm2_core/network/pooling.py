@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The point backbone's loops over neighbors as machine code, for inference: torch makes a pass for every operation."""
+"""The point backbone's loops over neighbors, compiled for inference: torch makes a pass for every operation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def largest_sums(own: Tensor | None, index: Tensor | None, relative: Tensor, wei
 
 
 def places_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -> Tensor:
-    """Where neighbors are, in units of the radius, and how their axes are turned, as seen in the frames of the centers.
+    """Positions of neighbors, in units of the radius, and their view axes, both in the view frames of the centers.
 
     xyz (B, m, 3) of which the first n are the centers, axes (B, m, 2), index (B, n, k) into m: (B, n, k, 5), see
     `pointnext.Aggregation`; on the CPU and without gradients.

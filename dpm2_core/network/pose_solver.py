@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pairs of points to a pose: consensus, precision-weighted solve or robust SVD.
 
-Beyond the paper: the first pose is a consensus of pairs that keep each other's distances, and with it the descriptors
-are matched again, each to what lies near it; where little fits, other poses are tried. The paper's own way is the
-solver `confident`.
+Beyond the paper: the first pose is a consensus of pairs whose mutual distances agree. With it the descriptors are
+matched again, each only to those that lie near it. If few pairs fit, other poses are tried. The paper's own method is
+the solver `confident`.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from dpm2_core.network.solved import Solved, confidence_of
 from dpm2_core.network.tokens import Tokens
 
 MIN_INLIERS = 30
-BEST = 30  # pairs whose mean probability says how well a pose is borne out
+BEST = 30  # pairs whose mean probability measures how well the matches support a pose
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
-FEW = 0.5  # of the pairs: where no more of them fit, other poses are tried, too
+FEW = 0.5  # share of the pairs: if fewer of them fit, other poses are tried, too
 TRIED = 8  # other poses, at most
 CLEARLY = 1.0  # logit by which the most probable of them must exceed that of the first pose to replace it
-MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from so many pairs, and from those that are so probable
+MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from this number of pairs, and all of this probability
 
 Solver = Literal["consensus", "confident"]
-"""How pairs become a pose: by a consensus and matched again with the pose at hand; or, as in the paper, by a robust SVD
-that starts from the most confident pairs, matched once."""
+"""Method that computes a pose from pairs: a consensus, with which they are matched again; or, as in the paper, a robust
+SVD that starts from the most confident pairs, matched once."""
 
 
 def first_pose(pairs: Correspondences) -> Tensor:
@@ -53,9 +53,9 @@ def first_pose(pairs: Correspondences) -> Tensor:
 
 
 def agreement(source: Tokens, target: Tokens, temperature: float, ratio: float) -> Tensor:
-    """How far two sets, matched as they are before either has seen the other, agree on a motion: the part (B,) of the
-    best pairs that one pose brings together. Of two views of a place it is large, of two places small, and it takes a
-    tenth of the time of a registration."""
+    """How far two sets agree on a motion: the share (B,) of the best pairs that one pose brings together. They are
+    matched before either has seen the other. The share is large for two views of a place, and small for two places. It
+    takes a tenth of the time of a registration."""
     scores = cosine(source.features, target.features) / temperature
     weight, i, j = best_pairs(softmax_both(scores, source.mask, target.mask), source.mask, target.mask, ratio)
     if weight.shape[1] == 0:
@@ -66,7 +66,7 @@ def agreement(source: Tokens, target: Tokens, temperature: float, ratio: float) 
 
 
 def supporting(pairs: Correspondences, T: Tensor) -> Tensor:
-    """The pairs (B, 2K) within `TOLERANCE` of a rough pose (B, 4, 4); all where they are few."""
+    """The pairs (B, 2K) within `TOLERANCE` under a rough pose (B, 4, 4); all pairs if these are few."""
     usable = pairs.weight > 0
     error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
     inliers = (error <= TOLERANCE) & usable
@@ -75,16 +75,16 @@ def supporting(pairs: Correspondences, T: Tensor) -> Tensor:
 
 
 def most_confident(pairs: Correspondences) -> Tensor:
-    """The pairs (B, 2K) that the paper's solver starts from: the `MOST_CONFIDENT`, and all that are `SURE`."""
+    """The pairs (B, 2K) that the paper's solver starts from: the `MOST_CONFIDENT`, and all of probability `SURE`."""
     least = pairs.weight.topk(min(MOST_CONFIDENT, pairs.weight.shape[1]))[0][:, -1:]
     return (pairs.weight >= least.clamp(max=SURE)) & (pairs.weight > 0)
 
 
 def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
-    """Weighted SVD on inliers that are chosen anew each round: those within mean + 3 deviations of the inliers.
+    """Weighted SVD on inliers that are chosen again each round: those within mean + 3 deviations of the inliers.
 
     Args:
-        inliers: (B, 2K), the first.
+        inliers: (B, 2K), the first ones.
 
     Returns:
         T (B, 4, 4) float64 and inliers (B, 2K).
@@ -105,7 +105,7 @@ def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> t
 
 class Matched(NamedTuple):
     """A batch of set pairs that the decoder has correlated, with the scores (B, N, M) of their matches, and the pairs
-    of these that are chosen without knowing a pose."""
+    chosen from these without a pose."""
 
     source: Tokens
     target: Tokens
@@ -117,7 +117,7 @@ class Matched(NamedTuple):
 def solve_batch(
     decoder: Decoder, source: Tokens, target: Tokens, correlated: Correlated, solver: Solver = "consensus"
 ) -> Solved | None:
-    """Match and solve; None where there is nothing to match."""
+    """Match and solve; None if there is nothing to match."""
     scores = match_scores(decoder, correlated)
     unguided = correspond(decoder, source, target, correlated, scores)
     if unguided.weight.shape[1] == 0:
@@ -131,7 +131,7 @@ def solve_batch(
 
 
 def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
-    """From rough poses (B, 4, 4): solved, matched again to what lies near under the pose at hand, solved again."""
+    """Solve from rough poses (B, 4, 4); then match again, only what is near under the current pose, and solve again."""
     source, target, correlated, scores, pairs = matched
     solve = _solve_precise if decoder.settings.precision else _solve_svd_near
     T, information, inliers = solve(pairs, T)
@@ -144,7 +144,7 @@ def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
 def _judged(
     decoder: Decoder, matched: Matched, pairs: Correspondences, solution: tuple[Tensor, Tensor, Tensor]
 ) -> Solved:
-    """Poses (B, 4, 4), information (B, 6, 6) and inliers (B, 2K) of pairs, with what tells how good they are."""
+    """Poses (B, 4, 4), information (B, 6, 6) and inliers (B, 2K) of pairs, with figures of their quality."""
     T, information, inliers = solution
     covariance = decoder.settings.covariance_scale * torch.linalg.inv_ex(information)[0]
     count = inliers.sum(1)
@@ -154,7 +154,8 @@ def _judged(
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
-    """The same, but where few pairs fit, as on both sides of a corner, and another pose is clearly more probable."""
+    """The same, but replaced where few pairs fit, as on both sides of a corner, and another pose is clearly more
+    probable."""
     rows = (solved.share < FEW).nonzero()[:, 0]
     if len(rows) == 0:
         return solved
@@ -170,19 +171,19 @@ def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
 
 
 def _rows(batch: Any, index: Tensor) -> Any:
-    """Some members of a batch: tensors in named tuples, nested at will."""
+    """Some members of a batch: tensors in arbitrarily nested named tuples."""
     return batch[index] if isinstance(batch, Tensor) else type(batch)(*(_rows(field, index) for field in batch))
 
 
 def _with_rows(batch: Any, index: Tensor, others: Any) -> Any:
-    """The batch with others in the place of its members `index`."""
+    """The batch with its members `index` replaced by others."""
     if isinstance(batch, Tensor):
         return batch.index_copy(0, index, others)
     return type(batch)(*(_with_rows(*fields) for fields in zip(batch, [index] * len(batch), others, strict=True)))
 
 
 def _solve_precise(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose, information and inliers by the predicted precisions; as machine code where no gradient is asked for."""
+    """Pose, information and inliers by the predicted precisions; compiled on the CPU if no gradient is needed."""
     if T.device.type == "cpu" and not torch.is_grad_enabled():
         T, information, squared = _solve_compiled(pairs, T)
     else:
@@ -207,7 +208,7 @@ def _solve_svd_near(pairs: Correspondences, T: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _solve_svd(pairs: Correspondences, inliers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose, information and inliers by the robust SVD: every offset counts as known like the others."""
+    """Pose, information and inliers by the robust SVD: all offsets count as equally precise."""
     T, inliers = robust_kabsch(pairs, inliers)
     sigma = _residual(pairs, T, inliers).clamp(min=0.02)[:, None, None, None] / 3**0.5
     _, jacobian = whitened_residuals(T, pairs._replace(L=torch.eye(3, device=T.device).expand_as(pairs.L)))
@@ -222,7 +223,7 @@ def _residual(pairs: Correspondences, T: Tensor, inliers: Tensor) -> Tensor:
 
 
 def _borne_out(unguided: Correspondences, T: Tensor) -> Tensor:
-    """Mean probability (B,) of the best pairs, as matched without the poses, that these bring together."""
+    """Mean probability (B,) of the best pairs, matched without the poses, that the poses bring together."""
     error = (transform(T, unguided.source.double()) - unguided.target).norm(dim=-1)
     weight = unguided.weight * (error <= TOLERANCE)
     return weight.topk(min(BEST, weight.shape[1]))[0].mean(1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""bf16 where the device multiplies it."""
+"""bf16 on devices that multiply it in hardware."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 
 def mixed_precision(device: torch.device, wanted: bool = True) -> torch.autocast:
-    """The context of the network on this device: autocast to bf16 where it is wanted and multiplied, else float32."""
+    """The context of the network on this device: autocast to bf16 if wanted and supported, else float32."""
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and multiplies_bf16(device.type))
 
 
 def product_type(x: Tensor) -> torch.dtype:
-    """Of what is multiplied with a tensor: bf16 under autocast, else the tensor's own."""
+    """The type of what is multiplied with a tensor: bf16 under autocast, else the tensor's own."""
     return torch.bfloat16 if torch.is_autocast_enabled(x.device.type) else x.dtype
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weights that come with dpm2: where they are, and the network loaded with them. Imports torch only to load."""
+"""The weights that come with dpm2: their files, and the network loaded with them. Imports torch only to load."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.imports import importing
 from dpm2_core.openmp import allowed
 
-if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
+if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does not need it
     from dpm2_core.network.model import DeepPointMap2
 
 M = TypeVar("M")
 PERCEPTION_WEIGHTS: dict[str, str] = {"movers": "movers", "ground": "gndnet", "static": "dslr"}
-"""Names of the weights of each kind, and of the task that trains them."""
+"""Name of the weights of each kind, which is also the task that trains them."""
 DYNAMIC = 0.4
-"""Probability from which a point is taken for one of a dynamic object: of 0.3, 0.35, 0.4 and 0.5 the best on the three
+"""Probability from which a point counts as part of a dynamic object: the best of 0.3, 0.35, 0.4 and 0.5 on the three
 kinds of validation worlds."""
 PRETRAINED_DIR = Path(__file__).resolve().parents[1] / "weights"
 """Folder of the weights that come with dpm2."""
@@ -43,7 +43,7 @@ def weights_path(weights: str) -> Path:
     """The file of shipped weights by their name, or the file of that path.
 
     Raises:
-        UsageError: there is neither.
+        UsageError: neither exists.
     """
     if weights in pretrained_names():
         return PRETRAINED_DIR / f"{weights}.safetensors"
@@ -55,15 +55,15 @@ def weights_path(weights: str) -> Path:
 
 
 def weights_id(weights: str) -> str:
-    """What identifies the descriptors that weights make: name, and the first 16 digits of the SHA-256 of the encoder.
+    """Identifier of the descriptors that weights produce: name, and the first 16 digits of the SHA-256 of the encoder.
 
-    Weights with another decoder have the same: it reads the descriptors of a map that was made before.
+    Weights that differ only in the decoder have the same identifier: they read the descriptors of existing maps.
 
     Args:
         weights: name of shipped weights, or path of a file.
 
     Raises:
-        UsageError: there is neither, or it is no weights. Dpm2Error: the file cannot be read.
+        UsageError: neither exists, or the file contains no weights. Dpm2Error: the file cannot be read.
     """
     path = weights_path(weights)
     try:
@@ -89,15 +89,15 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
     A file that has changed since is loaded again.
 
     Args:
-        threads: of torch, which has one number for the whole process; the only place that sets it.
+        threads: of torch, one number for the whole process; it is set only here.
         load: makes the network, ready for inference.
 
     Returns:
-        An object of the caller's own, so that what one caller's network remembers is not mixed up with another's, in
-        this thread or in another one. Its layers are shared: do not train them.
+        A separate object for each caller, so that callers do not share what the network caches, in this thread or in
+        another one. Its layers are shared: do not train them.
 
     Raises:
-        UsageError: as `load`, and for a file that is not there.
+        UsageError: as `load`, and for a missing file.
     """
     with importing():
         import torch
@@ -112,7 +112,7 @@ def load_once(path: Path, threads: int, load: Callable[[Path], M]) -> M:
     with _LOCK:
         if key not in _LOADED or _LOADED[key][0] != version:
             _LOADED[key] = (version, load(path))
-        network = copy.copy(_LOADED[key][1])  # of the object alone, not of the layers in it
+        network = copy.copy(_LOADED[key][1])  # of the object only: the layers are shared
     return cast(M, network)
 
 
@@ -123,7 +123,7 @@ def load_network(weights: str, threads: int) -> DeepPointMap2:
 
     Args:
         weights: name of shipped weights, or path of a .safetensors file.
-        threads: of torch, which has one number for the whole process.
+        threads: of torch, one number for the whole process.
 
     Raises:
         UsageError: no such weights.
@@ -137,5 +137,5 @@ def _load(path: Path) -> DeepPointMap2:
 
     model, metadata = load_model_and_metadata(path)
     if metadata.get("images") != "true":
-        model.encoder.image = None  # a branch that has never seen an image would only disturb
+        model.encoder.image = None  # a branch trained without images would only do harm
     return model

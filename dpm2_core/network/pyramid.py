@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A raw scan becomes the point pyramid that the backbone reads: sampling and neighbor search, once, in numpy."""
+"""The point pyramid of a raw scan, which the backbone reads: sampling and neighbor search, once, in numpy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.network.images import small_image
 from dpm2_core.network.settings import NetworkSettings, PointsSettings
 
-MIN_POINTS = 32  # below this a scan says nothing about the pose
+MIN_POINTS = 32  # a scan with fewer points does not determine the pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,15 @@ class PointBatch(NamedTuple):
 
 
 def crop(points: NDArray[np.float32], settings: PointsSettings) -> NDArray[np.float32]:
-    """Range crop and voxel grid of (N, 3+) points: (M, 3) by x, so that the order of a cloud with one point per voxel
-    does not matter; of several the first is kept.
+    """Range crop and voxel grid of (N, 3+) points: (M, 3), sorted by x, so that the order of a cloud with one point per
+    voxel does not matter; of several points the first is kept.
     """
     xyz = points[voxel_first(points, settings.voxel, settings.near, settings.far), :3]
     return xyz[np.argsort(xyz[:, 0])]
 
 
 def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: Sequence[Image] = ()) -> Pyramid:
-    """The pyramid of a cropped (M, 3) cloud, and of its images where reference points may be corners of them.
+    """The pyramid of a cropped (M, 3) cloud, and of its images if reference points may be their corners.
 
     Raises:
         Dpm2Error: fewer than `MIN_POINTS` points.
@@ -126,7 +126,7 @@ def _sampled(
 
 
 def _corners(cloud: NDArray[np.float32], images: Sequence[Image], network: NetworkSettings, most: int) -> Corners:
-    """Corners of all images, as many of each; none for a network without a camera."""
+    """Corners of all images, the same limit for each; none for a network without a camera."""
     if network.image.backbone == "none" or not images or most < len(images):
         return no_corners()
     found = []

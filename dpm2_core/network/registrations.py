@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solved poses to registrations: how probable it is that a pose is right, and that both sets saw the same place."""
+"""Registrations from solved poses, with the probability that a pose is right, and that both sets saw the same place."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dpm2_core.network.pose_solver import Solver, solve_batch
 from dpm2_core.network.solved import Solved, confidence_of, overlap_features
 from dpm2_core.network.tokens import Tokens
 
-LEAST = 0.1  # confidence: below it a pose is no result
-LEAST_SHARE = 0.4  # of the pairs: fewer fit at wrong poses alone
-LEAST_MATCHED = 0.15  # mean probability of the best pairs, where no head knows more: of the solver `confident`
+LEAST = 0.1  # confidence: a pose below it is rejected
+LEAST_SHARE = 0.4  # of the pairs: fewer fit only at wrong poses
+LEAST_MATCHED = 0.15  # mean probability of the best pairs, if the confidence head does not apply: solver `confident`
 
 
 def register_batch(
@@ -26,7 +26,7 @@ def register_batch(
     solved = solve_batch(decoder, source, target, correlated, solver)
     if solved is None:
         return [Registration.failed("neural", "0 matching descriptors, want 3")] * len(source.xyz)
-    if decoder.settings.precision and solver == "consensus":  # whose figures the head has learned from
+    if decoder.settings.precision and solver == "consensus":  # the head was trained on its figures
         confidence = confidence_of(decoder, solved).sigmoid()
         improbable = [_improbable(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
     else:
@@ -51,19 +51,19 @@ def overlap_probability(
 
 
 def _few(count: int) -> str:
-    """Why so many pairs make no pose; empty where they do."""
+    """Why this number of pairs gives no pose; empty if it does."""
     return f"{count} matching descriptors, want 3" if count < 3 else ""
 
 
 def _improbable(share: float, confidence: float) -> str:
-    """Why a pose that brings such a share of the pairs together is no result; empty where it is one."""
+    """Why a pose is rejected that brings this share of the pairs together; empty if it is not."""
     if share < LEAST_SHARE:
         return f"only {share:.0%} of the matched descriptors fit one motion"
     return "" if confidence >= LEAST else f"right with a probability of only {confidence:.0%}"
 
 
 def _unmatched(borne_out: float) -> str:
-    """The same of a pose that is borne out by matches of such a mean probability alone."""
+    """The same for a pose that is judged only by the mean probability of the matches that support it."""
     return "" if borne_out >= LEAST_MATCHED else f"descriptors match with a confidence of only {borne_out:.2f}"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image backbones by name: they map pixels to maps of features."""
+"""Image backbones by name: they compute feature maps from pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def image_backbone(settings: ImageSettings) -> ImagePyramid | None:
     """The image backbone that the settings name, with its pyramid; None for `none`.
 
     Raises:
-        UsageError: no such backbone, or timm is asked for and not installed.
+        UsageError: no such backbone, or timm is requested and not installed.
     """
     if settings.backbone == "none":
         return None

@@ -27,7 +27,7 @@ class StageSettings(Settings):
     neighbours: int = Field(gt=0)
     """Neighbors in the set abstraction."""
     channels: int = Field(gt=0)
-    """Channels out."""
+    """Output channels."""
     residual_radii: tuple[float, ...] = Field((), max_length=64)
     """Radius of each inverted residual block, m."""
     residual_neighbours: int = Field(16, gt=0)
@@ -38,7 +38,7 @@ class PointsSettings(Settings):
     """The LiDAR side: preprocessing and point backbone."""
 
     backbone: Literal["pointnext"] = "pointnext"
-    """The only one."""
+    """Point backbone: the only one."""
     voxel: float = Field(0.3, gt=0)
     """Edge of the input voxel grid, m."""
     near: float = Field(1.0, ge=0)
@@ -89,22 +89,22 @@ class FusionSettings(Settings):
     """Reference points and multi-modal transformer."""
 
     kind: FusionKind = "biased"
-    """How LiDAR and image features reach the reference points; none is DeepPointMap v1, the backbone's own points.
-    The others than biased are the alternatives of the paper's Table 4; point_painting gives every point of the cloud
-    the color of its pixel before the point backbone, and has no image backbone."""
+    """How LiDAR and image features reach the reference points. none is DeepPointMap v1, with the backbone's own points.
+    All except biased and none are the alternatives of the paper's Table 4. point_painting gives every point of the
+    cloud the color of its pixel before the point backbone, and has no image backbone."""
     reference: Literal["salient", "fps", "uniform", "normal"] = "salient"
     """How reference points are chosen: image corners, vertical edges and poles of the cloud among its farthest points,
     farthest points alone, or random positions. The last three are those of the paper's Table 3."""
     edges: float = Field(0.5, ge=0, le=1)
-    """Ratio of the reference points but for image corners that `salient` puts on vertical edges; fewer where a scan
+    """Ratio of the reference points, image corners excluded, that `salient` puts on vertical edges; fewer if a scan
     shows fewer."""
     corners: float = Field(0, ge=0, le=1)
-    """Ratio of the reference points that `salient` puts on image corners with the depth of the scan, each with the
-    texture around it in its descriptor; fewer where the images show fewer, none without an image."""
+    """Ratio of the reference points that `salient` puts on image corners with the depth of the scan. The descriptor of
+    each contains the texture around it. Fewer if the images show fewer, none without an image."""
     points: int = Field(256, gt=0)
     """Number of reference points."""
     reference_features: bool = True
-    """Start a reference point from the backbone's features where it is one of its points; False: from xyz alone."""
+    """Start a reference point from the backbone's features if it is one of its points; False: from xyz alone."""
     layers: int = Field(3, gt=0, le=64)
     """Multi-modal transformer layers."""
     heads: int = Field(4, gt=0, le=256)
@@ -112,19 +112,19 @@ class FusionSettings(Settings):
     alpha_lidar: float = Field(0.1, gt=0)
     """Decay of the point-to-point bias, 1/m."""
     alpha_image: tuple[float, ...] = (0.3, 1.0, 2.5, 6.0)
-    """Decay of the point-to-ray bias, 1/m: one for all heads, or one a head."""
+    """Decay of the point-to-ray bias, 1/m: one for all heads, or one per head."""
     learned_gain: bool = True
     """A learned factor per head and branch on the z-scored spatial bias; False: 1, as in the paper."""
     levels: tuple[int, ...] = (1, 3)
     """Backbone levels, 0 the finest, whose key-points the LiDAR branch reads."""
     relative: bool = True
-    """Among reference points, add to the attention a learned bias from where one lies as seen from the other."""
+    """Add to the attention among reference points a learned bias, given by where one lies as seen from the other."""
     pixel: bool = True
-    """Add the image's feature where a reference point projects to its descriptor: along a tunnel the texture right
-    there tells places apart, and the way through the attention is long to learn. False: the paper's."""
+    """Add to a descriptor the image feature at the pixel of its reference point. Along a tunnel, the texture at that
+    pixel distinguishes places, and through the attention this takes long to learn. False: as in the paper."""
     image_mask: Literal["view", "front"] = "view"
-    """Which reference points read an image: those that project into it, or, as in the paper, all, with the pixels
-    whose rays point away counted as far."""
+    """Which reference points read an image. `view`: those that project into it. `front`: all, as in the paper; pixels
+    whose rays point away count as far."""
 
 
 class DecoderSettings(Settings):
@@ -140,20 +140,20 @@ class DecoderSettings(Settings):
     """`sine`: code of absolute coordinates added before each attention, as in DeepPointMap. `relative`: a learned bias
     from where one descriptor lies as seen from the other; it does not depend on origin or heading."""
     precision: bool = True
-    """Predict with each offset its 3x3 precision (inverse covariance), and weigh the pose with it."""
+    """Predict with each offset its 3x3 precision (inverse covariance), and weight the offset in the pose with it."""
     temperature: float = Field(0.1, gt=0)
-    """Of the dual softmax over similarities."""
+    """Temperature of the dual softmax over similarities."""
     pair_ratio: float = Field(0.5, gt=0, le=1)
     """Pairs used for the pose: floor(ratio * (M + N)) // 2 of the most similar."""
     offset_limit: float = Field(2.0, gt=0)
     """Pairs with a longer predicted offset are dropped, m."""
     guided: int = Field(2, ge=0, le=64)
-    """Times that descriptors are matched anew with the pose at hand. 0: the paper's single matching."""
+    """Number of times that descriptors are matched again with the current pose. 0: the paper's single matching."""
     overlap_pose: bool = True
-    """The overlap head asks how much of a pair fits its registration, how certain that is and how far apart it puts
-    them. False: the paper's, which asks the descriptors."""
+    """The overlap head reads the registration of a pair: how much of the pair fits, how well the matches support it,
+    and the distance. False: it reads the descriptors, as in the paper."""
     covariance_scale: float = Field(4.0, gt=0)
-    """Factor on the covariance of the pose: both directions of a pair and neighboring pairs err alike."""
+    """Factor on the covariance of the pose: both directions of a pair, and neighboring pairs, have similar errors."""
 
 
 class NetworkSettings(Settings):
@@ -189,7 +189,7 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettin
 
 
 def _misfits(s: NetworkSettings) -> Iterator[str]:
-    """What does not fit each other, in words."""
+    """The settings that do not fit each other, in words."""
     fusion, decoder = s.fusion, s.decoder
     sizes = [stage.points for stage in s.points.stages]
     if sorted(sizes, reverse=True) != sizes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that were solved for: how close their pairs come, and how probably they are right."""
+"""Solved poses: how well their pairs fit, and how probable it is that they are right."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpm2_core.network.decoder import Decoder
 
-_BORNE_OUT, _SIGMA, _RMSE = 0.01, 0.02, 0.8  # less of these tells no more: 99 % of right poses have more
+_BORNE_OUT, _SIGMA, _RMSE = 0.01, 0.02, 0.8  # lower values are clamped: 99 % of right poses have more
 _WORST = 1e3  # m
 
 
@@ -19,11 +19,11 @@ class Solved(NamedTuple):
 
     Attributes:
         T: (B, 4, 4) float64.
-        covariance: (B, 6, 6) [rad, m] of xi in T exp(xi); not finite where the pairs leave a pose open.
+        covariance: (B, 6, 6) [rad, m] of xi in T exp(xi); not finite if the pairs do not determine a pose.
         residual: (B,) m, root mean square distance between the points of the inliers.
         inliers: (B,) pairs that fit, in both directions.
-        borne_out: (B,) 0..1, mean probability of the best pairs, as matched without the pose, that it brings together.
-        share: (B,) 0..1, of the pairs that are inliers.
+        borne_out: (B,) 0..1, mean probability of the best pairs, matched without the pose, that it brings together.
+        share: (B,) 0..1, share of the pairs that are inliers.
     """
 
     T: Tensor
@@ -41,12 +41,12 @@ def confidence_of(decoder: Decoder, solved: Solved) -> Tensor:
 
 
 def confidence_features(solved: Solved) -> Tensor:
-    """What tells a right pose from a wrong one (B, `CONFIDENCE_FEATURES`): logarithm of how well the matches bear it
-    out, share of the pairs that fit, logarithms of the largest standard deviation of the position and of the residual,
-    and the distance in units of 20 m, at most 1.
+    """Features (B, `CONFIDENCE_FEATURES`) that distinguish right poses from wrong ones: logarithm of `borne_out`, share
+    of the pairs that fit, logarithms of the largest standard deviation of the position and of the residual, and the
+    distance in units of 20 m, at most 1.
 
-    A wrong pose brings fewer pairs together, and less closely. Of views far apart less is to be expected: what a wrong
-    pose in a tunnel puts at the same place would match better if it were there.
+    A wrong pose brings fewer pairs together, and less closely. For views far apart, fewer pairs are expected. Frames
+    that a wrong pose in a tunnel puts at the same place would match better if they were there.
     """
     variance = torch.linalg.eigvalsh(solved.covariance[:, 3:, 3:].nan_to_num(_WORST**2, _WORST**2))[:, -1]
     borne_out = solved.borne_out.double().nan_to_num(0.0).clamp(min=_BORNE_OUT).log()
@@ -57,8 +57,8 @@ def confidence_features(solved: Solved) -> Tensor:
 
 
 def overlap_features(solved: Solved) -> Tensor:
-    """What the pose of a pair says about its overlap (B, `POSE_FEATURES`): how well the matches bear it out, the
-    distance in units of 20 m, and the share of the pairs that fit, which tells places apart that look alike."""
+    """Features (B, `POSE_FEATURES`) of the pose of a pair for its overlap: `borne_out`, the distance in units of 20 m,
+    and the share of the pairs that fit, which distinguishes places that look alike."""
     distance = _distance(solved)
     return torch.stack([solved.borne_out.nan_to_num(0.0).to(distance.dtype), distance, solved.share], -1).float()
 

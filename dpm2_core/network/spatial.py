@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tokens are: spatial biases of LiDAR key-points and feature pixels, and image features at projected points."""
+"""Positions of tokens: spatial biases of LiDAR key-points and feature pixels, image features at projected points."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def _distances(points: Tensor, tokens: Tensor) -> Tensor:
 
 
 def _near_bias(distance: Tensor, counted: Tensor, mask: Tensor, alphas: tuple[float, ...]) -> Tensor:
-    """The z-scores (B, len(alphas), N, T) of M exp(-alpha distance) over the tokens that the mask shows, those of the
-    others being 0; M is 0 where a distance (B, N, T) is not counted. The mask is (B, 1, T or 1).
+    """The z-scores (B, len(alphas), N, T) of M exp(-alpha distance) over the tokens that the mask shows, and 0 for the
+    others; M is 0 where a distance (B, N, T) is not counted. The mask is (B, 1, T or 1).
 
     bf16 under autocast: the largest tensors of the network, read by every layer.
     """
@@ -56,12 +56,12 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
     """Bias of feature pixels by the distance of points from their rays.
 
     Args:
-        points: (B, N, 3), m. uv: (T, 2), pixels, the same in every view. alphas: 1/m, one or one a head.
+        points: (B, N, 3), m. uv: (T, 2), pixels, the same in every view. alphas: 1/m, one or one per head.
 
     Returns:
-        The z-score over the T tokens of each view of M exp(-alpha distance), (B, len(alphas), N, V * T), M being 0 for
-        points behind the camera: another camera changes nothing of what this one says; and `seen` (B, N, V), True where
-        the point projects into an image that is present.
+        The z-score of M exp(-alpha distance), (B, len(alphas), N, V * T), where M is 0 for points behind the camera. It
+        is taken over the T tokens of each view, so that one camera does not change the bias of another. And `seen`
+        (B, N, V), True where the point projects into an image that is present.
     """
     biases, seen = [], []
     for view in range(views.pixels.shape[1]):
@@ -73,7 +73,7 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
 
 
 def seen_from(points: Tensor, views: Views, view: int) -> Tensor:
-    """Which points (B, N, 3) project into a view's image, where there is one: (B, N)."""
+    """Which points (B, N, 3) project into a view's image, if it is present: (B, N)."""
     height, width = views.pixels.shape[-2:]
     at, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
     inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
@@ -93,7 +93,7 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
     uv, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
     size = torch.tensor([width, height], device=uv.device)
     grid = (uv + 0.5) / size * 2 - 1
-    grid = torch.where(depth[..., None] > 0.1, grid, torch.full_like(grid, -9))  # behind: outside
+    grid = torch.where(depth[..., None] > 0.1, grid, torch.full_like(grid, -9))  # behind the camera: outside
     steps = torch.arange(window, device=uv.device) - window // 2
     shift = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
     shift = shift * 2 / torch.tensor(features.shape[:1:-1], device=uv.device)
@@ -105,7 +105,7 @@ def sample_at_points(points: Tensor, views: Views, features: Tensor, window: int
 
 def paint(points: Tensor, views: Views) -> Tensor:
     """Colors of points (B, N, 3), m: (B, N, 4) red, green, blue, 0..1, of the first image that shows a point, and 1;
-    zeros for one that none shows.
+    zeros for a point that no image shows.
 
     S. Vora et al., "PointPainting: Sequential Fusion for 3D Object Detection", CVPR 2020, with colors for classes.
     """
@@ -114,7 +114,7 @@ def paint(points: Tensor, views: Views) -> Tensor:
         seen = seen_from(points, views, view) & (out[..., 3] == 0)
         pixels = views.pixels[:, view].float() / 255
         sampled = sample_at_points(points, views, torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1), 1, view)
-        covered = sampled[..., 3:]  # less than 1 within half a pixel of the border, where nothing is mixed in
+        covered = sampled[..., 3:]  # less than 1 within half a pixel of the border, where zeros are mixed in
         color = torch.cat([sampled[..., :3] / covered.clamp(min=1e-3), torch.ones_like(covered)], -1)
         out = torch.where(seen[..., None], color, out)
     return out
@@ -127,7 +127,7 @@ def image_features(points: Tensor, views: Views, maps: list[FeatureMap]) -> tupl
         points: (B, N, 3), m.
 
     Returns:
-        (B, N, C), the mean of the views that see the point, zero where none does; and (B, N), whether any does.
+        (B, N, C), the mean of the views that see the point, zero if none does; and (B, N), whether any does.
     """
     finest = maps[0].features.unflatten(0, tuple(views.present.shape))
     seen = torch.stack([seen_from(points, views, view) for view in range(finest.shape[1])], -1)

@@ -30,7 +30,7 @@ class Tokens(NamedTuple):
     mask: Tensor
 
     def at(self, index: Tensor) -> Tokens:
-        """The sets with these numbers, of any shape, one after the other."""
+        """The sets with these numbers, one after the other; `index` has any shape."""
         return Tokens(*(field[index.flatten()] for field in self))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights as safetensors: nothing that is loaded can execute code, and nothing is loaded into the wrong network.
 
-The network that a file describes is compared with the tensors that it holds before any memory is taken for it.
+The network that a file describes is compared with the tensors in the file before any memory is allocated for it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dpm2_core.network.settings import NetworkSettings, settings_from
 
 T = TypeVar("T", bound=Settings)
 _LARGEST = 1 << 16  # no number in a description is greater: channels, points, pixels
-_TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; other names of it are addresses
+_TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; its other names are addresses
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
@@ -36,9 +36,9 @@ def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: 
 
 
 def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[str, str], half: bool) -> None:
-    """Write tensors and what is to be known of them, whole or not at all; `half` stores fp16.
+    """Write tensors and their metadata, completely or not at all; `half` stores fp16.
 
-    The same tensors and metadata give the same bytes, by which weights are told apart.
+    The same tensors and metadata give the same bytes, by which weights are identified.
     """
     stored = {
         name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
@@ -49,7 +49,7 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[
 
 
 def _in_order(file: bytes) -> bytes:
-    """A safetensors file with its metadata by name: the package writes them in the order of a hash map, any."""
+    """A safetensors file with its metadata sorted by name: the package writes it in the random order of a hash map."""
     end = 8 + int.from_bytes(file[:8], "little")
     header = json.loads(file[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -59,7 +59,7 @@ def _in_order(file: bytes) -> bytes:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors of a safetensors file, and what was written about them.
+    """Tensors and metadata of a safetensors file.
 
     Raises:
         UsageError: missing file, or another format.
@@ -74,7 +74,7 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """What was written about the weights beside them.
+    """The metadata of a weights file.
 
     Raises:
         UsageError: missing file, or another format.
@@ -94,7 +94,7 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
 
 
 def load_fitting(model: DeepPointMap2, path: Path) -> list[str]:
-    """Load the tensors that the network has with the same name and shape; returns the names of its others, which stay.
+    """Load the tensors that match one of the network in name and shape; returns the names of its others, which stay.
 
     Raises:
         UsageError: missing file, another format, values that are not finite, or nothing that fits.
@@ -117,7 +117,7 @@ def _fill(model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], m
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, torch.Tensor], path: Path, what: str) -> None:
-    """Put the tensors of a file into a module; `what` it was made for.
+    """Load the tensors of a file into a module; `what`: what the file was made for.
 
     Raises:
         UsageError: names or shapes differ, or a value is not finite.
@@ -146,7 +146,7 @@ def load_model(path: Path) -> DeepPointMap2:
 
 
 def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
-    """`load_model`, and what was written about the weights beside them; the file is opened once."""
+    """`load_model`, and the metadata of the weights; the file is opened once."""
     state, metadata = read_tensors(path)
     settings = _network_settings(path, metadata)
     check_fit(path, state, lambda: DeepPointMap2(settings))
@@ -168,7 +168,7 @@ def described(path: Path, metadata: Mapping[str, str], kind: type[T]) -> T:
     """The settings of the network that a weights file describes.
 
     Raises:
-        UsageError: none, or values that no network has.
+        UsageError: no description, or values that no network can have.
     """
     if "network" not in metadata:
         raise UsageError(f"{path}: safetensors without a network description")
@@ -183,10 +183,10 @@ def described(path: Path, metadata: Mapping[str, str], kind: type[T]) -> T:
 
 
 def check_fit(path: Path, state: Mapping[str, torch.Tensor], make: Callable[[], nn.Module]) -> None:
-    """Whether the tensors of a file are those of the network that `make` builds, before it takes memory.
+    """Check that the tensors of a file are those of the network that `make` builds, before memory is allocated.
 
     Raises:
-        UsageError: names or shapes differ, or there is no such network.
+        UsageError: names or shapes differ, or such a network cannot be built.
     """
     try:
         with torch.device("meta"):
@@ -210,7 +210,7 @@ def _check_finite(path: Path, state: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_numbers(path: Path, value: Any, name: str = "network") -> None:
-    """Raises UsageError for a number or a list beyond all bounds, anywhere in a description."""
+    """Raise UsageError if a number or the length of a list in a description is above `_LARGEST`."""
     if isinstance(value, dict):
         for key, item in value.items():
             _check_numbers(path, item, f"{name}.{key}")
