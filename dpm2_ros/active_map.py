@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map that a node works on, with its file: one that grows, or one that stays as it is, to find oneself in."""
+"""The map that a node works on, with its file: a map that grows, or a fixed one to localize in."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from dpm2_ros.map_folder import MapFolder, file_beside
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"
-_FOUND = isotropic(0.01, 0.1)  # how far the map itself may be off around a robot found in it
+_FOUND = isotropic(0.01, 0.1)  # possible error of the map itself around a robot localized in it
 
 
 class ActiveMap:
-    """It grows by keyframes, unless the SLAM has a localizer. Methods are for one thread; any thread may read.
+    """A map that grows by keyframes, unless the SLAM has a localizer. Methods are for one thread; any thread may read.
 
     Attributes:
-        slam: what works on it; the map is exchanged there.
-        located: what became of the last keyframe in a map that stays as it is.
-        file_problem: why the map has no file, in words; empty where it has, or is to have none.
+        slam: the SLAM system that works on the map; another map is put in there.
+        located: result of the last keyframe in a fixed map.
+        file_problem: why the map has no file, in words; empty if it has one, or if none is wanted.
 
     Raises:
-        UsageError: `localization_mode` without a map that would serve.
+        UsageError: `localization_mode` without a usable map.
     """
 
     def __init__(self, config: NodeConfig, robot: str, log: Any) -> None:
-        """`robot`: whose node it is; `log`: a ROS logger."""
+        """`robot`: name of the node's robot; `log`: a ROS logger."""
         self._config, self._robot, self._log = config, robot, log
         ros = config.ros
         self._maps = MapFolder(Path(ros.map_directory) if ros.map_directory else None, robot)
-        self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to be found in
-        self._folders: dict[str, Path] = {}  # of this drive, by the name under which it was saved
-        self._copies: dict[Path, Path] = {}  # map files that were saved last under a name, by what it asks for
+        self._path = Path(ros.map_file) if ros.map_file not in ("", AUTO) else None  # written, or to localize in
+        self._folders: dict[str, Path] = {}  # folders of this drive, by the name under which it was saved
+        self._copies: dict[Path, Path] = {}  # the copy saved last under a name, by the path that the name stands for
         self.located: LocalizationResult | None = None
         self.file_problem = ""
-        self._unreadable = False  # a keyframe of the map to be found in
+        self._unreadable = False  # whether a keyframe of the map to localize in could not be read
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
         self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._first_file()
-        # gtsam holds Python's lock while it works, and the odometry must not wait
+        # background: gtsam holds Python's global lock while it works, and the odometry must not wait
         self.slam = make_slam(config.slam, robot, self._store, background=True)
 
     @property
@@ -63,7 +63,7 @@ class ActiveMap:
         return self.slam.localizer
 
     def T_map_odom(self, robot: str) -> Array | None:
-        """(4, 4) of a robot; None while its place in the map is not known."""
+        """(4, 4) map -> odom of a robot; None while its pose in the map is not known."""
         if (localizer := self.localizer) is not None:
             return localizer.T_map_odom if localizer.state.located else None
         placed = self._T_map_odom
@@ -72,10 +72,10 @@ class ActiveMap:
         return placed.get(robot)
 
     def add(self, keyframe: Keyframe) -> list[Edge]:
-        """Take a keyframe in, or find it; returns the loops that were tried.
+        """Add a keyframe to the map, or localize it; returns the loops that were tried.
 
         Raises:
-            RejectedError: it is not sound; see `Mapper.add`.
+            RejectedError: it is invalid; see `Mapper.add`.
         """
         if self.localizer is not None:
             self._find(keyframe, self.localizer)
@@ -88,40 +88,40 @@ class ActiveMap:
         return result.loops
 
     def settle(self, wait: bool = False) -> bool:
-        """What another process has solved is in the map, and in where its robots are; see `Mapper.settle`."""
+        """Apply what another process has optimized to the map and to its robots' poses; see `Mapper.settle`."""
         if not self.mapper.settle(wait):
             return False
-        if self._T_map_odom is not None:  # not so of a robot that has started again: its last keyframe is of before
+        if self._T_map_odom is not None:  # but not of a restarted robot: its last keyframe is from before
             found = {robot: self.mapper.T_map_odom_of(robot) for robot in self._T_map_odom}
             self._T_map_odom = {robot: T for robot, T in found.items() if T is not None}
         return True
 
     def localise(self, name: str = "") -> str:
-        """End the map that grows, if it does, and look for the robot in its file; says so in words.
+        """End the growing map, if there is one, and localize the robot in its file; returns a message.
 
         Args:
-            name: of another map in the folder of maps; that which was saved last under it, if one was. A map that grows
-                without a file is saved in its folder first.
+            name: of another map in the folder of maps: the one that was saved last under this name, if any. A growing
+                map without a file is saved in its folder first.
 
         Raises:
-            UsageError, Dpm2Error: there is no file that would serve; what was before goes on.
+            UsageError, Dpm2Error: there is no usable file; the work before continues.
         """
         self._complete()
         asked, saved = self._maps.file(name) if name else None, ""
         path = None if asked is None else self._copies.get(asked, asked)
         if path is not None and (self._path is None or path.resolve() != self._path.resolve()):
-            saved = self.keep() if self._store is None else ""  # else nothing would have it
+            saved = self.keep() if self._store is None else ""  # else it would be lost
             self._exchange(open_for_localization(path, self._config.slam))
         else:
             if self.localizer is None:
                 self._check_places()
-                self.close()  # before it is opened again: beside a reader FILE-wal would stay
+                self.close()  # before it is opened again: with a reader, FILE-wal would remain
             self._exchange(self._opened())
         looking = f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
         return "; ".join(filter(None, (saved, looking)))
 
     def _check_places(self) -> None:
-        """Whether one could find oneself in the map that grows."""
+        """Raises UsageError unless the robot can be localized in the growing map."""
         if not isinstance(self._store, MapStore):
             raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
         if not self.mapper.keyframes:
@@ -129,7 +129,7 @@ class ActiveMap:
         check_for_localization(self._store, self._config.slam)
 
     def _exchange(self, store: MapStore | TiledMap) -> None:
-        """Go on with a file that was opened; the map that was is complete in its own, if it has one."""
+        """Continue with an opened file; the map before is completed in its own file, if it has one."""
         try:
             made = make_map(self._config.slam, store, background=True)
             self.close()
@@ -142,11 +142,11 @@ class ActiveMap:
         self.slam.use(*made)
 
     def extend(self) -> str:
-        """Let the map grow in which the robot was looked for, by a new session; says so in words.
+        """Extend the map in which the robot was localized by a new session; returns a message.
 
         Raises:
-            UsageError: the robot's place is not known, or the map is in tiles. Dpm2Error: the file cannot be written.
-                The robot is looked for as before.
+            UsageError: the robot's pose is not known, or the map is in tiles. Dpm2Error: the file cannot be written.
+                Localization continues as before.
         """
         if (localizer := self.localizer) is None:
             return f"a map is being made already, {len(self.mapper.keyframes)} keyframes"
@@ -160,7 +160,7 @@ class ActiveMap:
         return f"{self._path} grows by a new session"
 
     def restart(self, robot: str) -> None:
-        """A robot's odometry has started again: a loop or a search has to find where it is."""
+        """A robot's odometry has restarted: a loop closure or a relocalization must find its pose."""
         placed = self._T_map_odom or {}
         self._T_map_odom = {other: T for other, T in placed.items() if other != robot}
         self.mapper.forget_start()
@@ -168,9 +168,9 @@ class ActiveMap:
             self.localizer.restart()
 
     def keep(self) -> str:
-        """All that `reset` would end is in the file and in the folder, as far as there is one; says so in words.
+        """Save all that `reset` would end, in the file and in the folder, if there are any; returns a message.
 
-        A map whose file could not be made is in the folder alone: the next one may have a file.
+        A map whose file could not be created is only in the folder: the next one may have a file.
 
         Raises:
             Dpm2Error: it cannot be written.
@@ -179,7 +179,7 @@ class ActiveMap:
         return self._saved("") if self.saves and self.mapper.keyframes else ""
 
     def reset(self) -> None:
-        """Begin an empty map; or, in a map that stays as it is, look for the robot anew."""
+        """Begin an empty map; or, in a fixed map, search for the robot anew."""
         if self.localizer is not None:
             self.localizer.restart()
         else:
@@ -194,14 +194,15 @@ class ActiveMap:
         return self._maps.folder is not None and self.localizer is None
 
     def save(self, name: str = "") -> str:
-        """Cloud, trajectory and pose graph into the drive's own folder; says so in words.
+        """Write cloud, trajectory and pose graph into the drive's own folder; returns a message.
 
         Args:
-            name: of the folder, and then also of a copy of the map file; with a number, where another drive has it.
+            name: of the folder and of a copy of the map file; with a number, if another drive has this name. Empty:
+                the drive's own name, and no copy.
 
         Raises:
-            UsageError: there is nothing to save. Dpm2Error: it cannot be written, or its file is incomplete, or could
-                not be made: then the folder is written, and no copy.
+            UsageError: there is nothing to save. Dpm2Error: it cannot be written; or the map file is incomplete or
+                could not be created: then the folder is written, but no copy.
         """
         text = self._saved(name)
         if self.file_problem:
@@ -209,7 +210,7 @@ class ActiveMap:
         return text
 
     def _saved(self, name: str) -> str:
-        """As `save`; of a file that could not be made the text says why."""
+        """As `save`, but only reports in the message why a map file could not be created."""
         if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
         if self.localizer is not None:
@@ -222,9 +223,9 @@ class ActiveMap:
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
-        moved = isinstance(self._store, MapStore) and not self._store.in_place  # since the last keyframe
+        moved = isinstance(self._store, MapStore) and not self._store.in_place  # its file, since the last keyframe
         if self.mapper.store_problem or moved:
-            self.finish()  # it writes again: there may be room by now
+            self.finish()  # tries to write again: there may be space by now
         if problem := self.mapper.store_problem:
             raise Dpm2Error(f"map saved in {folder.resolve()}, but its file is incomplete: {problem}")
         path = self._path
@@ -240,11 +241,11 @@ class ActiveMap:
         return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}{without}"
 
     def finish(self) -> None:
-        """Do what still waits; the file stays open."""
+        """Complete the pending work; the file stays open."""
         self.slam.finish()
 
     def close(self) -> None:
-        """Everything that is known is in the file, which is closed; one without per keyframe is not kept."""
+        """Complete the file and close it; a file without a keyframe is removed."""
         self.finish()
         if self._store is not None:
             self._store.close()
@@ -255,17 +256,17 @@ class ActiveMap:
             self._store = None
 
     def _complete(self) -> None:
-        """All that is known is in the file, if there is one.
+        """Complete the file, if there is one.
 
         Raises:
-            Dpm2Error: it cannot be written, and the map goes on in memory.
+            Dpm2Error: it cannot be written, and the map continues in memory.
         """
         self.finish()
         if self.mapper.store_problem:
             raise Dpm2Error(f"the map goes on: {self.mapper.store_problem}")
 
     def _first_file(self) -> MapStore | None:
-        """A map file; a warning where that which was asked for exists, as after a crash: it does not go on."""
+        """A new map file; warns if the requested one exists already, as after a crash: it is not continued."""
         store, name = self._new_file(), self._config.ros.map_file
         if store is not None and name != AUTO and self._path != (asked := self._maps.of_robot(Path(name))):
             there = asked if asked.exists() else left_log(asked) or asked
@@ -273,7 +274,7 @@ class ActiveMap:
         return store
 
     def _new_file(self) -> MapStore | None:
-        """A map file, if there is to be one. A file that cannot be made is no reason not to map."""
+        """A new map file, if one is wanted. If it cannot be created, the map is built without it."""
         ros, self._folders, self.file_problem = self._config.ros, {}, ""
         requested = self._maps.usual if ros.map_file == AUTO else Path(ros.map_file)
         if requested.name:
@@ -288,7 +289,7 @@ class ActiveMap:
         return None
 
     def _created(self, requested: Path) -> tuple[Path, MapStore]:
-        """A new map file with a name, and a folder for its clouds, that do not exist yet."""
+        """A new map file. Neither its name nor that of the folder for its clouds exists yet."""
         for path in self._maps.free(requested):
             try:
                 return path, open_session(path, self._config.slam, dump_settings(self._config), resume=False)
@@ -299,17 +300,17 @@ class ActiveMap:
         raise AssertionError
 
     def _opened(self) -> MapStore | TiledMap:
-        """The file or folder of tiles, open for reading only."""
+        """The map file or folder of tiles, opened read-only."""
         if self._path is None:
             raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._maps.hint())
         return open_for_localization(self._path, self._config.slam)
 
     def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
-        """Where it is in a map that stays as it is; says what is new. A map that cannot be read does not show it."""
+        """Localize a keyframe in the fixed map, and log changes of the state. An unreadable map cannot confirm it."""
         before = localizer.state
         located = self.located = self.slam.map_step(keyframe).located
         assert located is not None
-        if located.unreadable and not self._unreadable:  # once a map, not with each keyframe
+        if located.unreadable and not self._unreadable:  # once per map, not with each keyframe
             self._log.error(located.registration.reason)
             self._unreadable = True
         if located.state is before:

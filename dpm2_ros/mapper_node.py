@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mapper apart from the odometry: on another machine, of one robot or of many. Keyframes in, one map out."""
+"""mapper_node: the mapper apart from the odometry, as on another machine. Builds one map of one or more robots."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from dpm2_ros.mapping import MapperThread
 
 _MOST_ROBOTS = 64
 PATIENCE = 10.0
-"""s that a topic has to bring a keyframe before another may take its place."""
+"""s within which a namespace must deliver a keyframe before its subscriptions may be closed."""
 
 
 class MapperNode(ManagedNode):
-    """Listens to every robot in its namespace and below, also to those that come later, and makes one map of all.
+    """Subscribes to every robot in its namespace and below, also to those that start later, and builds one map of all.
 
-    map -> odom of each goes out for the odometry frame that the robot itself names.
+    It sends map -> odom of each robot, with the odometry frame that the robot itself names.
     """
 
     def __init__(self, managed: bool = False) -> None:
@@ -38,7 +38,7 @@ class MapperNode(ManagedNode):
         self.start(managed)
 
     def configure(self, back: ExitStack) -> None:
-        """As of `ManagedNode`."""
+        """See `ManagedNode`."""
         self._weights = weights_identity(self._config.slam)
         self._open_map(back)
         self._feeds: dict[str, Feed] = {}
@@ -46,7 +46,7 @@ class MapperNode(ManagedNode):
         publish_diagnostics(self, self._statuses)
 
     def activate(self, back: ExitStack) -> None:
-        """Listen from now on, in the same map. What was sent meanwhile was not acknowledged, and is sent again."""
+        """Subscribe, with the same map. Keyframes sent in the meantime were not acknowledged, and are sent again."""
         for feed in self._feeds.values():
             feed.open()
         back.callback(self._pause)
@@ -56,7 +56,7 @@ class MapperNode(ManagedNode):
 
     @property
     def slam(self) -> Slam:
-        """What works on the map."""
+        """The SLAM system that works on the map."""
         return self._map.active.slam
 
     @property
@@ -69,7 +69,7 @@ class MapperNode(ManagedNode):
             feed.close()
 
     def _discover(self) -> None:
-        """Listen to the robots that are there, and to the one of this very namespace in any case."""
+        """Subscribe to the robots that publish now, and always to the one of this node's own namespace."""
         topics = [topic for topic, _ in self.get_topic_names_and_types() if topic.endswith(ODOM)]
         for namespace in (self._own, *(topic.removesuffix(ODOM) for topic in topics)):
             if namespace in self._feeds or not f"{namespace}/".startswith(f"{self._own}/"):
@@ -84,7 +84,7 @@ class MapperNode(ManagedNode):
                 self._feeds.pop(namespace).close()
 
     def _idle(self, namespace: str, feed: Feed) -> bool:
-        """Whether nothing is lost without that feed."""
+        """Whether that feed can be closed without a loss."""
         return namespace != self._own and not feed.proven and time.monotonic() - feed.opened > PATIENCE
 
     def _make_room(self) -> bool:
@@ -106,7 +106,7 @@ class MapperNode(ManagedNode):
         return response
 
     def _shared_frames(self) -> list[str]:
-        """Odometry frames of robots in several namespaces that are heard now."""
+        """Odometry frames that robots in several namespaces use at the same time."""
         counts = Counter(frame for feed in self._feeds.values() for frame in feed.odom_frames)
         return sorted(frame for frame, count in counts.items() if count > 1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map in a thread of its own, and all that is published of it; part of slam_node, and the core of mapper_node."""
+"""The thread of the map, and all that is published about the map; part of slam_node, and the core of mapper_node."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ from dpm2_ros.subscriptions import LAST_ONE
 from dpm2_ros.tf import TransformBroadcaster
 
 LOOPS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""Not all: of whoever hangs, DDS keeps 5000 and then makes each later one wait, in vain."""
+"""Not KEEP_ALL: for a subscriber that hangs, DDS would keep 5000 messages and then block on each later one, in vain."""
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-"""Of who listens, to miss none."""
-_GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and at most of work at one
+"""For subscribers that must not miss a message."""
+_GRID_PERIOD, _GRID_WORK = 0.5, 0.3  # s between two grids, and longest work on one
 RETRY = 10.0
-"""s after which a map file that is incomplete is written to again, also where no keyframe comes."""
+"""s after which an incomplete map file is written to again, also if no keyframe arrives."""
 BEHIND = 10
-"""Keyframes that a map may lack before /diagnostics warns; a few are always on their way."""
+"""Keyframes that may wait for the map before /diagnostics warns; a few are always in transit."""
 
 
 class MapperThread:
-    """Works on the map so that a loop search or an optimization never delays the odometry.
+    """Works on the map in its own thread, so that a loop search or an optimization never delays the odometry.
 
-    Every method may be called from any thread, and returns at once.
+    Every method may be called from any thread, and returns at once, except `close`.
 
     Attributes:
-        active: what it works on; other threads may read there.
-        written: so many keyframes, of all that were ever added, are in the map file (without one: in the map) or
-            rejected, but for those that are missing.
-        tf: what sends map -> odom.
-        missing: keyframes that were not unsound, but could not be taken in, by number: why, in words.
+        active: the map that it works on; other threads may read it.
+        written: number of keyframes, of all that were ever added, that are in the map file (without one: in the map) or
+            rejected. Those in `missing` are counted, too.
+        tf: sends map -> odom.
+        missing: number of each valid keyframe that could not be added to the map, to the reason, in words.
     """
 
     def __init__(self, node: GuardedNode, config: NodeConfig, robot: str) -> None:
@@ -65,7 +65,7 @@ class MapperThread:
         self.active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)
         self._stamp = 0  # of the last keyframe, ns
-        self._restarted: dict[str, Future[None]] = {}  # by robot: since when its odometry's start is known here
+        self._restarted: dict[str, Future[None]] = {}  # by robot: done once its odometry's restart is known here
         self._lock = threading.Lock()
         self._added = self._taken = self.written = 0  # keyframes
         self.missing: dict[int, str] = {}
@@ -85,33 +85,33 @@ class MapperThread:
                 (OccupancyGrid, "dpm2/grid", lambda: _GRID_PERIOD, self._grid),
             )
         ]
-        self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid is of, and the grid
-        self._of_no_use = ""  # why it is, in words
-        self._settled: Future[None] = self._submit(lambda: None)  # done: nobody looks for what has been solved
+        self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid was drawn from, and the grid
+        self._of_no_use = ""  # why the grid is unusable, in words
+        self._settled: Future[None] = self._submit(lambda: None)  # done: no `_settle` is pending
         self._settled_at = time.monotonic()
         node.create_timer(0.1, self._show)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
     @property
     def keyframes(self) -> int:
-        """How many there are."""
+        """Number of keyframes in the map."""
         return len(self.active.mapper.keyframes)
 
     @property
     def waiting(self) -> int:
-        """Keyframes that are not in the map yet."""
+        """Number of keyframes that were added but are not in the map yet."""
         return self._added - self._taken
 
     @property
     def store_problem(self) -> str:
-        """Why the map file is behind, in words; empty when it is not, or when there is none."""
+        """Why the map file is incomplete, in words; empty if it is complete, or if there is none."""
         return self.active.mapper.store_problem
 
     def broadcast(self, stamp: int, robot: str, odom_frame: str, T_own_odom: Array | None = None) -> None:
         """Send map -> odom of a robot, valid from that stamp (ns) on, if it is known.
 
         Args:
-            T_own_odom: (4, 4) frame `odom_frame` in that of the robot's keyframes; None: it is the same.
+            T_own_odom: (4, 4) `odom_frame` in the odometry frame of the robot's keyframes; None: they are the same.
         """
         restarted = self._restarted.get(robot)
         T_map_odom = self.active.T_map_odom(robot) if restarted is None or restarted.done() else None
@@ -120,14 +120,14 @@ class MapperThread:
             self.tf.send(T, stamp + self._config.ros.ahead, odom_frame)
 
     def add(self, make: Callable[[], Keyframe]) -> int:
-        """Take in the keyframe that `make`, called in this thread, returns; how many came before it."""
+        """Add the keyframe that `make`, called in the map's thread, returns; returns how many were added before it."""
         with self._lock:
             number, self._added = self._added, self._added + 1
             self._submit(lambda: self._take_in(number, make))
         return number
 
     def hint(self, T_map_base: Array) -> str:
-        """Prior for the robot's pose (4, 4), for example from RViz; returns why it cannot be used, or an empty text."""
+        """Set a prior for the robot's pose (4, 4), as from RViz; returns why it cannot be used, or an empty text."""
         localizer = self.active.localizer
         if localizer is None:
             return "a map is being made: a pose is of use only with localization_mode"
@@ -135,30 +135,30 @@ class MapperThread:
         return ""
 
     def localise(self) -> Future[str]:
-        """End the map that is being made, if one is, and look for the robot in the map file; returns a message."""
+        """End the map that is being built, if any, and localize the robot in the map file; returns a message."""
         return self._thread.submit(self._change, self.active.localise)
 
     def load(self) -> Future[str]:
-        """Look for the robot in the map that `ros.map_name` names, or in the same one again; returns a message."""
+        """Localize the robot in the map that `ros.map_name` names, or in the same one again; returns a message."""
         if not (name := self._config.ros.map_name) and self.active.localizer is None:
             raise UsageError("no map is loaded: ros.map_name is empty, and localization_mode is off")
         return self._thread.submit(self._change, lambda: self.active.localise(name))
 
     def extend(self) -> Future[str]:
-        """Let the map grow from now on: that in which the robot was looked for, by a new session."""
+        """Extend the map in which the robot was localized by a new session; returns a message."""
         return self._thread.submit(self._change, self.active.extend)
 
     def apply(self, config: NodeConfig) -> None:
-        """What is shown, and the map's name, by settings that have changed while the node runs."""
+        """Apply settings that have changed while the node runs: those of the displays, and the map's name."""
         self._config = config
         self._changes += 1
 
     def restart(self, robot: str) -> None:
-        """A robot's odometry has started again: the map stays, the robot's place in it is no longer known."""
+        """A robot's odometry has restarted: the map stays, the robot's pose in it is no longer known."""
         self._restarted[robot] = self._submit(lambda: self.active.restart(robot))
 
     async def before_reset(self, response: Trigger.Response, begins: str) -> None:
-        """Save the map, and answer the service that asks for a reset: with what begins, or why there is no reset."""
+        """Save the map, and fill the response of a reset service: with `begins`, or with why there is no reset."""
         await respond(self._node, self._thread.submit(self.active.keep), response)
         if response.success:
             response.message = "; ".join(filter(None, (response.message, begins)))
@@ -166,11 +166,11 @@ class MapperThread:
             response.message = f"no reset: {response.message}"
 
     def reset(self) -> None:
-        """The odometry starts again, and with it an empty map."""
+        """The odometry restarts, and with it an empty map or the search for the robot; see `ActiveMap.reset`."""
         self._restarted[self._robot] = self._submit(lambda: self._change(self.active.reset))
 
     def close(self) -> None:
-        """Finish what is waiting, save the map, end the thread.
+        """Add the keyframes that still wait, save the map, end the thread.
 
         Raises:
             Dpm2Error: the map could not be written, or its file is incomplete.
@@ -189,12 +189,12 @@ class MapperThread:
             except UsageError as error:
                 self._node.get_logger().info(str(error))
             except Dpm2Error as error:
-                if not self.store_problem:  # which is the graver one
+                if not self.store_problem:  # which is more serious, and raised below
                     raise
                 self._node.get_logger().error(str(error))
         if self.store_problem:
             raise Dpm2Error(f"map file incomplete: {self.store_problem}")
-        if self.active.file_problem and self.keyframes:  # of a map that is in no folder, either
+        if self.active.file_problem and self.keyframes:  # such a map is in no folder either
             raise Dpm2Error(f"no map file: {self.active.file_problem}")
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
@@ -212,7 +212,7 @@ class MapperThread:
             self._node.fail("mapper", error)
 
     def _change(self, work: Callable[[], Any]) -> Any:
-        """Work after which there is another map to show, and none of what is being built of the one before."""
+        """Do work that changes the map; displays that are being built of the map before are dropped."""
         for display in self._displays:
             display.again()
         result = work()
@@ -288,7 +288,7 @@ class MapperThread:
             self._drawn = of, OccupancyMap(ros.grid, ros.grid_max_cells)
             self._of_no_use = ""
         grid = self._drawn[1]
-        if not mapper.update_grid(grid, _GRID_WORK):  # of a map that was loaded, or after a loop in a large one
+        if not mapper.update_grid(grid, _GRID_WORK):  # incomplete: of a loaded map, or after a loop in a large one
             self._displays[-1].again()
         before, self._of_no_use = self._of_no_use, why_of_no_use(mapper.poses[mapper.placed])
         if self._of_no_use and not before:
@@ -296,7 +296,7 @@ class MapperThread:
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
     def _map(self) -> Generator[None, None, PointCloud2]:
-        """In steps, so that keyframes come to their turn."""
+        """Built in steps, so that keyframes are processed in between."""
         mapper, ros = self.active.mapper, self._config.ros
         nodes, voxel = np.flatnonzero(mapper.placed).tolist(), self._config.slam.map.voxel
         points = yield from map_cloud_in_steps(mapper.clouds, mapper.poses, voxel, nodes)

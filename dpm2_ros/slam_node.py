@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds and images in, odometry, keyframes and (with the mapper embedded) the map out."""
+"""slam_node: receives clouds and images, publishes odometry, keyframes and (with the mapper embedded) the map."""
 
 from __future__ import annotations
 
@@ -42,11 +42,12 @@ from dpm2_ros.tf import TransformBroadcaster
 from dpm2_ros.warm_up import warm_up
 
 HELD = 300
-"""Poses kept while the base frame is not known; with one more the drive begins again."""
+"""Poses kept while the base frame is unknown; with one more the drive begins again."""
 
 
 class SlamNode(ManagedNode):
-    """The executor's thread only fills a queue; a worker empties it; the mapper has a thread of its own.
+    """The node of the odometry. The executor's thread only fills a queue, a worker thread processes it, and the mapper
+    has a thread of its own.
 
     Raises:
         UsageError: a parameter that is not allowed.
@@ -63,7 +64,7 @@ class SlamNode(ManagedNode):
         self.start(managed)
 
     def configure(self, back: ExitStack) -> None:
-        """As of `ManagedNode`."""
+        """See `ManagedNode`."""
         ros, weights = self._config.ros, weights_identity(self._config.slam)
         self._slam = self._open_map(back).active.slam if ros.embed_mapper else make_slam(self._config.slam, self._robot)
         self._health = Health()
@@ -72,33 +73,33 @@ class SlamNode(ManagedNode):
         self._odom = self.create_publisher(Odometry, "dpm2/odom", 10)
         self._state = StatePublisher(self)
         self._projection = Projection(self, second=bool(self._config.input.second_image_topic))
-        # Without a thread as long as the mapper takes the keyframes into its own.
+        # Starts no thread with an embedded mapper, whose thread then does this work.
         self._line = ThreadPoolExecutor(1, thread_name_prefix="keyframes", initializer=lower_priority)
         back.callback(self._line.shutdown)
-        beside = ros.invert_odom_tf if ros.embed_mapper else ros.publish_tf_map  # a leaf, or a half of map -> odom
+        beside = ros.invert_odom_tf if ros.embed_mapper else ros.publish_tf_map  # a leaf, or a part of map -> odom
         sends = beside if self._beside else ros.publish_tf_odom
         self._tf = TransformBroadcaster(self, ros.own_frame, sends, ros.invert_odom_tf)
         self._stopping = threading.Event()
         self._base = BaseFrame(ros.base_frame, (ros.odom_frame, ros.own_frame, ros.map_frame))
         self._requests = Requests(self, self._mapper, self._base, ros.map_frame)
-        self._waited = False  # for the base frame
+        self._waited = False  # whether the wait for the base frame is over
         self._lidar_frame = ""  # of the last cloud
         warm_up(self._config.slam)
         self._known: Calibration | None = None
-        self._left: Bundle | None = None  # of the synchronizer before a deactivation
+        self._left: Bundle | None = None  # `left` of the synchronizer that a deactivation ended
         self._begin()
         back.callback(self._give_up)
         self._index = 0
 
     def activate(self, back: ExitStack) -> None:
-        """Take clouds from now on; the drive goes on, if there was one."""
+        """Receive clouds from now on; an earlier drive continues, if there was one."""
         ros, self._waited = self._config.ros, False
-        self._health = Health()  # its counts are beside those of the inputs, which are new too
+        self._health = Health()  # its counts are reported together with those of the inputs, which are new too
         self._stopping.clear()
         self._other = None
         if self._beside:
             self._other = OtherOdometry(self, ros, lambda: self._inputs.calibration.transforms)
-        # Last of all: who is subscribed is ready, and whoever waits for subscribers loses nothing.
+        # Subscribe last: when a publisher sees the subscriptions, the node is ready, and no cloud is lost.
         reading = self._config.input.model_copy(update={"images": self._config.input.images and self._slam.uses_images})
         self._inputs = Inputs(self, reading, ros, self._known)
         self._known = self._inputs.calibration
@@ -116,30 +117,30 @@ class SlamNode(ManagedNode):
 
     @property
     def slam(self) -> Slam:
-        """What runs in this node."""
+        """The SLAM system of this node."""
         return self._slam
 
     @property
     def calibration(self) -> Calibration:
-        """What is known of the sensors so far."""
+        """Calibration of the sensors, as far as it is known."""
         return self._inputs.calibration
 
     def _end(self, worker: threading.Thread) -> None:
-        """No more clouds, after the one that the worker is at."""
+        """End the worker after the cloud that it is processing."""
         self._stopping.set()
         worker.join()
         self._left = self._inputs.synchronizer.left
         self.get_logger().info(self._diagnostics.account())
 
     def _begin(self) -> None:
-        """The state of a drive at its start."""
+        """Set the state to that of a drive at its start."""
         self._slam.begin_drive()
         self._base.restart()
         self._sweep = Sweep()
         self._held: list[OdometryResult] = []  # until the base frame is known
-        self._up: Up | None = None  # of `Frame`, for all of it
+        self._up: Up | None = None  # `Frame.up` of the whole drive
         self._covariance = np.zeros((6, 6))
-        self._before: BodyMotion | None = None  # the last registered frame, of which `_covariance` is
+        self._before: BodyMotion | None = None  # the last registered frame, to which `_covariance` refers
         self._unsent: BodyMotion | None = None  # the last frame, if the other odometry was not known at its stamp
 
     def _work(self) -> None:
@@ -152,14 +153,14 @@ class SlamNode(ManagedNode):
                 continue
             try:
                 self._process(bundle)
-            except Exception as error:  # a bug; but the drive goes on, and /diagnostics counts it
+            except Exception as error:  # a bug: the drive continues, and /diagnostics counts it
                 error.add_note(f"of the cloud at {bundle.stamp} ns")
                 self.fail("cloud", error)
 
     def _end_drive(self, of_map: Callable[[MapperThread], None]) -> None:
-        """The next cloud begins another drive; `of_map`: what becomes of the map, where it is here.
+        """Let the next cloud begin another drive; `of_map`: what is done with the map of an embedded mapper.
 
-        A mapper elsewhere is told before it hears the next odometry.
+        A separate mapper is notified before it receives the next odometry.
         """
         self._begin()
         if self._mapper is not None:
@@ -168,7 +169,7 @@ class SlamNode(ManagedNode):
             wait([self._line.submit(self._sender.restart)])
 
     def _begin_again(self, why: str) -> None:
-        """Another drive in the same map, if there has been one."""
+        """Begin another drive in the same map, if one has begun already."""
         if self._before is None and not self._held:
             return
         self.get_logger().warning(
@@ -177,7 +178,7 @@ class SlamNode(ManagedNode):
         self._end_drive(lambda mapper: mapper.restart(self._robot))
 
     def _process(self, bundle: Bundle) -> None:
-        """One frame, from messages to messages."""
+        """Process one frame, from the received messages to the published ones."""
         lidar_frame, before = bundle.cloud.header.frame_id or "lidar", self._lidar_frame
         if lidar_frame != before and before:
             self._begin_again(f"clouds come in frame {lidar_frame}, no longer in {before}")
@@ -187,13 +188,13 @@ class SlamNode(ManagedNode):
             self._begin_again("time went back by more than a second (a looped bag, a clock that was set)")
         self._lidar_frame = lidar_frame
         self._look_for_base(lidar_frame)
-        if self._before is None and not self._held:  # what it began with is not compared with level scans
+        if self._before is None and not self._held:  # fixed per drive: all its scans are leveled in the same way
             x, y, z = self._base.T_start_lidar[2, :3].tolist()
             self._up = (x, y, z) if self._base.name else None  # for the base, and so in odom
         self._frames.up = self._up
         frame = self._frames.frame(bundle.stamp, bundle.cloud, self._index, bundle.beside)
         tracked = self._tracked(replace(frame, dropped=bundle.dropped, stepped=bundle.stepped))
-        if tracked.imu and tracked.registration.method == "first":  # of the level; diagnostics may miss one cloud
+        if tracked.imu and tracked.registration.method == "first":  # on the level; /diagnostics may miss one cloud
             self.get_logger().warning(f"{self.calibration.imu_topic}: {tracked.imu}")
         self._index += 1
         self._held.append(tracked)
@@ -212,7 +213,7 @@ class SlamNode(ManagedNode):
             self._health.scale = scale
 
     def _tracked(self, frame: Frame) -> OdometryResult:
-        """A step of the odometry, beside another one if there is one."""
+        """One step of the odometry, with the pose of another odometry as a guess, if there is one."""
         other, base = self._other, self._base
         if other is None or not base.name:
             return self._slam.odometry_step(frame)
@@ -224,12 +225,12 @@ class SlamNode(ManagedNode):
         return tracked
 
     def _give_up(self) -> None:
-        """Say that the poses that are kept will not be published."""
+        """Log that the poses that are kept will not be published."""
         if self._held:
             self.get_logger().error(f"{len(self._held)} poses not published; {self._base.problem}")
 
     def _look_for_base(self, lidar_frame: str) -> None:
-        """Before the first pose wait for what is latched, while clouds may still queue; then follow what comes."""
+        """Before the first pose, wait for the latched messages while the queue has room; then follow /tf_static."""
         base, inputs, known, ros = self._base, self._inputs, self._inputs.calibration, self._config.ros
         end, room = time.monotonic() + ros.tf_timeout, max(ros.queue_depth - 1, 1)
         while not self._waited:
@@ -251,7 +252,7 @@ class SlamNode(ManagedNode):
             self.get_logger().warning(self._diagnostics.tf_problem, once=True)
 
     def _hand_on(self, tracked: OdometryResult) -> OdometryResult:
-        """The keyframe to the map, pose and transforms published; returns what was published."""
+        """Pass the keyframe to the map, publish pose and transforms; returns what was published."""
         mapper, T_start_lidar = self._mapper, self._base.T_start_lidar
         T_start_odom = T_start_lidar @ se3.inverse(self._slam.odometry.T_start)
         if tracked.keyframe is not None:
@@ -281,12 +282,12 @@ class SlamNode(ManagedNode):
         if ros.invert_odom_tf or (self._other is None and not self._base.child_problem):
             self._tf.send(motion.T_odom_body, motion.stamp, self._base.name)
         if not (tracked.state is State.LOST and self._mapper is not None and self._mapper.active.localizer is not None):
-            self._send_map(motion)  # where the map does not grow nobody is in it by an odometry that is lost
+            self._send_map(motion)  # in localization mode, a lost odometry gives no pose in the map
 
     def _send_map(self, motion: BodyMotion) -> None:
-        """Where odom is: in the map, or, where the mapper is elsewhere, another's in our own.
+        """Send odom in the map; or, with a separate mapper, the frame of another odometry in slam_node's own.
 
-        Another odometry may tell of the end of a sweep after it has told of its middle: then with the next cloud.
+        The pose of another odometry at the end of a sweep may arrive late: it is then used with the next cloud.
         """
         ros, T_own_odom, before = self._config.ros, None, self._unsent
         self._unsent = None
@@ -305,8 +306,8 @@ class SlamNode(ManagedNode):
             self._tf.send(T_own_odom, motion.stamp + ros.ahead, ros.odom_frame)
 
     def _finished(self, keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Array) -> Keyframe:
-        """Not in the worker's thread: the keyframe in the base's frame, sent; with descriptors as a LiDAR that stands
-        would have them."""
+        """Send the keyframe and return it, in the base's frame; not called in the worker's thread. Its descriptors are
+        those of a level LiDAR."""
         x, y, z = T_base_lidar[2, :3].tolist()
         if keyframe.up is None and not is_level(T_base_lidar[2, :3]):  # of a drive that began before the base was known
             keyframe = replace(keyframe, up=(x, y, z), descriptors=None)
