@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes in: clouds, images, an IMU and calibration."""
+"""The inputs of slam_node: clouds, images, an IMU, a GNSS receiver and calibration."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ from dpm2_ros.synchronizer import Bundle, StampCheck, Synchronizer
 from dpm2_ros.tf_message import TFMessage
 
 OTHER_FRAME = 2.0
-"""s without a cloud after which one in another frame begins another drive."""
+"""s without a cloud after which a cloud in another frame begins another drive."""
 
 LAST_ONE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Inputs:
-    """Clouds, images, an IMU, a GNSS receiver and calibration as they come in. The callbacks only put them into queues.
+    """Subscriptions to clouds, images, IMU, GNSS receiver and calibration. The callbacks only put messages into queues.
 
     Attributes:
-        imu: its samples; None where none is wanted. imu_received: messages so far. imu_last: when, s.
-        gnss: its fixes; None where none are wanted. gnss_received: messages so far. gnss_last: stamp, ns, and arrival,
-            s, of the last fix.
+        imu: its samples; None if it is not used. imu_received: messages so far. imu_last: arrival of the last, s.
+        gnss: its fixes; None if it is not used. gnss_received: messages so far. gnss_last: stamp, ns, and arrival, s,
+            of the last fix.
         calibration: what is known by now; its topics are full names, after remapping.
     """
 
     def __init__(
         self, node: GuardedNode, settings: InputSettings, ros: RosSettings, known: Calibration | None = None
     ) -> None:
-        """`known`: what an earlier one has learned.
+        """`known`: the calibration that an earlier instance has received.
 
         Raises:
             UsageError: a second sensor with the topic of the first.
@@ -76,21 +76,21 @@ class Inputs:
         beside += filter(None, [self.calibration.second_topic])
         self.synchronizer = Synchronizer(beside, ros.queue_depth, ros.sync_timeout, settings.image_tolerance)
         self.losses = Losses()
-        """Clouds that were sent, and never arrived."""
+        """Clouds that were sent and never arrived."""
         self._frame: str | None = None  # of the clouds
         self._times: deque[tuple[int, int]] = deque(maxlen=5)
         others = self._others(given)
         self._static_topic, self._static_messages = node.resolve_topic_name(naming.TF_STATIC), 0
-        if TFMessage is not None:  # else extrinsics come from parameters alone
+        if TFMessage is not None:  # else extrinsics come from parameters only
             node.create_subscription(TFMessage, naming.TF_STATIC, self._on_static, LATCHED)
         self._correction_topic = node.resolve_topic_name(naming.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, naming.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
-        # The last to be announced: who waits for it has found the others.
+        # Announced last: a publisher that waits for this subscription has found the others by then.
         self.subscriptions = [self._subscribed(PointCloud2, given.points_topic, self._on_cloud), *others]
         node.create_timer(0.1, self._refresh)
 
     def _others(self, given: InputSettings) -> list[MatchedSubscription]:
-        """The subscriptions to all but the clouds, of the topics that are given, before remapping."""
+        """The subscriptions to all topics but that of the clouds; `given` has their names before remapping."""
         known, out = self.calibration, list[MatchedSubscription]()
         if known.camera is not None:
             out += self._images(known.camera, given.image_topic, given.camera_info_topic)
@@ -118,7 +118,7 @@ class Inputs:
         return MatchedSubscription(self._node, kind, topic, callback, self._ros)
 
     def take(self, timeout: float) -> Bundle | None:
-        """The next cloud that is ready, with its images; None after `timeout` s without one."""
+        """The next cloud that is ready, with its synchronized messages; None after `timeout` s without one."""
         end = time.monotonic() + timeout
         with self._arrived:
             while True:
@@ -137,14 +137,14 @@ class Inputs:
         return known.angle_correction_deg is not None or not count(self._correction_topic)
 
     def problem(self, topic: str) -> str:
-        """Why nothing comes on a topic of these although it has a publisher, in words; else empty."""
+        """Why nothing is received on one of these topics although it has a publisher, in words; else empty."""
         return next((one.problem for one in self.subscriptions if one.topic == topic), "")
 
     @property
     def times(self) -> tuple[int, int] | None:
-        """ns: a late cloud's stamp, and what the node's clock said when it came; None before there are some.
+        """ns: stamp of a recent cloud, and the node's clock when it arrived; None before three clouds.
 
-        Of the last five the one with the median difference: /clock and clouds may change places on their way.
+        Of the last five the pair with the median difference: /clock and clouds may arrive in another order.
         """
         times = sorted(self._times, key=lambda pair: pair[1] - pair[0])
         return times[len(times) // 2] if len(times) >= 3 else None
@@ -161,7 +161,11 @@ class Inputs:
         )
 
     def _of_the_drive(self, message: PointCloud2 | bytes) -> PointCloud2:
-        """An unreadable cloud counts as a failed scan where one was due; any other is not of this drive."""
+        """The cloud, if it is of this drive. An unreadable one is accepted, as a failed scan, if a cloud was due.
+
+        Raises:
+            RejectedError: it is in another frame, or unreadable when no cloud was due.
+        """
         cloud, problem = checked_cloud(message)
         now, frame, last = time.monotonic(), cloud.header.frame_id, self.synchronizer.last_arrival
         if self._frame not in (None, frame) and last is not None and now - last < OTHER_FRAME:
@@ -174,9 +178,9 @@ class Inputs:
     def _on_cloud(self, message: PointCloud2 | bytes, info: Mapping[str, Any]) -> None:
         cloud, *others = self.subscriptions
         self._take_clock()
-        for other in reversed(others):  # what was sent before the cloud is to be there before it; calibration first
+        for other in reversed(others):  # messages sent before the cloud are added before it; calibration first
             other.take()
-        # Several publishers count each for themselves.
+        # With several publishers, each has its own numbers.
         number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
         try:
             message = self._of_the_drive(message)
@@ -197,13 +201,13 @@ class Inputs:
                 f"{lost} clouds before that at {stamp / 1e9:.3f} s were lost on the way", throttle_duration_sec=5
             )
         said = f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}"
-        if check is StampCheck.SET_BACK:  # right after those that were out of order, which must not keep it quiet
+        if check is StampCheck.SET_BACK:  # not throttled: it follows the warnings on clouds out of order
             self._node.get_logger().warning(said)
         elif check is not StampCheck.ACCEPTED:
             self._node.get_logger().warning(said, throttle_duration_sec=5)
 
     def _take_clock(self) -> None:
-        """Follow what has come on /clock already: in lockstep no other time passes, and its time is the cloud's."""
+        """Process the /clock messages that have arrived: in lockstep, the last one has the time of the cloud."""
         if self._node.get_clock().ros_time_is_active:
             for subscription in list(self._node.subscriptions):
                 if subscription.topic_name == CLOCK_TOPIC:
@@ -240,25 +244,25 @@ class Inputs:
         if self.gnss is not None:
             stamp = self._stamp(message)
             self.calibration.check_sensor(self.calibration.gnss_topic, message.header.frame_id, stamp)
-            if self.gnss.add(stamp, message):  # else it says that it has no fix
+            if self.gnss.add(stamp, message):  # else the receiver reports that it has no fix
                 self.gnss_last = stamp, time.monotonic()
             self.gnss_received += 1
 
     @property
     def _clock(self) -> float:
-        """s by /clock; 0 where it is not followed."""
+        """Time of /clock, s; 0 if the node does not use it."""
         clock = self._node.get_clock()
         return float(clock.now().nanoseconds * 1e-9) if clock.ros_time_is_active else 0.0
 
     def _stamp(self, message: Any) -> int:
-        """ns; drivers that leave the stamp at 0 get the time of arrival."""
+        """Stamp in ns; the time of arrival if the driver leaves the stamp at 0."""
         return stamp_ns(message.header) or self._node.get_clock().now().nanoseconds
 
     def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
         info = info_of(camera.topic, message)
         if _usable(camera.info):
-            decode_camera(info, np.eye(4), "camera")  # raises where what is known is to stay
+            decode_camera(info, np.eye(4), "camera")  # raises if it is invalid: the known one stays
             frame, known, images = info.header.frame_id, camera.info.header.frame_id, self.calibration.frame_of(camera)
             if images and frame_name(frame) not in (images, frame_name(known)):
                 raise RejectedError("another frame", f"a CameraInfo in frame {frame[:80]!r}, the images' is {images!r}")
@@ -271,7 +275,7 @@ class Inputs:
         if changed := replaced(before, tree):
             text = f"{self._static_topic}: {excerpt(changed)}; of two publishers that disagree the last one counts"
             self._node.get_logger().warning(text, throttle_duration_sec=5)
-        self.calibration.transforms = tree  # another one: the worker may be reading that of before
+        self.calibration.transforms = tree  # a new tree: the worker may be reading the old one
         if problem:
             raise RejectedError("transform", problem)
 
@@ -284,13 +288,13 @@ class Inputs:
 
 
 def _with_defaults(settings: InputSettings) -> InputSettings:
-    """The settings with every topic that is wanted."""
+    """The settings, with the default topic for each one that is empty."""
     usual = {"points_topic": naming.POINTS, "image_topic": naming.IMAGE, "imu_topic": naming.IMU.lstrip("/")}
     return settings.model_copy(update={key: getattr(settings, key) or topic for key, topic in usual.items()})
 
 
 def _named(node: Node, given: InputSettings) -> Calibration:
-    """What is to come in, by full names, after remapping; nothing is known of it yet."""
+    """A calibration with the full names of the topics, after remapping; it contains no values yet."""
     known = Calibration(node.resolve_topic_name(given.points_topic))
     if given.second_points_topic:
         known.second_topic = node.resolve_topic_name(given.second_points_topic)
@@ -310,7 +314,7 @@ def _named(node: Node, given: InputSettings) -> Calibration:
 
 
 def _usable(info: Any) -> bool:
-    """Whether it is a CameraInfo that can be used."""
+    """Whether it is a usable CameraInfo."""
     if info is None:
         return False
     try:
@@ -321,7 +325,7 @@ def _usable(info: Any) -> bool:
 
 
 def _camera_info_beside(node: Node, image_topic: str) -> str:
-    """The camera_info beside the images where they really come from, unless it has a remapping of its own."""
+    """The camera_info topic next to that of the images after remapping, unless it has its own remapping."""
     usual = info_topic_beside(image_topic)
     if node.resolve_topic_name(usual) != node.resolve_topic_name(usual, only_expand=True):
         return usual

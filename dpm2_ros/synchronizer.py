@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which clouds are accepted, and when one has waited long enough for what goes with it. Pure: no ROS, no clock, no
-thread.
+"""Accepts or rejects clouds, and synchronizes each with messages of the other sensors: images of one or two cameras,
+and the cloud of a second LiDAR. Pure logic: no ROS, no clock, no thread.
 
-Images of one or two cameras go with it, and the cloud of a second LiDAR.
-
-Every accepted cloud leaves exactly once, in order, with these by the rules of `dpm2_core.data.pairing`. It leaves as
-soon as there is one of each within the tolerance: a nearer one that may be on its way is not worth the wait.
+Each accepted cloud is released exactly once and in order, together with the messages that `dpm2_core.data.pairing`
+associates with it. It is released as soon as every sensor has a message within the tolerance; it does not wait for a
+closer one.
 """
 
 from __future__ import annotations
@@ -19,97 +18,100 @@ from typing import Any
 from dpm2_core.data.pairing import AHEAD, JUMP, Beside, SetBack, is_due, passed
 
 HOLD = 0.5
-"""Longest wait (s) for the next stamp, which confirms a jump."""
+"""Longest wait (s) for the next stamp, which confirms a jump of the stamps."""
 FEW = 2
-"""Clouds that may wait at least where they come faster than they can be processed."""
+"""Smallest limit of the queue when clouds arrive faster than they can be processed."""
 PATIENCE = 5
-"""Clouds in a row that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
+"""Consecutive clouds that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
 
 
 class StampCheck(StrEnum):
-    """What became of an incoming cloud."""
+    """Whether an incoming cloud is accepted, and why not."""
 
     ACCEPTED = "accepted"
     RESTARTED = "restarted"
     """Accepted, and time has gone back."""
     REPEATED = "repeated"
-    """Rejected: its stamp is that of the cloud before."""
+    """Rejected: it has the stamp of the previous cloud."""
     OUT_OF_ORDER = "out of order"
     """Rejected: a later cloud has been accepted already. Unless more follow, see `SET_BACK`."""
     SET_BACK = "its clock was set back by less than a second; the drive goes on"
-    """Accepted, as are those right before it that were out of order; counted as accepted."""
+    """Accepted, together with the out-of-order clouds right before it; counted as accepted."""
     JUMPED = "the stamp jumps; the next one shows whether it is right"
-    """Neither accepted nor rejected yet; counted as what becomes of it."""
+    """Neither accepted nor rejected yet; counted once that is decided."""
     STRAY = "stray"
     """Rejected: its stamp jumped, and the next one did not."""
 
 
 @dataclass(eq=False)
 class Bundle:
-    """A cloud and what goes with it, ready to be processed; arrival and `now` are seconds of one clock, `clock` is when
-    it arrived by the clock of a recording or a simulation, s, or 0 without one."""
+    """A cloud and the messages synchronized with it, ready to be processed. `arrival` is in seconds of the same clock
+    as `now` in `Synchronizer`; `clock` is the arrival by the clock of a recording or a simulation, s, or 0 without one.
+    """
 
     stamp: int
     cloud: Any
     arrival: float
     clock: float
     restarted: bool
-    """Whether time has gone back before it."""
+    """Whether time went back before this cloud."""
     stepped: bool = False
-    """Whether it has gone on by more than has passed."""
+    """Whether the stamps advanced by more than the time that has passed."""
     beside: dict[str, tuple[int, Any]] = field(default_factory=dict)
-    """Topic of each other sensor that has one to stamp (ns) and message."""
+    """Topic of each other sensor that has a message for this cloud, to stamp (ns) and message."""
     dropped: int = 0
-    """Clouds right before it that were."""
+    """Number of clouds right before it that were dropped."""
 
 
 @dataclass(eq=False)
 class SensorState:
-    """What a sensor beside the LiDAR has delivered."""
+    """What a sensor other than the LiDAR has delivered."""
 
     messages: Beside
     received: int = 0
     matched: int = 0
     late: int = 0
-    """Messages for which a cloud had not waited."""
+    """Messages that arrived after their cloud was released."""
     missed: int = 0
-    """Clouds in a row that left without it, since one came that was in time or ahead."""
+    """Consecutive clouds released without it, since its last message that was in time or ahead."""
     unused: int = 0
-    """Messages in a row that went with no cloud."""
+    """Consecutive messages that were synchronized with no cloud."""
     without: int = 0
-    """Clouds in a row that left without it, whether they had waited or not."""
+    """Consecutive clouds released without it, whether they had waited or not."""
     last_arrival: float | None = None
     present: bool = True
-    """Whether there is a publisher; clouds do not wait for a sensor without one."""
+    """Whether the topic has a publisher; clouds do not wait for a sensor without one."""
 
     @property
     def awaited(self) -> bool:
-        """Whether a cloud still waits for this sensor."""
+        """Whether clouds still wait for this sensor."""
         return self.missed < PATIENCE
 
     @property
     def fits(self) -> bool:
-        """Whether its messages go with clouds: most of a fast one go with none, and most clouds miss a slow one."""
+        """Whether its messages can be synchronized with clouds. Most messages of a fast sensor match no cloud, and most
+        clouds have no message of a slow one, so that only both together show a problem."""
         return self.without < PATIENCE or self.unused < PATIENCE
 
     def waits(self, stamp: int) -> bool:
-        """Whether a cloud of that stamp (ns) should."""
+        """Whether a cloud with that stamp (ns) should wait for this sensor."""
         return self.present and self.awaited and not passed(self.messages.last, stamp)
 
 
 class Synchronizer:
-    """A bounded queue of clouds, each waiting for what goes with it.
+    """A bounded queue of clouds, each waiting for the messages of the other sensors.
 
     Args:
-        beside: topics of the other sensors. Without any, nothing waits.
-        depth: clouds that may wait; when full, the oldest is dropped. Where clouds keep coming faster than they go, one
-            fewer may wait each time, down to `FEW`: as many are lost, but those that go are not old.
+        beside: topics of the other sensors. Without any, no cloud waits.
+        depth: limit of the queue; when it is full, the oldest cloud is dropped. While clouds arrive faster than they
+            are processed, the limit shrinks by one each time, down to `FEW`. Just as many clouds are dropped then, but
+            the remaining ones are more recent.
         timeout: longest wait of a cloud, s.
-        tolerance: greatest difference of stamps that belong together, s.
+        tolerance: largest difference of the stamps of synchronized messages, s.
 
     Attributes:
-        sensors: those, by topic.
-        left: the last cloud that went; None before one has.
+        sensors: the other sensors, by topic.
+        left: the last cloud that was released; None before the first.
     """
 
     def __init__(self, beside: Iterable[str], depth: int, timeout: float, tolerance: float) -> None:
@@ -119,29 +121,29 @@ class Synchronizer:
         self.last_arrival: float | None = None
         self._timeout = timeout
         self._queue: deque[Bundle] = deque()
-        self._depth = self._room = depth  # what may wait in general, and now
-        self._moves = False  # whether a cloud has gone since the last was dropped: too slow, but not held up
-        self._newest: Bundle | None = None  # the last one accepted
-        self._period = JUMP  # ns, from the last but one to that
+        self._depth = self._room = depth  # limit of the queue in general, and at present
+        self._moves = False  # whether a cloud was released since the last drop: the worker is slow, but not blocked
+        self._newest: Bundle | None = None  # the last accepted cloud
+        self._period = JUMP  # ns, between the last two accepted clouds
         self._jumped: Bundle | None = None
         self._set_back = SetBack()
         self.left: Bundle | None = None
 
     def __len__(self) -> int:
-        """Clouds that are waiting."""
+        """Number of clouds that are waiting."""
         return len(self._queue) + (self._jumped is not None)
 
     @property
     def received(self) -> int:
-        """Clouds that have come in."""
+        """Number of clouds that have arrived."""
         return sum(self.counts.values()) + (self._jumped is not None)
 
     def follow(self, left: Bundle | None) -> None:
-        """Go on where another one has ended: what is its `left`."""
+        """Continue where another synchronizer ended; `left`: its attribute of that name."""
         self.left = self._newest = left
 
     def add_cloud(self, stamp: int, cloud: Any, now: float, clock: float = 0.0) -> StampCheck:
-        """Take a cloud with its stamp (ns); `now` is when it arrived, `clock` as of `Bundle`."""
+        """Add a cloud with its stamp (ns); `now` is when it arrived, `clock` as in `Bundle`."""
         self.last_arrival = now
         bundle = Bundle(stamp, cloud, now, clock, restarted=False)
         if self._jumped is not None and self._newest is not None:
@@ -164,16 +166,15 @@ class Synchronizer:
         return StampCheck.SET_BACK if late else check
 
     def _came_in_time(self, late: Bundle, bundle: Bundle) -> bool:
-        """Whether the clouds from one that was out of order to this one came at the pace of their stamps, and more time
-        has passed than these say since the last one in order: the clock was set back, and nothing was kept on the way.
-        """
+        """Whether the sensor's clock was set back. Then the clouds from the out-of-order `late` to `bundle` arrived at
+        the pace of their stamps, and since the last cloud in order more time has passed than the stamps show. Clouds
+        that were delayed on the way do not arrive like this."""
         return self._on_pace(bundle, late) and self._ahead(bundle, self._newest) < -self._period / 2
 
     def _came_at_once(self, bundle: Bundle, following: Bundle | None) -> bool:
-        """Whether one that is ahead came a period after the last, and the one after it at the pace of their stamps: the
-        clock was set; where clouds were lost or kept on the way one of the two is not so. Where none follows, as in
-        lockstep, /clock alone tells.
-        """
+        """Whether the sensor's clock was set forward before this cloud. Then it arrived one period after the last, and
+        the `following` one at the pace of the stamps; if clouds were lost or delayed, one of the two is false. If none
+        follows, as in lockstep, only /clock can show it."""
         last = self._newest
         if last is None or bundle.stamp < last.stamp:
             return False
@@ -182,7 +183,7 @@ class Synchronizer:
         return told and is_due(passed * 1e9, self._period)
 
     def _on_pace(self, bundle: Bundle, last: Bundle) -> bool:
-        """Whether the stamps have gone on from that cloud by as much as has passed."""
+        """Whether the stamps have advanced since that cloud by as much as the time."""
         return abs(self._ahead(bundle, last)) < self._period / 3
 
     def due(self, stamp: int, now: float, clock: float = 0.0) -> bool:
@@ -191,7 +192,7 @@ class Synchronizer:
         return self._newest is not None and self._check(due) is StampCheck.ACCEPTED
 
     def add(self, topic: str, stamp: int, message: Any, now: float) -> None:
-        """Take a message of another sensor with its stamp (ns)."""
+        """Add a message of another sensor with its stamp (ns)."""
         sensor, left = self.sensors[topic], self.left
         tolerance = sensor.messages.tolerance
         sensor.received += 1
@@ -199,25 +200,25 @@ class Synchronizer:
         sensor.last_arrival = now
         late = left is not None and -JUMP < stamp - left.stamp <= (tolerance if sensor.missed else -tolerance)
         sensor.late += late
-        if left is None or (not late and abs(stamp - left.stamp) < JUMP):  # by more it may be of another clock
+        if left is None or (not late and abs(stamp - left.stamp) < JUMP):  # beyond that it may be of another clock
             sensor.missed = 0
         elif late and stamp - left.stamp >= -tolerance and now <= left.arrival + self._timeout:
-            sensor.missed = 0  # it would have come in time, had that cloud waited
+            sensor.missed = 0  # it would have been in time, if that cloud had waited
         sensor.messages.add(stamp, message, [bundle.stamp for bundle in self._queue])
 
     def pop(self, now: float) -> Bundle | None:
-        """The next cloud that has what goes with it or has waited long enough; None if there is none yet."""
+        """The next cloud that has its messages or has waited long enough; None if there is none yet."""
         if self._jumped is not None and now >= self._jumped.arrival + HOLD:
             self._settle(true=True)
         ready = self._ready(now)
-        if ready is None:  # who asks is not behind
+        if ready is None:  # the consumer keeps up
             self._room = self._depth
         else:
             self.left, self._moves = ready, True
         return ready
 
     def _ready(self, now: float) -> Bundle | None:
-        """Takes the next cloud from the queue, if it need not wait."""
+        """Take the next cloud from the queue, if it need not wait."""
         if not self._queue:
             return None
         head, sensors = self._queue[0], self.sensors
@@ -253,9 +254,9 @@ class Synchronizer:
 
     @staticmethod
     def _ahead(bundle: Bundle, last: Bundle | None) -> float:
-        """By how much more (ns) the stamps have gone on than time has passed since that cloud.
+        """By how much more (ns) the stamps have advanced since that cloud than the time.
 
-        A recording that is played faster passes more time than one who listens, and /clock says how much.
+        In a recording that is played faster, more time passes than for the receiver; /clock shows how much.
         """
         if last is None:
             return 0.0
@@ -263,7 +264,7 @@ class Synchronizer:
         return bundle.stamp - last.stamp - passed * 1e9
 
     def _settle(self, true: bool, following: Bundle | None = None) -> None:
-        """Accept or reject the cloud whose stamp jumped; `following`: the next one, where it is there."""
+        """Accept or reject the cloud whose stamp jumped; `following`: the next one, if it has arrived."""
         bundle, self._jumped = self._jumped, None
         if bundle is None or self._newest is None:
             return
@@ -285,7 +286,7 @@ class Synchronizer:
             self._room, self._moves = max(self._room - 1, min(FEW, self._depth)), False
         while len(self._queue) > self._room:
             oldest = self._queue.popleft()
-            self._queue[0].restarted |= oldest.restarted  # not lost with the cloud that announced it
+            self._queue[0].restarted |= oldest.restarted  # kept, although the cloud that had it is dropped
             self._queue[0].stepped |= oldest.stepped
             self._queue[0].dropped += oldest.dropped + 1
             self.dropped += 1
