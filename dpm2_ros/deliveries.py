@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot has still to send of a drive, by what the mapper acknowledges."""
+"""Which keyframes of a drive a robot still has to send, by the mapper's acknowledgments."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 from dpm2_ros.unsent import KeyframeFile
 
-_SLOT, _MEMORY = 0.3, 0.8  # s; the mapper acknowledges twice a second
+_SLOT, _MEMORY = 0.3, 0.8  # s; the mapper acknowledges twice per second
 _PATIENCE, _ANNOUNCE = 1.5, 2.0  # s until a keyframe is sent again, and between two announcements
-_CERTAIN = 2.0  # s for which every acknowledgment says that all have arrived, before a file is deleted
+_CERTAIN = 2.0  # s for which every acknowledgment must confirm all keyframes, before a file is deleted
 
 
 class Delivery:
     """The keyframes of a drive, and which of them the mapper has.
 
     Attributes:
-        earlier: whether the drive is over, as after a new start.
+        earlier: whether the drive is over, as after a restart.
     """
 
     def __init__(self, session: str, file: KeyframeFile, earlier: bool, now: float) -> None:
@@ -29,36 +29,36 @@ class Delivery:
         self._whole_since: float | None = None
 
     def append(self, parts: list[bytes], sent: float | None) -> None:
-        """A new keyframe, sent at that time, s; None: not yet."""
+        """Add a new keyframe that was sent at that time, s; None: not sent yet."""
         self.file.append(parts)
         self._sent.append(-float("inf") if sent is None else sent)
         self._announced = sent or self._announced
 
     @property
     def arrived(self) -> int:
-        """How many the mapper has, in its map file or still in memory."""
+        """Number of keyframes that the mapper has, in its map file or still in memory."""
         below, above = self._acks.agreed
         return below + len(above)
 
     @property
     def late(self) -> int:
-        """How many are not in the mapper's map file, from the first gap on."""
+        """Number of keyframes from the first one on that is not in the mapper's map file."""
         return len(self.file) - self._acks.agreed[0]
 
     def acknowledge(self, below: int, above: Set[int], now: float) -> None:
-        """All ids below a number are in the map file; some above have arrived, too."""
+        """Process an acknowledgment: all ids below a number are in the map file, some above have arrived, too."""
         made = len(self.file)
         self._acks.add(min(below, made), {id for id in above if below <= id < made}, now)
         self._whole_since = None if self.late else self._whole_since or now
 
     def certain(self, now: float) -> bool:
-        """Whether all are delivered, by more than one acknowledgment; of a drive without keyframes too."""
+        """Whether all keyframes are delivered, by more than one acknowledgment. True of a drive without keyframes."""
         if not len(self.file):
             return True
         return not self.late and self._whole_since is not None and now - self._whole_since > _CERTAIN
 
     def due(self, now: float, most: int) -> list[int]:
-        """Ids to be sent now."""
+        """Ids of keyframes to be sent now, at most `most`."""
         below, above = self._acks.agreed
         late = [id for id in range(below, len(self.file)) if id not in above and now - self._sent[id] > _PATIENCE]
         for id in late[:most]:
@@ -66,7 +66,7 @@ class Delivery:
         return late[:most]
 
     def announces(self, now: float) -> bool:
-        """Whether the pose of the last one is due, so that the mapper knows how many there are."""
+        """Whether the pose of the last keyframe is due, by which the mapper knows how many there are."""
         if not len(self.file) or now - self._announced <= _ANNOUNCE:
             return False
         self._announced = now
@@ -74,10 +74,10 @@ class Delivery:
 
 
 class Acks:
-    """What the mapper has: that on which all its acknowledgments of the last second agree.
+    """The keyframes that the mapper has: those on which all its acknowledgments of the last second agree.
 
-    Anyone can send one. One that claims too little costs a keyframe sent twice; one that claims too much would
-    cost the keyframe, so no single one is trusted.
+    Any process can send an acknowledgment. If it claims too little, a keyframe is sent twice; if it claims too much, a
+    keyframe would be lost. So no single one is trusted.
     """
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class Acks:
         return functools.reduce(_both, results) if results else (0, frozenset())
 
     def add(self, below: int, above: Set[int], now: float) -> None:
-        """One that came at that time, s."""
+        """Add an acknowledgment that arrived at that time, s."""
         if not self._slots or now - self._slots[-1].begin > _SLOT:
             self._slots.append(_Slot(now, now, below, frozenset(above)))
         else:
@@ -102,7 +102,7 @@ class Acks:
 
 @dataclass(eq=False)
 class _Slot:
-    """Those that came between two times, s, and on what they agree."""
+    """The acknowledgments that arrived between two times, s, and the ids on which they agree."""
 
     begin: float
     end: float

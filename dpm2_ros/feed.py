@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The keyframes of one namespace: checked, in order, those of every drive apart from those of any other."""
+"""Receives the keyframes of one namespace: checks them, and orders those of each drive separately."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ from dpm2_ros.mapping import MapperThread
 from dpm2_ros.streams import Parts, Stream
 
 ODOM = "/dpm2/keyframe_odom"
-"""Topic by which robots are found."""
+"""Topic, in a robot's namespace, by which robots are discovered."""
 SILENT = 5.0
 """s without a message after which a drive counts as over; a robot announces its last keyframe every 2 s."""
 BESIDE = 2.5
-"""s for which both of two drives must be heard to be two robots."""
-_STREAMS = 256  # drives that are known, most of them over
-_APART = 8  # robots beside the one whose namespace it is
+"""s for which two drives must both send messages to count as two robots."""
+_STREAMS = 256  # known drives, most of them over
+_APART = 8  # robots in the namespace of another one
 _HELD = 16_000_000  # bytes that may wait
-_ACKS = 50  # between two ticks, to drives that are not known yet
+_ACKS = 50  # acknowledgments between two ticks, to drives whose robot is not decided
 _BACKLOG = 32  # keyframes that may wait for the mapper
 
 
 class Feed:
-    """One namespace: joins messages to keyframes, hands them to the mapper, and acknowledges those that have arrived.
+    """One namespace: assembles keyframes, passes them to the mapper, and acknowledges those that have arrived.
 
-    What is not in the map file yet is acknowledged as what waits: so its robot keeps it, and does not send it again.
-    A new session is that of the robot that was started again, once the old one has been silent for `SILENT` s. If both
-    are heard they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
-    The robot itself says which drives are over: those it sends first, and its odometry is of none of them.
+    A keyframe that is not in the map file yet is acknowledged as waiting: its robot keeps it, but does not send it
+    again. Once a session has been silent for `SILENT` s, a new session is that of the restarted robot. If both send
+    messages, they are two robots, and the second gets a name of its own, `robot.session`. So no session ends another.
+    The robot itself marks the drives that are over: it sends them first, and its odometry is of none of them.
     """
 
     def __init__(self, node: GuardedNode, mapper: MapperThread, namespace: str, weights: str) -> None:
-        """`weights`: the identity of the mapper's network."""
+        """`weights`: identity of the weights of the mapper's network."""
         self._node, self._mapper, self._namespace, self._weights = node, mapper, namespace, weights
         self._robot = namespace.strip("/")
         self.opened = -float("inf")
-        self._streams: dict[str, Stream] = {}  # by session, the one that was heard last at the end
+        self._streams: dict[str, Stream] = {}  # by session, the one with the latest message at the end
         self._acks = 0
         self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
         self._pose_topic = namespace + ODOM
@@ -63,7 +63,7 @@ class Feed:
         self._received: Any = None
 
     def open(self) -> None:
-        """Listen, from now on or again: what is known of the drives has stayed."""
+        """Subscribe, for the first time or again; the known drives are kept."""
         node, self.opened = self._node, time.monotonic()
         self._subscriptions = [
             node.create_subscription(Odometry, self._pose_topic, self._on_pose, WIRE),
@@ -80,23 +80,23 @@ class Feed:
 
     @property
     def proven(self) -> bool:
-        """Whether a keyframe has come of it."""
+        """Whether a keyframe of this namespace was passed to the mapper."""
         return any(stream.taken for stream in self._streams.values())
 
     @property
     def beside(self) -> list[str]:
-        """Names of further robots in this namespace that are heard now."""
+        """Names of further robots in this namespace that send messages now."""
         recent = time.monotonic() - SILENT
         return [name for name, s in self.robots.items() if name != self._robot and s.heard > recent]
 
     @property
     def odom_frames(self) -> set[str]:
-        """Of the odometries that are heard now."""
+        """Odometry frames of the robots that send messages now."""
         recent = time.monotonic() - SILENT
         return {stream.odom_frame for stream in self.robots.values() if stream.live and stream.heard > recent}
 
     def tick(self) -> None:
-        """Twice a second: decide what waits, and acknowledge what has arrived."""
+        """Called twice per second: pass on keyframes that wait, and acknowledge those that have arrived."""
         now = time.monotonic()
         self._acks = 0
         for stream in list(self._streams.values())[-_ACKS:]:
@@ -107,14 +107,14 @@ class Feed:
                 self._acknowledge(stream, now)
 
     def forget(self) -> None:
-        """The map is empty: the next keyframe of each drive is its first."""
+        """Note that the map is empty: the next keyframe of each drive is its first there."""
         for stream in self._streams.values():
             stream.last = None
 
     def close(self) -> None:
-        """Listen no more. What has arrived goes to the map, however much waits there already.
+        """Unsubscribe. Complete keyframes are passed to the mapper, however many wait there already.
 
-        Not so the keyframes of a drive whose place is not decided: their robot sends them again.
+        Those of a drive whose robot is not decided are not: they are sent again.
         """
         for stream in self.robots.values():
             self._hand_on(stream, time.monotonic(), math.inf)
@@ -125,16 +125,16 @@ class Feed:
     def _on_odom(self, message: Odometry) -> None:
         frame = message.header.frame_id
         check_frame(frame)
-        known = self.robots  # without a keyframe of a robot in the map it is not known where in it the robot is
+        known = self.robots  # a robot without a keyframe in the map has no pose in it
         main = [self._robot] if self._robot in known else []
-        for robot in (*main, *reversed(known)):  # of two that use the same frame the first
+        for robot in (*main, *reversed(known)):  # of two with the same frame, the first
             if known[robot].odom_frame == frame and known[robot].live:
                 if not self._has_begun_anew(known[robot]):
                     self._mapper.broadcast(stamp_ns(message.header), robot, frame)
                 return
 
     def _has_begun_anew(self, drive: Stream) -> bool:
-        """Whether the robot of a drive has started again since it was heard: its odometry is that of another drive."""
+        """Whether the robot of a drive has restarted since its last message: its odometry is then of another drive."""
         return any(s.robot is None and s.live and drive.heard < s.since <= s.heard for s in self._streams.values())
 
     def _on_pose(self, message: Odometry) -> None:
@@ -149,7 +149,7 @@ class Feed:
         self._take_part("seen", message.header.frame_id, lambda id: self._usable(message, id))
 
     def _take_part(self, part: str, name: str, checked: Callable[[int], Any]) -> None:
-        """One of the messages of a keyframe, by its name; the stream takes note of one that is rejected."""
+        """Add one of the messages of a keyframe, by its name; the stream counts a rejected one."""
         stream, id = self._hear(name)
         if not stream.wants(id, part):
             return
@@ -164,7 +164,7 @@ class Feed:
             self._bound()
 
     def _usable(self, message: PointCloud2, id: int) -> Descriptors | None:
-        """Descriptors that the mapper's network can compare; without, it makes its own of the keyframe's cloud."""
+        """Descriptors that the mapper's network can compare; None: it computes its own from the keyframe's cloud."""
         _check_budget(message, id)
         descriptors, weights = descriptors_from_msg(message)
         channels = self._mapper.active.mapper.channels
@@ -198,7 +198,7 @@ class Feed:
         return stream, id
 
     def _bound(self) -> None:
-        """Unknown drives may not fill the memory: those whose last message is oldest are dropped."""
+        """Limit the memory of other drives: the messages of those with the oldest last message are dropped."""
         held = {session: s.holds for session, s in self._streams.items() if s.robot != self._robot}
         total = sum(held.values())
         for session, size in held.items():
@@ -208,7 +208,11 @@ class Feed:
             total -= size
 
     def _hand_on(self, stream: Stream, now: float, most: float = _BACKLOG) -> None:
-        """To the mapper, where so many may wait: what is complete up to the first gap, once it is known whose it is."""
+        """Pass the complete keyframes before the first gap to the mapper, once the drive's robot is decided.
+
+        Args:
+            most: keyframes that may wait in the mapper.
+        """
         while self._mapper.waiting < most and (stream.robot is not None or self._place(stream, now)):
             taken = stream.take()
             if taken is None:
@@ -216,7 +220,8 @@ class Feed:
             self._add(stream, *taken)
 
     def _place(self, stream: Stream, now: float) -> bool:
-        """Whose drive it is, if that is certain: the robot's, or that of another one in the same namespace."""
+        """Decide whose drive it is: this robot's, or that of another one in the same namespace; returns whether that is
+        decided."""
         main, name = self.robots.get(self._robot), self._robot or "/"
         if not stream.ready:
             return False
@@ -277,10 +282,10 @@ def keyframe_from(
 ) -> Keyframe:
     """A keyframe without its cloud; its edge leads to the last one that arrived (the mapper expects gaps).
 
-    A covariance of zeros says that the odometry began anew: there is no edge.
+    A covariance of zeros means that the odometry restarted: there is no edge.
 
     Raises:
-        RejectedError: the pose is not a rigid transform, or the covariance not one.
+        RejectedError: the pose is not a rigid transform, or the covariance is invalid.
     """
     try:
         T_odom_kf = checked_pose(pose.pose.pose)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A keyframe as three messages: pose, descriptors, packed cloud with fix and thumbnail; and what the mapper answers."""
+"""A keyframe as three messages: pose, descriptors, packed cloud with fix and thumbnail; and the acknowledgment."""
 
 from __future__ import annotations
 
@@ -24,23 +24,24 @@ from dpm2_core.slam.store.cloud_codec import pack_cloud
 from dpm2_ros.conversions import EARLIER, bytes_to_array, columns_to_msg
 
 WIRE = QoSProfile(depth=64, reliability=ReliabilityPolicy.RELIABLE)
-"""Of keyframes; what falls out of the queue is sent again."""
+"""QoS of keyframes; messages that drop out of the queue are sent again."""
 BUDGET = 99_000
-"""Bytes of a keyframe's payload and descriptors on the wire; pose and protocol have the rest of 100 kB. Descriptors may
-have half of it, 325 of 128 channels: beside more the cloud would have too few points to be verified by."""
+"""Largest size of a keyframe's payload and descriptors on the wire, bytes; pose and protocol use the rest of 100 kB.
+Descriptors may use half of it, 325 of 128 channels: with more, the cloud would have too few points for loop
+verification."""
 
-_FIX = struct.Struct("<q15d")  # stamp, ns; place, covariance, antenna, as in `Fix`
+_FIX = struct.Struct("<q15d")  # stamp, ns; position, covariance, antenna, as in `Fix`
 _OF_FIX, _OF_THUMBNAIL = "fix", "thumbnail"
-_LARGEST_THUMBNAIL = 20_000  # bytes: more would cost the cloud its points. One of 320 pixels has 6000 to 25 000
+_LARGEST_THUMBNAIL = 20_000  # bytes: a larger one would replace points of the cloud; 320 pixels have 6000 to 25 000
 _FEATURE = "feature"
 _MOST_CHANNELS = 4096
 
 
 def of_earlier_drive(parts: Sequence[bytes]) -> list[bytes]:
-    """The serialized messages of a keyframe with a name that says that its drive is over.
+    """The serialized messages of a keyframe, with a name that marks its drive as over.
 
     Raises:
-        RuntimeError: they are no such messages.
+        RuntimeError: they are not the messages of a keyframe.
     """
     kinds = (Odometry, PointCloud2, UInt8MultiArray)
     pose, descriptors, cloud = (deserialize_message(part, kind) for part, kind in zip(parts, kinds, strict=True))
@@ -52,13 +53,13 @@ def of_earlier_drive(parts: Sequence[bytes]) -> list[bytes]:
 
 
 def received_to_msg(session: str, below: int, above: Sequence[int]) -> UInt32MultiArray:
-    """What a mapper has of a session: all ids below one, in its map file, and some above."""
+    """The acknowledgment of a session's keyframes: all ids below a number, in the map file, and some above."""
     dimension = MultiArrayDimension(label=session, size=1 + len(above), stride=1 + len(above))
     return UInt32MultiArray(layout=MultiArrayLayout(dim=[dimension]), data=[below, *above])
 
 
 class Payload(NamedTuple):
-    """What comes with a keyframe's cloud, which is packed: its fix and its thumbnail, if it has them."""
+    """A keyframe's packed cloud, with its fix and its thumbnail, if it has them."""
 
     cloud: bytes
     fix: Fix | None = None
@@ -68,7 +69,7 @@ class Payload(NamedTuple):
 def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[PointCloud2, UInt8MultiArray]:
     """Descriptors and payload of a keyframe, the cloud downsampled until both are within `BUDGET`.
 
-    Behind the cloud are its fix and its thumbnail, if it has them, as dimensions more; a large thumbnail comes smaller.
+    The fix and the thumbnail, if any, follow the cloud as further dimensions; a large thumbnail is made smaller.
     """
     d, fix, thumbnail = keyframe.descriptors, keyframe.fix, keyframe.thumbnail
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
@@ -92,7 +93,7 @@ def payload_from_msg(message: UInt8MultiArray) -> Payload:
     """The payload of a keyframe, its cloud not unpacked yet.
 
     Raises:
-        RejectedError: the parts are not as long as it says, or the fix or the thumbnail is invalid.
+        RejectedError: the parts do not have the stated lengths, or the fix or the thumbnail is invalid.
     """
     data, dimensions = bytes(message.data), message.layout.dim
     if len(dimensions) < 2:
@@ -124,9 +125,9 @@ def _fix_from(data: bytes) -> Fix:
 def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: str = "") -> PointCloud2:
     """A cloud of points x, y, z, axis_x, axis_y, step and 128 int8 `feature:WEIGHTS`, in units of step; empty for None.
 
-    The first, in half of `BUDGET`: any number of the first is as evenly spread as all.
-    Those of a tilted LiDAR whose base is not known, and those of a room, are not sent: the receiver makes its own of
-    the cloud.
+    Only the first ones are sent, within half of `BUDGET`: any number of the first is as evenly spread as all.
+    Those of a tilted LiDAR whose base is not known, and those of a room, are not sent: the receiver computes its own
+    from the cloud.
     """
     d = None if d is not None and (d.up is not None or d.scale != 1) else d
     values, features = np.zeros((0, 6), np.float32), np.zeros((0, 1), np.int8)
@@ -144,7 +145,7 @@ def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]
     """The inverse of `descriptors_to_msg`: descriptors, and the identity of the weights that made them.
 
     Raises:
-        RejectedError: it is something else.
+        RejectedError: it does not contain descriptors.
     """
     if not message.width:
         return None, ""

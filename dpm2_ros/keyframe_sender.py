@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes on the wire: three messages each, at most 100 kB together, sent again until the mapper has them.
+"""Sends keyframes: three messages each, at most 100 kB together, again and again until the mapper has them.
 
-A robot keeps all keyframes of its drive, in a file (`unsent.py`), and announces its last one every two seconds. The
-mapper acknowledges what it has: all below a number, in its map file, and some above, in memory. So it costs nothing to
-be out of reach for a while, to join late, to start the mapper again, or that either is killed: the next start sends
-what is left of the drives before. DDS' own reliability ends with either process, and forgets what is too old.
+A robot stores all keyframes of its drive in a file (`unsent.py`), and announces its last one every two seconds. The
+mapper acknowledges the keyframes that it has: all below a number, in its map file, and some above, in memory. So
+nothing is lost if the link fails for a while, if the mapper starts late or restarts, or if either process is killed:
+the next start sends what is left of earlier drives. The reliability of DDS ends with either process, and DDS discards
+old messages.
 """
 
 from __future__ import annotations
@@ -34,25 +35,25 @@ from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
 _MOST_ACKED = 1001  # numbers in an acknowledgment
-_TICK, _BURST = 0.25, 8  # s, and the keyframes that are sent again in one
-_FAREWELL = 4.0  # s; acknowledgments come twice a second, and those of one second are to agree
+_TICK, _BURST = 0.25, 8  # s between two calls of `_repeat`, and keyframes sent again by one
+_FAREWELL = 4.0  # s; acknowledgments arrive twice per second, and those of one second must agree
 
 
 class KeyframeSender:
-    """Publishes a robot's keyframes, keeps them, and sends those again that the mapper misses. Any thread may call.
+    """Publishes a robot's keyframes, stores them, and sends those again that the mapper lacks. Any thread may call.
 
-    Drives are sent one after the other: what an earlier one still has to deliver comes before the next one's.
+    Drives are sent one after the other: the remaining keyframes of an earlier one come before those of the next.
     """
 
     def __init__(self, node: GuardedNode, robot: str, ros: RosSettings, weights: str = "") -> None:
-        """`weights`: see `weights_identity`. With the mapper in the same process each keyframe is sent once."""
+        """`weights`: see `weights_identity`. With the mapper in the same process, each keyframe is sent once."""
         self._robot, self._odom_frame, self._weights = robot, ros.own_frame, weights
         self._log, self._lock = node.get_logger(), threading.Lock()
         self._folder = Path(ros.map_directory) if ros.map_directory else None
         self._descriptors = node.create_publisher(PointCloud2, "dpm2/keyframe", WIRE)
         self._cloud = node.create_publisher(UInt8MultiArray, "dpm2/keyframe_cloud", WIRE)
         self._pose = node.create_publisher(Odometry, "dpm2/keyframe_odom", WIRE)
-        self._drives: list[Delivery] = []  # those that are over and not delivered, then the one that goes on
+        self._drives: list[Delivery] = []  # those that are over and not delivered, then the current one
         if not ros.embed_mapper:
             self._drives += self._left_behind()
             self.restart()
@@ -63,19 +64,19 @@ class KeyframeSender:
 
     @property
     def arrived(self) -> tuple[int, int]:
-        """Keyframes that the mapper has acknowledged, and all, those of earlier drives included."""
+        """Number of keyframes that the mapper has acknowledged, and of all; both include those of earlier drives."""
         with self._lock:
             return sum(drive.arrived for drive in self._drives), sum(len(drive.file) for drive in self._drives)
 
     @property
     def problem(self) -> str:
-        """Why keyframes that the mapper lacks would end with this process; empty if none would."""
+        """Why keyframes that the mapper lacks would be lost with this process; empty if none would."""
         with self._lock:
             file = self._drives[-1].file
             return f"{len(file) - file.stored} keyframes in memory only: {file.problem}" if file.problem else ""
 
     def restart(self) -> None:
-        """A new drive begins: a session of its own. The mapper is told at once that the one before is over."""
+        """Begin a new drive, with its own session. The mapper is notified at once that the drive before is over."""
         session = secrets.token_hex(4)
         drive = Delivery(session, self._file(session), False, time.monotonic())
         last = None
@@ -85,16 +86,16 @@ class KeyframeSender:
             self._drives = [*(earlier for earlier in self._drives if len(earlier.file)), drive]
             for earlier in self._drives[:-1]:
                 if not earlier.earlier:
-                    with suppress(sqlite3.Error, OSError, RuntimeError):  # `_repeat` reads it again, and says so
+                    with suppress(sqlite3.Error, OSError, RuntimeError):  # `_repeat` reads it again, and logs it
                         last = of_earlier_drive(earlier.file.read(len(earlier.file) - 1))[0]
                 earlier.earlier = True
             for earlier in self._drives[1:-1]:
-                earlier.file.pause()  # until its turn: without a mapper there may be hundreds
+                earlier.file.pause()  # closed until its turn: without a mapper there may be hundreds
         if last is not None:
             self._pose.publish(last)
 
     def send(self, keyframe: Keyframe) -> None:
-        """A new one, in the frame whose pose is published."""
+        """Send a new keyframe, which is in the frame whose pose is published."""
         drive = self._drives[-1] if self._drives else None
         covariance = np.zeros((6, 6)) if keyframe.edge is None else keyframe.edge.covariance
         name = keyframe_name(self._robot, keyframe.id, drive.session if drive else "")
@@ -111,22 +112,22 @@ class KeyframeSender:
         self._publish(parts)
 
     def close(self) -> None:
-        """Before the node ends: wait until the mapper, if one listens, has all in its file, or for `_FAREWELL`.
+        """Before the node ends: wait until the mapper, if one runs, has all in its file, but at most `_FAREWELL`.
 
-        What it does not have stays on the disk, for the next start.
+        Keyframes that it does not have stay on disk, for the next start.
         """
         end = time.monotonic() + _FAREWELL
         while any(drive.late for drive in self._drives) and self._received.get_publisher_count():
             if time.monotonic() > end:
                 break
             time.sleep(_TICK)
-            take_waiting(self._received)  # nobody calls back any more
+            take_waiting(self._received)  # no executor does it any more
             self._repeat()
         with self._lock:
             for drive in self._drives:
                 late, file = drive.late, drive.file
                 if late:
-                    file.catch_up()  # there may be room by now
+                    file.catch_up()  # there may be space by now
                 lost = min(late, len(file) - file.stored)
                 file.close(keep=late > lost)
                 if file.path is not None and late > lost:
@@ -137,7 +138,7 @@ class KeyframeSender:
                     self._log.error(f"{lost} keyframes neither delivered nor {kept}: {why}")
 
     def _file(self, session: str) -> KeyframeFile:
-        """Of a new drive, on the disk if that can be."""
+        """The file of a new drive, on disk if possible."""
         if self._folder is not None:
             path = path_of(self._folder, self._robot, session)
             try:
@@ -155,7 +156,7 @@ class KeyframeSender:
             try:
                 file = KeyframeFile(path)
             except (sqlite3.Error, OSError) as error:
-                if "locked" not in str(error):  # else a robot of this name drives with it
+                if "locked" not in str(error):  # else another process with this robot's name uses it
                     self._log.error(f"{path}: not sent: {error}")
                 continue
             if len(file):
@@ -179,7 +180,7 @@ class KeyframeSender:
                 drive.acknowledge(below, set(above), time.monotonic())
 
     def _repeat(self) -> None:
-        """Send a few of those again that have been missed for long; announce the last one."""
+        """Send a few keyframes again that were not acknowledged for a while; announce the last one."""
         now = time.monotonic()
         with self._lock:
             while len(self._drives) > 1 and self._drives[0].certain(now):
@@ -190,7 +191,7 @@ class KeyframeSender:
                 last = self._read(drive, len(drive.file) - 1)[0] if drive.announces(now) else None
             except (sqlite3.Error, OSError, RuntimeError) as error:
                 self._log.error(f"{drive.file.path}: not sent: {error}", throttle_duration_sec=10)
-                if drive.earlier:  # what cannot be read may not keep the others back
+                if drive.earlier:  # an unreadable file must not block the other drives
                     drive.file.close(keep=True)
                     self._drives.remove(drive)
                 return
@@ -201,13 +202,13 @@ class KeyframeSender:
 
     @staticmethod
     def _read(drive: Delivery, id: int) -> list[bytes]:
-        """The messages of a keyframe; those of an earlier drive say so."""
+        """The messages of a keyframe; those of an earlier drive are marked as such."""
         parts = drive.file.read(id)
         return of_earlier_drive(parts) if drive.earlier else parts
 
 
 def weights_identity(settings: SlamSettings) -> str:
-    """The identity of what made descriptors, the digits of `network.pretrained.weights_id`; "" without descriptors.
+    """Identity of the weights that make descriptors: digits of `network.pretrained.weights_id`; "" without descriptors.
 
     Raises:
         UsageError: there are no such weights.

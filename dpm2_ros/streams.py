@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes of one drive put together from their messages, in their order; whatever comes, memory is bounded."""
+"""Assembles the keyframes of one drive from their messages, in order. Memory is bounded, whatever is received."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import Any
 from dpm2_core.estimates import Keyframe
 
 AHEAD = 64
-"""Keyframes that may wait for one before them; those beyond are sent again."""
-_MOST_WAITING = 1000  # of which a robot is told at once
-_HALVES = 64  # keyframes of which some messages are missing; also sent again
+"""Keyframes that may wait for an earlier one; those beyond are sent again."""
+_MOST_WAITING = 1000  # ids in one acknowledgment
+_HALVES = 64  # incomplete keyframes that may wait; those beyond are also sent again
 _STUCK = 6.0  # s in which a robot sends a keyframe four times
 _TIMES = 3
 Parts = dict[str, Any]
-"""What has come of a keyframe, each part checked: `pose`, `cloud` (a `Payload`), `seen` (its descriptors, or None)."""
+"""The received parts of a keyframe, each checked: `pose`, `cloud` (a `Payload`), `seen` (its descriptors, or None)."""
 _WHOLE = 3
 
 
 class Stream:
-    """One drive, known by its session; without a session nothing is sent again, and order is arrival.
+    """One drive, identified by its session. Without a session nothing is sent again, and the order is that of arrival.
 
     Attributes:
-        next: all ids below have gone on to the mapper, or were given up; without a session, so many have.
-        heard: when the last message came, s. since: when the first one came, since another drive took its place.
-        robot: what the map calls it; None while that is not decided.
-        last: its keyframe that went on last, without the cloud.
-        odom_frame: that its keyframes name.
-        taken: keyframes that went on.
+        next: all ids below it were passed to the mapper, or given up; without a session, the number that was.
+        heard: when the last message arrived, s. since: when the first one arrived; anew after another drive replaced it.
+        robot: its name in the map; None while that is not decided.
+        last: the keyframe that was passed on last, without the cloud.
+        odom_frame: the odometry frame that its keyframes name.
+        taken: number of keyframes that were passed on.
         live: whether the robot's odometry is that of this drive.
     """
 
@@ -42,15 +42,15 @@ class Stream:
         self.last: Keyframe | None = None
         self.odom_frame = ""
         self._parts: OrderedDict[int, Parts] = OrderedDict()
-        self._above: dict[int, tuple[int, Parts]] = {}  # whole keyframes with their ids, by id, or in turn from `next`
-        self._given: deque[tuple[int, int]] = deque()  # ids that have gone on, and the mapper's numbers for them
-        self._bad: tuple[float, int] | None = None  # since when, and how often, messages of the next one were rejected
+        self._above: dict[int, tuple[int, Parts]] = {}  # complete keyframes and ids, by id or counted from `next`
+        self._given: deque[tuple[int, int]] = deque()  # ids that were passed on, and the mapper's numbers for them
+        self._bad: tuple[float, int] | None = None  # since when, and how often, messages of `next` were rejected
 
     def arrived(self, written: int, missing: Container[int] = ()) -> tuple[int, list[int]]:
-        """Ids that have come: all below a number, which are in the map file, and some above, which wait in memory.
+        """Ids that have arrived: all below a number, which are in the map file, and some above, which wait in memory.
 
         Args:
-            written: of the mapper's numbers, how many are in its file. missing: those of them that are not.
+            written: all of the mapper's numbers below this are in its file, except those in `missing`.
         """
         while self._given and (number := self._given[0][1]) < written and number not in missing:
             self._given.popleft()
@@ -59,22 +59,22 @@ class Stream:
 
     @property
     def holds(self) -> int:
-        """Bytes."""
+        """Size of the messages that wait, bytes."""
         return sum(map(_size, [*self._parts.values(), *(parts for _, parts in self._above.values())]))
 
     @property
     def ready(self) -> bool:
-        """Whether the next keyframe is there."""
+        """Whether the next keyframe is complete."""
         return self.next in self._above
 
     def wants(self, id: int, part: str) -> bool:
-        """Whether a message would add anything: pose, cloud, or seen."""
+        """Whether a part (pose, cloud or seen) of a keyframe is still missing."""
         if self.session and (not self.next <= id < self.next + AHEAD or id in self._above):
             return False
         return part not in self._parts.get(id, ())
 
     def put(self, id: int, part: str, value: Any) -> bool:
-        """A part that is sound; whether its keyframe is complete now."""
+        """Add a valid part; returns whether its keyframe is complete now."""
         parts = self._parts.setdefault(id, {})
         parts[part] = value
         if len(parts) < _WHOLE:
@@ -88,25 +88,25 @@ class Stream:
         return True
 
     def take(self) -> tuple[int, Parts] | None:
-        """The next keyframe, if it is there."""
+        """Remove and return the next keyframe, if it is complete."""
         if not self.ready:
             return None
         self.next, self._bad = self.next + 1, None
         return self._above.pop(self.next - 1)
 
     def given(self, id: int, number: int) -> None:
-        """The mapper has been handed a keyframe, and calls it by that number."""
+        """Note that a keyframe was passed to the mapper, which gave it that number."""
         if self.session:
             self._given.append((id, number))
 
     def reject(self, id: int, now: float) -> None:
-        """A message of a keyframe was not sound."""
+        """Note that a message of a keyframe was invalid."""
         if self.session and id == self.next:
             since, times = self._bad or (now, 0)
             self._bad = since, times + 1
 
     def give_up(self, now: float) -> int | None:
-        """The id of the next keyframe if it came again and again and was never sound: those after it go on."""
+        """Skip the next keyframe and return its id, if it was received repeatedly and never valid; else None."""
         if self._bad is None or not self._above or now - self._bad[0] < _STUCK or self._bad[1] < _TIMES:
             return None
         self._bad, self.next = None, self.next + 1
@@ -114,22 +114,22 @@ class Stream:
         return self.next - 1
 
     def drop(self) -> None:
-        """Forget what waits: it is sent again."""
+        """Discard the messages that wait: they are sent again."""
         self._parts.clear()
         self._above.clear()
 
     def replaced(self) -> None:
-        """Another drive has taken its place; should it be heard again, its place is decided anew."""
+        """Another drive has replaced it. If it sends messages again, its robot is decided anew."""
         self.robot, self.last, self.since = None, None, float("inf")
         self.drop()
 
     def hear(self, now: float, live: bool = True) -> None:
-        """A message came; `live`: the robot still drives it."""
+        """Note that a message arrived; `live`: whether the drive is not over."""
         self.heard, self.since, self.live = now, min(self.since, now), live
 
 
 def _size(parts: Parts) -> int:
-    """Bytes, roughly."""
+    """Approximate size, bytes."""
     payload, descriptors = parts.get("cloud"), parts.get("seen")
     size = 2000 if payload is None else 2000 + len(payload.cloud) + len(payload.thumbnail or b"")
     return size if descriptors is None else size + int(descriptors.nbytes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's keyframes on its disk until the mapper has them: also those of a process that was killed."""
+"""Stores a robot's keyframes on its disk until the mapper has them, also those of a process that was killed."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ _LARGEST = 200_000  # bytes of a message: twice what a keyframe may have
 
 
 class KeyframeFile:
-    """The messages of a drive's keyframes, those of number 0 first, each added whole or not at all.
+    """The messages of a drive's keyframes, in order from number 0; each keyframe is added whole or not at all.
 
-    Where the file is full or not wanted, keyframes go into a `SpillFile`, and end with the process unless there is room
-    for them later.
+    If the disk is full or no file is wanted, keyframes are put into a `SpillFile`. They are lost with the process,
+    unless there is space for them later.
 
     Attributes:
-        stored: keyframes in the file. problem: why the last one could not be added to it; empty if it was.
+        stored: number of keyframes in the file. problem: why the last one could not be added to it; empty if it was.
 
     Raises:
-        sqlite3.Error, OSError: the file cannot be made, is no such file, is damaged, or another process has it; also
-            when it is opened again, after `pause`.
+        sqlite3.Error, OSError: the file cannot be created, is not such a file, is damaged, or another process uses it;
+            also when it is opened again, after `pause`.
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        """`path`: made where there is none; None: nothing of it is to outlive the process."""
+        """`path`: created if it does not exist; None: nothing is to outlive the process."""
         self.path = path
         self.stored, self.problem = 0, ""
-        self._others: list[list[int]] = []  # after those: their numbers in the other one
+        self._others: list[list[int]] = []  # keyframes after those: their numbers in `_spill`
         self._spill = SpillFile()
         self._connection: Connection | None = None
         if path is not None:
@@ -46,7 +46,7 @@ class KeyframeFile:
             self._connection, self.stored = _opened(path, "rwc")
 
     def _connected(self) -> Connection:
-        """The file, opened again if need be."""
+        """The connection to the file, which is opened again if necessary."""
         if self._connection is None:
             assert self.path is not None
             connection, stored = _opened(self.path, "rw")
@@ -60,16 +60,16 @@ class KeyframeFile:
         return self.stored + len(self._others)
 
     def append(self, parts: Sequence[bytes]) -> None:
-        """The next keyframe: its pose, its descriptors, its cloud, each serialized."""
+        """Add the next keyframe: its pose, its descriptors, its cloud, each serialized."""
         if not self.catch_up(parts):
             self._others.append([self._spill.append(part) for part in parts])
 
     def catch_up(self, parts: Sequence[bytes] | None = None) -> bool:
-        """Write what waits in memory, and then that keyframe; whether all are in the file. See `problem`."""
+        """Write the keyframes of the `SpillFile`, and then `parts`; returns whether all are in the file. See `problem`."""
         if self.path is None:
             return False
         try:
-            while self._others:  # in turn: a file has no gap
+            while self._others:  # in order: a file has no gap
                 self._insert([self._spill.read(number) for number in self._others[0]])
                 del self._others[0]
                 if not self._others:
@@ -101,31 +101,31 @@ class KeyframeFile:
         return found
 
     def pause(self) -> None:
-        """Leave the file closed, for any process, until a keyframe is read or added."""
+        """Close the file, so that any process can use it, until a keyframe is read or added."""
         if self._connection is not None:
             with suppress(sqlite3.Error):
                 self._connection.close()
             self._connection = None
 
     def close(self, keep: bool) -> None:
-        """`keep`: leave the file for the next start; else it is deleted."""
+        """Close the file; `keep`: leave it for the next start, else it is deleted."""
         self.pause()
         if self.path is not None and not keep:
-            with suppress(OSError):  # the file system can only be read by now, or the folder is not empty
+            with suppress(OSError):  # the file system is read-only by now, or the folder is not empty
                 for path in (self.path, Path(f"{self.path}-wal")):
                     path.unlink(missing_ok=True)
                 self.path.parent.rmdir()
 
 
 def _opened(path: Path, mode: str) -> tuple[Connection, int]:
-    """A file, and how many keyframes there are in it; `mode`: see `connect`.
+    """The opened file, and the number of keyframes in it; `mode`: see `connect`.
 
     Raises:
         sqlite3.Error, OSError: see `KeyframeFile`.
     """
     connection = connect(path, mode, timeout=0.0)
     try:
-        # One process alone: a second one of the same name in the same folder takes a file of its own.
+        # For one process only: a second one with the same robot name and folder uses a file of its own.
         connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
