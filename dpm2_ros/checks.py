@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of sensor messages before they may wait for the worker: whatever else is on their topics stays out."""
+"""Checks of sensor messages before they are queued for the worker: all others on their topics are rejected."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from dpm2_ros.tf_message import MOST_TRANSFORMS
 
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 2000
-_SAME = 1e-3  # m, and of a rotation's matrix: what two who write one place in their own words differ by
+_SAME = 1e-3  # m, and of a rotation's matrix: two publishers of the same pose may differ by this
 
 
 def check_header(header: Any) -> None:
-    """Raises RejectedError unless stamp and frame can be what they say."""
+    """Raises RejectedError unless stamp and frame are valid."""
     if header.stamp.sec < 0 or header.stamp.nanosec >= 10**9:
         raise RejectedError("stamp", f"a stamp of {header.stamp.sec} s and {header.stamp.nanosec} ns")
     if header.frame_id:
@@ -32,17 +32,17 @@ def check_header(header: Any) -> None:
 
 
 def check_size(message: Any, points: int = 0) -> None:
-    """Raises RejectedError for what is larger than any sensor's."""
+    """Raises RejectedError for a message that is larger than that of any sensor."""
     if len(message.data) > _MOST_BYTES or points > MAX_POINTS:
         raise RejectedError("size", f"{len(message.data)} bytes, {points} points")
 
 
 def checked_cloud(message: Any) -> tuple[Any, str]:
-    """A PointCloud2, made of a Livox' CustomMsg where it is one, serialized; and why its points cannot be read, empty
+    """A PointCloud2, converted if the message is a serialized Livox CustomMsg; and why its points cannot be read, empty
     if they can.
 
     Raises:
-        RejectedError, MessageError: it is no cloud of any sensor.
+        RejectedError, MessageError: it cannot be the cloud of a sensor.
     """
     if isinstance(message, bytes):
         message = cloud_of_custom(message)
@@ -59,7 +59,7 @@ def checked_pose(pose: Any) -> Array:
     """A geometry_msgs Pose or Transform as (4, 4).
 
     Raises:
-        UsageError: it is no rigid transform. RejectedError: it leads farther than a map can be.
+        UsageError: it is not a rigid transform. RejectedError: it is longer than any map.
     """
     T = transform_matrix(pose)
     check_pose(T)
@@ -73,7 +73,7 @@ def check_transforms(message: Any) -> None:
 
 
 def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
-    """A tree with the transforms of a TFMessage that are sound, and what is wrong with the last of the others.
+    """A tree with the valid transforms of a TFMessage added, and what is wrong with the last invalid one.
 
     Raises:
         RejectedError: there are too many.
@@ -96,7 +96,7 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
 
 
 def replaced(before: TransformTree, after: TransformTree) -> str:
-    """Which frames of a tree another one has elsewhere, in words; empty where there are none."""
+    """Which frames of a tree have another parent or pose in a second tree, in words; empty if none has."""
     said = []
     for frame in before.frames:
         old, new = before.parent(frame), after.parent(frame)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node reports on /diagnostics: the state of its map, and the messages that it could not use."""
+"""What all nodes report on /diagnostics: the state of the map, and the rejected messages."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticS
 PERIOD = 1.0
 """s between two messages."""
 _RECENT = 10.0  # s
-_LONGEST = 1000  # characters of a text, some of which quote messages
+_LONGEST = 1000  # characters of a text, which may quote a message
 
 
 def publish_diagnostics(node: GuardedNode, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
-    """Ask for the statuses every `PERIOD` from now on, and send them."""
+    """Publish the statuses every `PERIOD` from now on."""
     publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def publish() -> None:
@@ -30,14 +30,14 @@ def publish_diagnostics(node: GuardedNode, statuses: Callable[[], list[Diagnosti
 
 
 def status(node: GuardedNode, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
-    """Of a part of a node."""
+    """The status of a part of a node."""
     values = [KeyValue(key=key, value=excerpt(str(value), _LONGEST)) for key, value in figures.items()]
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
     return DiagnosticStatus(level=level, name=name, message=excerpt(text, _LONGEST), hardware_id="", values=values)
 
 
 def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
-    """A map that grows: how large it is, and what is wrong with its file or its poses."""
+    """The status of a growing map: its size, and the problems of its file and its poses."""
     core = mapper.active.mapper
     loops = [loop.ok for loop in core.loops]
     figures = {"keyframes": mapper.keyframes, "loops accepted": sum(loops), "loops tried": len(loops)}
@@ -59,7 +59,7 @@ def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
 
 
 def message_status(node: GuardedNode) -> DiagnosticStatus:
-    """What came in and could not be used, by topic and reason."""
+    """The status of the received messages: how many were rejected, by topic and reason."""
     rejections = node.rejections
     total = sum(rejections.values())
     level, text = OK, f"{total} messages rejected"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that no message ends: what it cannot use is rejected, counted by its reason, and logged now and then."""
+"""A node that no message can crash: an unusable one is rejected, counted by its reason, and logged now and then."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from dpm2_core.errors import Dpm2Error, printable
 from dpm2_core.slam.mapping.admission import RejectedError
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_QUIET = 5.0  # s between two lines about the same reason
-_MOST_KINDS = 200  # of topic and reason; more are counted together
-_LENGTH = 300  # characters of a line, whatever is in the message
+_QUIET = 5.0  # s between two log lines about the same reason
+_MOST_KINDS = 200  # pairs of topic and reason; further ones are counted together
+_LENGTH = 300  # characters of a log line, whatever is in the message
 
 
 class GuardedNode(Node):
-    """Every callback of a subscription or a timer is guarded; a service reports in its response what is wrong.
+    """A node in which every callback of a subscription or a timer is guarded; services report errors in the response.
 
     Attributes:
-        errors: unexpected exceptions: bugs, but the node goes on.
-        answering: requests of services that are still being worked on in another thread.
+        errors: number of unexpected exceptions: bugs, but the node continues.
+        answering: number of service requests that are being processed in another thread.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -40,16 +40,16 @@ class GuardedNode(Node):
         self._said: dict[str, float] = {}
         self._last_rejection = -float("inf")
         self._guard_lock = threading.Lock()
-        super().__init__(name, **options)  # subscribes to /clock, perhaps
+        super().__init__(name, **options)  # may subscribe to /clock
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kw: Any
     ) -> Any:
-        """As of `Node`; an exception in the callback rejects the message."""
+        """As in `Node`; an exception in the callback rejects the message."""
         return super().create_subscription(msg_type, topic, self._guarded(callback, topic), *args, **kw)
 
     def create_timer(self, period: float, callback: Callable[[], None]) -> Any:
-        """It goes on when /clock stops, as at the end of a bag; an exception in the callback is counted."""
+        """As in `Node`, but it continues when /clock stops, as at the end of a bag; exceptions are counted."""
         return super().create_timer(period, self._guarded(callback, "timer"), clock=_STEADY)
 
     @property
@@ -64,12 +64,12 @@ class GuardedNode(Node):
         return time.monotonic() - self._last_rejection
 
     def reject(self, where: str, reason: str, text: str) -> None:
-        """Count something that cannot be used, and say why; any thread may call.
+        """Count an unusable message, and log why it is unusable; any thread may call.
 
         Args:
-            where: the topic it came from.
-            reason: one of a few words, never a text from the message.
-            text: one line; what it quotes of the message may be anything.
+            where: its topic.
+            reason: one of a few fixed texts, never one from the message.
+            text: one line; it may quote anything from the message.
         """
         kind = f"{where}: {reason}"
         with self._guard_lock:
@@ -82,7 +82,7 @@ class GuardedNode(Node):
             self.get_logger().warning(f"{where}: rejected: {excerpt(text)}")
 
     def fail(self, where: str, error: BaseException) -> None:
-        """Count an exception that is a bug; any thread may call."""
+        """Count and log an exception that is a bug; any thread may call."""
         with self._guard_lock:
             self.errors += 1
             said = len(self._said) <= 2 * _MOST_KINDS and self._may_say(f"{where} {type(error).__name__}")
@@ -91,7 +91,7 @@ class GuardedNode(Node):
             self.get_logger().error(f"{where}: {lines[-3000:]}")
 
     def _may_say(self, kind: str) -> bool:
-        """Whether the log has had no line of that kind of late; if so, it has one now. With the lock."""
+        """Whether a log line of that kind is due; if so, it is noted as written. Call it with the lock."""
         now = time.monotonic()
         if now - self._said.get(kind, -float("inf")) < _QUIET:
             return False
@@ -99,7 +99,7 @@ class GuardedNode(Node):
         return True
 
     def _guarded(self, callback: Callable[..., Any], where: str) -> Callable[..., Any]:
-        @functools.wraps(callback)  # rclpy asks for its signature
+        @functools.wraps(callback)  # rclpy inspects its signature
         def call(*args: Any) -> None:
             try:
                 callback(*args)
@@ -114,14 +114,14 @@ class GuardedNode(Node):
 
 
 def slow_service(node: Node, kind: type, name: str, callback: Callable[..., Any]) -> None:
-    """A service whose callback awaits: in a group of its own, for the others of a group wait until it ends."""
+    """Create a service whose callback awaits. It has its own group: other callbacks of a group wait until it ends."""
     node.create_service(kind, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
 
 
 def take_waiting(subscription: Any) -> None:
-    """Call back, in this thread, with all that has arrived for it; an executor would take one of each topic in turn."""
+    """Call the callback, in this thread, with all messages that have arrived; an executor takes one of each topic."""
     handle = subscription.handle
-    with handle:  # not to be destroyed meanwhile
+    with handle:  # so that it is not destroyed in the meantime
         for _ in range(subscription.qos_profile.depth):
             if (taken := handle.take_message(subscription.msg_type, subscription.raw)) is None:
                 return
@@ -137,23 +137,23 @@ async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
         response.success, response.message = True, work.result()
     except Dpm2Error as error:
         response.success, response.message = False, str(error)
-    except Exception as error:  # a bug; who asked is to have an answer nevertheless
+    except Exception as error:  # a bug; the client must get a response nevertheless
         response.success, response.message = False, f"{type(error).__name__}: {error}"
         node.fail("service", error)
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """In a callback: let the executor go on with others until the condition holds."""
+    """In a callback: let the executor run other callbacks until the condition is true."""
     while not condition():
         await _other_callbacks()
 
 
 @types.coroutine
 def _other_callbacks() -> Generator[None, None, None]:
-    """Awaited in a callback: the executor goes on with others, and comes back."""
+    """Awaited in a callback: the executor runs other callbacks, then resumes this one."""
     yield
 
 
 def excerpt(text: str, length: int = _LENGTH) -> str:
-    """A text of unknown origin for a terminal: what does not print is escaped, what is too long is cut."""
+    """A text of unknown origin, safe for a terminal: unprintable characters are escaped, a long text is cut."""
     return printable(text if len(text) <= length else f"{text[:length]}...")

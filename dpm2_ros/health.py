@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the odometry of a node is doing, counted as it works."""
+"""Figures on the odometry of a node, counted while it runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.estimates import OdometryResult
 
 
 class Health:
-    """Figures of the odometry: of the whole run, and of the last 200 frames where they are rates or times."""
+    """Figures of the odometry: counts of the whole run, times of the last 200 frames, rate of the last 5 s."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -23,11 +23,11 @@ class Health:
         self.processed = self.failed = 0
         self.last: OdometryResult | None = None
         self.scale = ""
-        """What settings the odometry has chosen by its scans, if it chooses."""
+        """The preset that `slam.preset` auto has chosen by the scans; else empty."""
         self._last_good: float | None = None
 
     def add(self, tracked: OdometryResult, latency: float) -> None:
-        """One frame is out, `latency` s after its cloud came in."""
+        """Add a frame whose result was published `latency` s after its cloud arrived."""
         now = time.monotonic()
         with self._lock:
             self.processed += 1
@@ -41,7 +41,7 @@ class Health:
                 self._last_good = now
 
     def figures(self) -> dict[str, object]:
-        """Name, with its unit, to value."""
+        """Name (with its unit) to value."""
         now = time.monotonic()
         with self._lock:
             out: dict[str, object] = {
@@ -58,7 +58,7 @@ class Health:
             if self._last_good is not None:
                 out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
             latency, seconds = list(self._latency), {stage: list(s) for stage, s in self._seconds.items()}
-        if latency:  # from here on without the lock, for which the worker would wait
+        if latency:  # from here on without the lock, for which the worker would have to wait
             p50, p95 = np.percentile(latency, [50, 95]) * 1000
             out |= {"latency p50 (ms)": f"{p50:.1f}", "latency p95 (ms)": f"{p95:.1f}"}
         return out | {f"{stage} p50 (ms)": f"{1000 * np.median(s):.1f}" for stage, s in seconds.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many messages of a topic were sent and never arrived. Pure logic: no ROS, no clock, no thread."""
+"""Counts messages of a topic that were sent and never arrived. Pure logic: no ROS, no clock, no thread."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections import deque
 from statistics import median
 
 _LEAST = 5
-"""Steps of the stamps after which their period is known."""
+"""Number of steps of the stamps after which their period is known."""
 _PAUSE = 20
-"""Periods from which on nothing is known to be lost: the sensor, or whoever recorded it, has paused."""
+"""Periods from which on a gap counts as a pause of the sensor or of the recorder, not as a loss."""
 _OFF = 0.25
-"""Periods by which a gap may differ from a whole number of them."""
+"""Periods by which a gap may differ from a whole number of periods."""
 
 
 class Losses:
-    """Counts the gaps: of the publisher's own numbers, or, where the middleware has none, of the stamps' rhythm.
+    """Counts the gaps in the publisher's sequence numbers, or, if the middleware has none, in the period of the stamps.
 
-    The numbers are exact, whatever the recording's pauses. Nothing is lost before the first message that arrives; of a
-    publisher that takes the place of another all that it has sent was to arrive.
+    The numbers are exact, also if the recording has pauses. Messages before the first one that arrives do not count as
+    lost. If another publisher takes over, all messages that it has sent count.
 
     Attributes:
         count: messages lost so far.
@@ -31,11 +31,11 @@ class Losses:
         self._steps: deque[int] = deque(maxlen=50)  # ns
 
     def add(self, stamp: int, number: int | None) -> int:
-        """Take note of a message that arrived; returns how many were lost between the one before and this one.
+        """Add a message that arrived; returns how many were lost between the previous one and this one.
 
         Args:
             stamp: ns.
-            number: that its publisher gave it, by one more each time; None if it gave none, or if there are several.
+            number: its publisher's sequence number; None if there is none, or if there are several publishers.
         """
         before, self._number = self._number, number
         lost = self._step(stamp)
@@ -45,13 +45,13 @@ class Losses:
         return lost
 
     def skip(self, number: int | None) -> None:
-        """A message with that number arrived, and is not used; so it is not lost."""
+        """Note that a message with that number arrived but is not used: it is not lost."""
         if number is not None:
             self.count += _between(self._number, number)
             self._number = number
 
     def _step(self, stamp: int) -> int:
-        """By the stamps alone."""
+        """Number of lost messages, by the stamps only."""
         before, self._stamp = self._stamp, stamp
         step = 0 if before is None else stamp - before
         if step <= 0:  # the first, a repeated one, or a looped bag
@@ -63,7 +63,7 @@ class Losses:
 
 
 def _between(before: int | None, number: int) -> int:
-    """How many messages are missing between two; another publisher begins at 1 again."""
+    """Number of messages missing between two sequence numbers; another publisher begins at 1 again."""
     if before is None:
         return 0
     return number - 1 - (before if number > before else 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The odometry that a robot has already: `odom -> base` on /tf, or nav_msgs/Odometry on a topic, at a cloud's stamp."""
+"""The odometry that a robot already has, at a cloud's stamp: `odom -> base` on /tf, or nav_msgs/Odometry on a topic."""
 
 from __future__ import annotations
 
@@ -31,38 +31,38 @@ from dpm2_ros.tf_message import TFMessage
 from dpm2_ros.transform_history import TransformHistory
 
 WAIT = 0.1
-"""s that a cloud waits for the odometry that comes after it."""
-_MEMORY = 0.02  # fraction of the newest step in how much longer its ways are than those of the scans
-_SLIPS = 0.05  # so much is said, of what is assumed no more; a wheel's radius is often wrong by 2 %, which does no harm
-_DOUBTFUL = 1.5  # times as far off as assumed
+"""s that a cloud waits for an odometry message that arrives after it."""
+_MEMORY = 0.02  # weight of the newest step in the mean distances, of which `slip` is the ratio
+_SLIPS = 0.05  # a larger slip is reported; a wheel's radius is often wrong by 2 %, which does no harm
+_DOUBTFUL = 1.5  # times the assumed error
 _RECENT = 10.0  # s
 
 
 class OtherOdometry:
-    """What `ros.odom_source` names; its callbacks are the executor's, all else the worker's.
+    """The odometry that `ros.odom_source` names. The executor calls its callbacks, the worker all other methods.
 
     Attributes:
-        problem: why it was not there at the last cloud, in words; empty if it was.
-        missed: clouds for which it was not there. found: those for which it was. outweighed: those of the latter whose
-            scans contradicted it.
+        problem: why it had no pose at the last cloud, in words; empty if it had one.
+        missed: clouds for which it had no pose. found: clouds for which it had one. outweighed: those of the latter
+            whose scans contradicted it.
     """
 
     def __init__(self, node: GuardedNode, ros: RosSettings, static: Callable[[], TransformTree]) -> None:
-        """`static`: the frames that do not move, by now.
+        """`static`: returns the current tree of static transforms.
 
         Raises:
-            UsageError: what it needs is missing.
+            UsageError: tf2_msgs is missing, and needed.
         """
         self._static, self._frame = static, ros.odom_frame
         self._history, self._changed = TransformHistory(), threading.Condition()
-        self._child = ""  # whose pose the topic has
+        self._child = ""  # the frame whose pose the topic has
         self.source = node.resolve_topic_name(TF if ros.odom_source == "tf" else ros.odom_topic)
         self.problem, self.missed, self.found, self.outweighed = f"nothing of use on {self.source} yet", 0, 0, 0
-        self._in_a_row = 0  # clouds without it
-        self._unmet: tuple[int, str, float] | None = None  # the last such: stamp, base, and until when it was to wait
+        self._in_a_row = 0  # consecutive clouds without it
+        self._unmet: tuple[int, str, float] | None = None  # the last of these: stamp, base, end of the longest wait
         self._comparison: Comparison | None = None
         self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
-        self._ways = np.zeros(2)  # m, of late: its own, and those of the scans
+        self._ways = np.zeros(2)  # m per cloud, recent means of the distance: its own, and that of the scans
         self._subscription: MatchedSubscription | None = None
         if ros.odom_source == "topic":
             self._subscription = MatchedSubscription(node, Odometry, ros.odom_topic, self._on_odometry, ros)
@@ -73,7 +73,7 @@ class OtherOdometry:
             node.create_subscription(TFMessage, TF, self._on_tf, QoSProfile(depth=100))
 
     def guess(self, stamp: int, base: str, T_base_lidar: Array) -> Guess | None:
-        """Where it has the LiDAR at a stamp (ns), as soon as it says so; None where it does not."""
+        """Its pose of the LiDAR at a stamp (ns), as soon as it is received; None if it is not received in time."""
         began = time.monotonic()
         with self._changed:
             end = began + (WAIT if self._in_a_row < PATIENCE else 0.0)
@@ -91,18 +91,18 @@ class OtherOdometry:
         return Guess(T_odom_base @ T_base_lidar, covariance)
 
     def T_odom_base(self, stamp: int, base: str) -> Array | None:
-        """(4, 4) at a stamp (ns), if it is known already."""
+        """(4, 4) at a stamp (ns); None if it is not known yet."""
         with self._changed, suppress(UsageError):
             found = self._find(stamp, base)
             return None if found is None else found[0]
         return None
 
     def judge(self, comparison: Comparison | None) -> str:
-        """What the scan of the last cloud said to it; returns why it was outweighed, or an empty text."""
+        """Compare it with the scan of the last cloud; returns why it was outweighed, or an empty text."""
         self._comparison = comparison
         if comparison is None or comparison.unsure:
             return ""
-        if comparison.used:  # a jump is no slip
+        if comparison.used:  # else it jumped, which is no slip
             ways = [np.linalg.norm(T[:3, 3]) for T in (comparison.T_other, comparison.T_scans)]
             self._ways = (1 - _MEMORY) * self._ways + _MEMORY * np.array(ways)
             return ""
@@ -114,13 +114,13 @@ class OtherOdometry:
 
     @property
     def slip(self) -> float:
-        """By what fraction its ways are longer than those of the scans, of late; NaN while the robot stands."""
+        """By which fraction its recent distances are longer than those of the scans; NaN while the robot stands."""
         other, scans = self._ways
         return float(other / scans - 1) if scans > 1e-3 else float("nan")
 
     @property
     def verdict(self) -> str:
-        """How far it is to be believed, in words; empty where there is nothing to say against it."""
+        """What contradicts it, or why it has no pose, in words; empty if nothing does."""
         if self.problem:
             return (self._subscription.problem if self._subscription is not None else "") or self.problem
         said = []
@@ -135,7 +135,7 @@ class OtherOdometry:
         return "; ".join(said)
 
     def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
-        """As `_find`, and `problem` says why not."""
+        """As `_find`; sets `problem`."""
         try:
             found = self._find(stamp, base)
         except UsageError as error:
@@ -147,7 +147,7 @@ class OtherOdometry:
 
     def _find(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
         static, source = self._static(), base if self._subscription is None else self._child
-        if not source:  # no message was of use: `problem` is as at the start
+        if not source:  # no usable message yet: `problem` is as at the start
             return None
         T, covariance = self._history.lookup(self._frame, source, stamp, static)
         if source != base:
@@ -157,7 +157,8 @@ class OtherOdometry:
         return T, covariance
 
     def _tell(self) -> None:
-        """Something has come: whoever waits looks again, and the next cloud waits if this one would have had it so."""
+        """A message has arrived: a waiting `guess` looks again. If the last cloud without a pose would have had one by
+        waiting, the next cloud waits again."""
         if self._unmet is not None and self._in_a_row >= PATIENCE:
             stamp, base, end = self._unmet
             with suppress(UsageError):
@@ -196,7 +197,7 @@ class OtherOdometry:
 
 
 def _turned(covariance: Array, T_body_other: Array) -> Array:
-    """A covariance (6, 6) along the axes of another frame of the same body. Not moved there: what drivers state of
-    directions that they do not measure, such as 1e6, would with a lever arm be everywhere."""
+    """A covariance (6, 6) along the axes of another frame of the same body. It is rotated only: with a lever arm, large
+    values of directions that a driver does not measure, such as 1e6, would spread to all directions."""
     turn = np.kron(np.eye(2), T_body_other[:3, :3].T)
     return np.asarray(turn @ covariance @ turn.T)

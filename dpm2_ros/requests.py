@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of slam_node by services and from RViz: a new start, another map, a pose to begin with."""
+"""The requests to slam_node by services and from RViz: reset, another map, initial pose."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Requests:
     """The services of slam_node, and `initialpose`.
 
     Attributes:
-        reset: set once a new start is asked for, and the map saved.
+        reset: set once a reset is requested and the map is saved.
     """
 
     def __init__(self, node: GuardedNode, mapper: MapperThread | None, base: BaseFrame, map_frame: str) -> None:
-        """`mapper`: None where it is another node's."""
+        """`mapper`: None with a separate mapper_node."""
         self._node, self._mapper, self._base, self._map_frame = node, mapper, base, map_frame
         self.reset = threading.Event()
         slow_service(node, Trigger, "~/reset", self._on_reset)
@@ -53,7 +53,7 @@ class Requests:
         return await self._ask(MapperThread.localise if request.data else MapperThread.extend, response)
 
     async def _ask(self, work: Callable[[MapperThread], Future[str]], response: Any) -> Any:
-        """The response, filled with what the mapper's thread makes of it."""
+        """The response, filled with the result of `work` in the mapper's thread."""
         if self._mapper is None:
             response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"
             return response

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How slam_node is doing, on /diagnostics once a second."""
+"""The state of slam_node, on /diagnostics once per second."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dpm2_ros.synchronizer import StampCheck
 from dpm2_ros.tf import TransformBroadcaster
 
 OTHER_CLOCK = 1.0
-"""Seconds between a cloud's stamp and the node's clock beyond which they are not of the same clock."""
+"""A larger difference between a cloud's stamp and the node's clock, s, is reported as two different clocks."""
 
 _LEVEL = {
     State.TRACKING: OK,
@@ -38,7 +38,7 @@ _LEVEL = {
 
 
 class Diagnostics:
-    """Publishes the state of odometry, camera and mapper."""
+    """Publishes the state of the odometry, the sensors and the mapper."""
 
     def __init__(
         self,
@@ -49,15 +49,15 @@ class Diagnostics:
         keyframes: MapperThread | KeyframeSender,
         base: BaseFrame,
     ) -> None:
-        """`keyframes`: the map, or what sends keyframes to one elsewhere."""
+        """`keyframes`: the embedded mapper, or the sender of keyframes to a separate one."""
         self._node, self._inputs, self._frames, self._health = node, inputs, frames, health
         self._keyframes, self._base = keyframes, base
         self.tf_problem = ""
-        """Why its pose is not on /tf, in words."""
+        """Why the node's pose is not on /tf, in words."""
         self.other: OtherOdometry | None = None
         """Another odometry, if there is one."""
         self.tf: TransformBroadcaster | None = None
-        """What sends the pose on /tf."""
+        """Sends the pose on /tf."""
         self._lost_before = self._dropped_before = 0
         self._status = partial(status, node)
         publish_diagnostics(node, self._statuses)
@@ -90,7 +90,8 @@ class Diagnostics:
         return [*out, message_status(self._node)]
 
     def account(self) -> str:
-        """What became of all clouds that were sent since the first that arrived, in words; for when none is at work."""
+        """How many of all clouds sent since the first that arrived were processed, dropped or lost, in words. Call it
+        while no cloud is being processed."""
         synchronizer, lost = self._inputs.synchronizer, self._inputs.losses.count
         received, waiting, processed = synchronizer.received, len(synchronizer), self._health.processed
         rejected = sum(
@@ -133,7 +134,7 @@ class Diagnostics:
         return figures
 
     def _absence(self) -> tuple[bytes, str] | None:
-        """Why no cloud comes, in words, and how bad that is; None where one has come lately."""
+        """Level and reason, in words, if no cloud arrives; None if one has arrived recently."""
         topic, last = self._inputs.calibration.points_topic, self._inputs.synchronizer.last_arrival
         if not (text := _silence("cloud", topic, last)):
             return None
@@ -144,7 +145,7 @@ class Diagnostics:
         return STALE, text
 
     def _beside_tracking(self, last: OdometryResult) -> list[tuple[bytes, str]]:
-        """What else is to be said of the last result and of the clouds since the last message, and how bad that is."""
+        """Further levels and texts, of the last result and of the clouds since the last message."""
         topic, log = self._inputs.calibration.points_topic, self._node.get_logger()
         dropped, lost = self._inputs.synchronizer.dropped, self._inputs.losses.count
         count, fields, clock = self._node.count_publishers(topic), self._frames.time_problem, self._clock_problem()
@@ -171,7 +172,7 @@ class Diagnostics:
         return [(level, text) for level, text in found if text]
 
     def _clock_problem(self) -> str:
-        """How the clouds' clock is not that of the node, in words; empty where it is."""
+        """How the clouds' clock differs from that of the node, in words; empty if it does not."""
         clock = self._node.get_clock().now().nanoseconds
         stamp, now = self._inputs.times or (clock, clock)  # clouds without a stamp get that of the clock
         if not now:
@@ -213,7 +214,7 @@ class Diagnostics:
         return self._status("other odometry", WARN if verdict else OK, text, figures)
 
     def _imu(self) -> DiagnosticStatus | None:
-        """None where none is, and none was asked for."""
+        """None if there is no IMU and no setting requests one."""
         inputs, last, topic = self._inputs, self._health.last, self._inputs.calibration.imu_topic
         problem = inputs.problem(topic) or self._frames.problems.get(topic, "")
         if not problem and not inputs.imu_received:
@@ -223,7 +224,7 @@ class Diagnostics:
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
-        problem = problem or _silence("sample", topic, inputs.imu_last)  # where no cloud comes either
+        problem = problem or _silence("sample", topic, inputs.imu_last)  # also if no cloud arrives
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
@@ -236,7 +237,7 @@ class Diagnostics:
         return self._status("gnss", WARN if problem else OK, problem or text, {"received": inputs.gnss_received})
 
     def _fix_problem(self) -> str:
-        """Why no fix comes, or none is of use, in words; else empty."""
+        """Why no fix arrives, or why the fixes are unusable, in words; else empty."""
         last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
         stamp, arrival = last or (0, None)
         if problem := self._inputs.problem(topic) or _silence("fix", topic, arrival):
@@ -245,7 +246,7 @@ class Diagnostics:
         return f"stamps of another clock, {ahead:+.0f} s from the clouds'" if abs(ahead) > OTHER_CLOCK + SILENT else ""
 
     def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
-        """Of a sensor beside the LiDAR and its messages, in words, and their topic."""
+        """Status of a sensor other than the LiDAR; `part` is its name, `what` that of its messages."""
         sensor = self._inputs.synchronizer.sensors[topic]
         figures = {"received": sensor.received, "matched": sensor.matched, "late": sensor.late}
         if unheard := self._inputs.problem(topic):
@@ -262,21 +263,21 @@ class Diagnostics:
 
 
 def _tracked(last: OdometryResult) -> tuple[bytes, str]:
-    """The state and its reason, and how bad it is."""
+    """Level of the state, and the state with its reason."""
     level, registration = _LEVEL[last.state], last.registration
     if last.failed:
-        level = max(level, WARN)  # as while it begins, where clouds in millimeters have no point in range
+        level = max(level, WARN)  # also at the start, as for clouds in millimeters, with no point in range
     return level, f"{last.state}: {registration.reason}" if registration.reason else str(last.state)
 
 
 def _date(stamp: int) -> str:
-    """A stamp in ns, for people."""
+    """A stamp in ns as text."""
     date = datetime.fromtimestamp(stamp // 10**9, UTC)
     return f"{stamp * 1e-9:.3f} s ({date:%Y-%m-%d %H:%M:%S} UTC)"
 
 
 def _silence(what: str, topic: str, last_arrival: float | None) -> str:
-    """That no message has come on a topic lately, in words; empty where one has. `what` it has, in one word."""
+    """Text if no message has arrived on a topic recently; else empty. `what`: the kind of its messages, in one word."""
     if last_arrival is None:
         return f"no {what} on {topic} yet"
     silence = time.monotonic() - last_arrival

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state in one word, latched, sent at each change: what a behavior tree or a supervisor waits for."""
+"""The state in one word, latched, sent at each change: for behavior trees and supervisors."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from dpm2_ros.guard import GuardedNode, excerpt
 from dpm2_ros.subscriptions import LAST_ONE
 
 SILENT = 2.0
-"""Seconds without a message after which a sensor counts as silent, and without a pose the whole."""
+"""Seconds without a message after which a sensor counts as silent; without a pose, the node does."""
 NO_POSE = "silent"
 _QUIET = 10.0  # s between two messages of the log
 
 
 class StatePublisher:
-    """`dpm2/state`: a `State`, or silent while no pose follows the last one. Any thread may call."""
+    """Publishes `dpm2/state`: a `State`, or silent once no pose has followed for `SILENT` s. Any thread may call."""
 
     def __init__(self, node: GuardedNode) -> None:
         self._publisher = node.create_publisher(String, "dpm2/state", LAST_ONE)
@@ -30,7 +30,7 @@ class StatePublisher:
         node.create_timer(0.25, self._listen)
 
     def send(self, tracked: OdometryResult) -> None:
-        """That of a pose which is published now; what is lost with it is logged, too."""
+        """Send the state of a pose that is published now; a loss of the odometry is logged, too."""
         self._last = time.monotonic()
         reason = excerpt(tracked.registration.reason)
         if tracked.breaks > self._breaks:

@@ -25,7 +25,7 @@ class Stream:
 
     Attributes:
         next: all ids below it were passed to the mapper, or given up; without a session, the number that was.
-        heard: when the last message arrived, s. since: when the first one arrived; anew after another drive replaced it.
+        heard: when the last message arrived, s. since: when the first one arrived, anew once it was `replaced`.
         robot: its name in the map; None while that is not decided.
         last: the keyframe that was passed on last, without the cloud.
         odom_frame: the odometry frame that its keyframes name.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that move, over the last seconds: where one was in another at a stamp. Pure: no ROS, no clock, no thread.
+"""Moving frames over the last seconds: the pose of one in another at a stamp. Pure logic: no ROS, no clock, no thread.
 
-tf2's buffer is not part of ROS from pip, and knows no covariances.
+The buffer of tf2 is not part of ROS from pip, and has no covariances.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_ros.checks import checked_pose
 
 GAP = 500_000_000
-"""ns: samples farther apart say nothing of the time between."""
+"""ns: no pose is interpolated between samples that are farther apart."""
 _KEPT = 20_000_000_000  # ns
 _MOST_SAMPLES = 4000  # of a frame
 _MOST_FRAMES = 200
-_DEEPEST = 20  # frames above one another
+_DEEPEST = 20  # parents in a chain of frames
 
 
 @dataclass(eq=False)
 class _Track:
-    """A frame in its parent; samples are messages, of which few are ever looked at."""
+    """A frame in its parent. Samples are kept as messages, since few of them are ever converted."""
 
     parent: str
     stamps: list[int] = field(default_factory=list)
@@ -84,7 +84,7 @@ class TransformHistory:
         self._tracks: dict[str, _Track] = {}
 
     def add(self, parent: str, child: str, stamp: int, pose: Any, covariance: Array | None = None) -> None:
-        """Place `child` in `parent` at a stamp (ns).
+        """Add the pose of `child` in `parent` at a stamp (ns).
 
         Args:
             pose: geometry_msgs Pose or Transform.
@@ -104,7 +104,7 @@ class TransformHistory:
         """T_target_source (4, 4) at a stamp (ns), between two samples, and its covariance (6, 6) if one is stated.
 
         Args:
-            static: the frames that do not move.
+            static: the static transforms.
 
         Raises:
             UsageError: why it is not known, in words.

@@ -65,7 +65,7 @@ class KeyframeFile:
             self._others.append([self._spill.append(part) for part in parts])
 
     def catch_up(self, parts: Sequence[bytes] | None = None) -> bool:
-        """Write the keyframes of the `SpillFile`, and then `parts`; returns whether all are in the file. See `problem`."""
+        """Write the keyframes of the `SpillFile`, then `parts`; returns whether all are in the file. See `problem`."""
         if self.path is None:
             return False
         try:
