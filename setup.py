@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One description for `pip install .` and `colcon build`."""
+"""The package description for `pip install .` and `colcon build`."""
 
 import os
 import re
@@ -14,11 +14,11 @@ EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 
 REQUIREMENTS = [
     "numpy>=1.26,<3",  # every array
-    "scipy>=1.11.4,<2",  # rotations, nearest neighbors; parts of a graph, which 1.11.2 gets wrong without an error
-    "torch>=2.6,<2.14",  # the network; its CPU wheels serve, README.md
+    "scipy>=1.11.4,<2",  # rotations, nearest neighbors; connected components, which 1.11.2 gets wrong without an error
+    "torch>=2.6,<2.14",  # the network; its CPU wheels are enough, README.md
     "safetensors>=0.4,<1",  # weights: data that cannot execute code
     "numba>=0.61,<1",  # loops over points as machine code: scan registration, sampling
-    "llvmlite",  # what the processor has; of the version that numba asks for
+    "llvmlite",  # features of the processor; in the version that numba requires
     "gtsam>=4.3,<4.4",  # pose graph; the first with wheels for numpy 2
     "pydantic>=2.7,<3",  # typed configuration
     "annotated-types>=0.6,<1",  # the bounds of its fields, as ROS parameters
@@ -26,11 +26,11 @@ REQUIREMENTS = [
     "typer>=0.19,<1",  # command line
     "rich>=14.3,<16",  # progress bars and tables
     "rosbags>=0.11.6,<0.12",  # bags without ROS; 0.x releases change the interface
-    "backports.zstd>=1,<2",  # messages that are compressed one by one; rosbags has it as well
-    "mcap>=1.2,<2",  # salvages bags whose recording was cut off
-    "opencv-python-headless>=4.9,<6",  # image decoding; headless: no Qt beside RViz
+    "backports.zstd>=1,<2",  # bags with messages that are compressed one by one; rosbags needs it, too
+    "mcap>=1.2,<2",  # recovers bags whose recording was cut off
+    "opencv-python-headless>=4.9,<6",  # image decoding; headless: no second Qt in addition to RViz
 ]
-ROS = [  # wheels for x86_64 alone; elsewhere ROS 2 itself must be installed
+ROS = [  # wheels for x86_64 only; elsewhere ROS 2 itself must be installed
     "ros-jazzy-rclpy>=7.1,<8; platform_machine == 'x86_64'",  # ROS 2 Jazzy itself
     "ros-rclpy[fastrtps]>=7.1.6,<8; platform_machine == 'x86_64'",  # its DDS
     "ros-jazzy-common-interfaces>=5.3,<6; platform_machine == 'x86_64'",  # sensor_msgs, nav_msgs, ...
@@ -65,12 +65,12 @@ EXTRAS = {
     "las": ["laspy>=2.5,<3"],  # dpm2 map export MAP OUT.las
     "fleet": [  # dpm2 fleet
         "ray>=2.40,<3",  # many processes, here or on a cluster
-        "faiss-cpu>=1.9,<2",  # places that look alike among many
+        "faiss-cpu>=1.9,<2",  # search for similar places among many
     ],
     "view": ["rerun-sdk>=0.41,<1"],  # dpm2 run --view, --record
     "datasets": ["kiss-icp>=1.2,<2", "pypcd4>=1.1,<2"],  # input.dataset, folders of PCD files
     "timm": ["timm>=1,<2"],  # image backbones timm:NAME
-    "train": ["tensorboard>=2.16,<3"],  # curves beside log.jsonl
+    "train": ["tensorboard>=2.16,<3"],  # curves in addition to log.jsonl
     "peers": ["kiss-slam>=0.0.2,<1"],  # dpm2 experiment --peer kiss-slam
     "bench": ["kiss-icp>=1.2,<2", "small_gicp>=1.0,<2", "pypose>=0.9,<1"],  # what the benchmarks compare with
 }
@@ -78,7 +78,7 @@ EXTRAS["dev"] = [line for name in ("plot", "sim", "test", "docs", "lint", "bench
 
 
 def ros2_run_stubs() -> list[str]:
-    """What `ros2 run` finds in lib/dpm2_ros after pip: each starts the console script of the same environment."""
+    """Scripts that `ros2 run` finds in lib/dpm2_ros after pip: each starts the console script of its environment."""
     folder = Path("build/ros2_run")
     folder.mkdir(parents=True, exist_ok=True)
     for name in EXECUTABLES:
@@ -112,7 +112,7 @@ setup(
     package_data={"dpm2_core": ["py.typed", "weights/*", "network/presets/*", "slam/presets/*", "evaluation/assets/*"]},
     data_files=data_files,
     python_requires=">=3.11,<3.13",
-    # On a machine with ROS 2 sourced, its own packages serve, and the wheels would shadow them.
+    # On a machine with ROS 2 sourced, its own packages are used; the wheels would shadow them.
     install_requires=REQUIREMENTS + ([] if os.environ.get("ROS_DISTRO") else ROS),
     extras_require=EXTRAS,
     zip_safe=False,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 launch dpm2_ros dpm2.launch.py [bag:=FOLDER] [params_file:=FILE] [rviz:=false] ...`; `--show-args` lists all.
 
-An argument that is left empty is not given to the nodes: files and defaults decide.
+An empty argument is not passed to the nodes: files and defaults apply.
 """
 
 import os
@@ -56,12 +56,12 @@ SHOWN = {"points_topic": "/kitti/velo/pointcloud", "image_topic": "/kitti/camera
 
 
 def at_home(value: dict[str, str]) -> dict[str, str]:
-    """With ~ expanded in paths, which no shell does behind `:=`; the nodes do it with those that they are given."""
+    """The values with ~ expanded in paths, since no shell does it after `:=`; the nodes expand their own parameters."""
     return value | {name: os.path.expanduser(value[name]) for name in ("bag", "params_file")}
 
 
 def parameters(value: dict[str, str]) -> dict[str, bool | str]:
-    """What the nodes are given, by the arguments' values."""
+    """The nodes' parameters, by the arguments' values."""
     given = {parameter: value[argument] for argument, parameter in PARAMETERS.items()}
     given["use_sim_time"] = value["use_sim_time"]
     if value["use_sim_time"] == "auto":
@@ -70,7 +70,7 @@ def parameters(value: dict[str, str]) -> dict[str, bool | str]:
 
 
 def robots(value: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
-    """Namespace of each robot's slam_node, and its arguments' values; frames on /tf are global, so each has its own."""
+    """Namespace of each robot's slam_node, and its arguments' values. /tf is global: each robot has its own frames."""
     if not value["robots"]:
         return [(value["namespace"], value)]
     names = [name.strip() for name in value["robots"].split(",")]
@@ -90,7 +90,7 @@ def robots(value: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
 
 
 def nodes(value: dict[str, str]) -> list[tuple[str, str, dict[str, str]]]:
-    """Executable, namespace and arguments' values of each node of dpm2."""
+    """Executable, namespace and the arguments' values of each node of dpm2."""
     found = [("slam_node", *robot) for robot in robots(value)]
     if value["embed_mapper"] == "false" or value["robots"]:
         found.append(("mapper_node", value["namespace"], value))
@@ -98,18 +98,18 @@ def nodes(value: dict[str, str]) -> list[tuple[str, str, dict[str, str]]]:
 
 
 def ending(value: dict[str, str]) -> str:
-    """The executable whose end is that of the launch; one of several robots may come back."""
+    """The executable whose end ends the launch; with several robots, one of them may be restarted."""
     return "mapper_node" if value["robots"] else "slam_node"
 
 
 def bag_options(value: dict[str, str]) -> list[str]:
-    """Of bag_player: it waits for each slam_node, however slowly one starts; RViz hears the clouds long before."""
+    """Options of bag_player: it waits for each slam_node, however slowly it starts; RViz subscribes long before."""
     heard = ["--for", "slam_node", "--subscribers", str(len(robots(value)))]
     return [value["bag"], "--rate", value["rate"], "--wait", "300", *heard]
 
 
 def parameter_files(value: dict[str, str]) -> list[str]:
-    """That of the user, if any; launch_ros itself only warns of one that is missing."""
+    """The parameter file of the user, if any; launch_ros itself only warns if it is missing."""
     file = value["params_file"]
     if file and not Path(file).is_file():
         raise RuntimeError(f"params_file: no such file: {file}")
@@ -117,7 +117,7 @@ def parameter_files(value: dict[str, str]) -> list[str]:
 
 
 def rviz_remappings(value: dict[str, str], layout: str) -> dict[str, str]:
-    """From the topics of the layout, which are those of a robot without namespace and of KITTI's, to this robot's."""
+    """Remappings from the topics of the layout (of a robot without namespace, and of KITTI) to those of this robot."""
     here = "/" + "".join(f"{part}/" for part in value["namespace"].split("/") if part)
     rules = {topic: here + topic[1:] for topic in re.findall(r"/(?:dpm2/\w+|initialpose)", layout)}
     for argument, topic in SHOWN.items():
@@ -127,7 +127,7 @@ def rviz_remappings(value: dict[str, str], layout: str) -> dict[str, str]:
 
 
 def _typed(given: dict[str, bool | str]) -> list[dict[str, bool | ParameterValue]]:
-    """Texts stay texts, whatever YAML would take them for."""
+    """The parameters, with texts marked as texts, so that YAML does not convert them."""
     typed = {n: ParameterValue(v, value_type=str) if isinstance(v, str) else v for n, v in given.items()}
     return [typed] if typed else []
 
@@ -139,7 +139,7 @@ def _actions(context) -> list:
         common["arguments"] = ["--lifecycle"]
     actions, last = [], ending(value)
     for executable, namespace, own in nodes(value):
-        # With its name the arguments come after all that params_file has for the node; without, before some of it.
+        # With the node's name, the arguments override params_file; without it, only some of its entries.
         given = {"name": executable, "namespace": namespace}
         files = [*parameter_files(value), *_typed(parameters(own))]
         ends = Shutdown() if executable == last else None
@@ -168,7 +168,7 @@ def _rviz(value: dict[str, str], sim_time: bool) -> Node | LogInfo:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """slam_node, and as asked for: mapper_node, bag_player, RViz."""
+    """Launch slam_node and, if requested, mapper_node, bag_player and RViz."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=CHOICES.get(name))
         for name, (default, text) in ARGUMENTS.items()
