@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plays a rosbag2 recording with its own timing, for machines without `ros2 bag`. Messages pass through undecoded, all
-but those of /tf_static."""
+"""Plays a rosbag2 recording with its own timing, for machines without `ros2 bag`. Messages are not decoded, except
+those of /tf_static."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from dpm2_ros.tf_message import MOST_TRANSFORMS, TFMessage
 
 CLOCK = "/clock"
 LATCHED = (naming.TF_STATIC, naming.VERTICAL_ANGLE_CORRECTION)
-_STATIC = naming.TF_STATIC, "tf2_msgs/msg/TFMessage"  # and its type
+_STATIC = naming.TF_STATIC, "tf2_msgs/msg/TFMessage"  # topic and type
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
 HELD_UP = 1.0
-"""Seconds that a message may be late and those after it catch up: a node has room for ten clouds."""
+"""Largest delay of a message, s, after which the following ones still catch up: a node has room for ten clouds."""
 DELIVERY = 5.0
-"""Seconds that the end of a recording may take to arrive: a receipt that is lost is asked for again after three."""
+"""Longest wait for the end of a recording to arrive, s: a lost acknowledgment is requested again after three."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Options:
 
 
 class BagPlayer:
-    """Publishers of everything in a bag that can be published here.
+    """Publishes all topics of a bag whose message types are available.
 
     Raises:
         UsageError: the bag cannot be read, has none of the topics, or nothing of it can be published.
@@ -78,26 +78,26 @@ class BagPlayer:
         self._bag: Bag = open_bag(options.bag)
         if missing := [topic for topic in options.topics or () if topic not in self._bag.types]:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
-        # A CameraInfo that was recorded once was latched.
+        # A CameraInfo that was recorded only once was latched.
         once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
         self._latched = (*LATCHED, *once)
         self._publishers = self._make_publishers()
         self._timed = [topic for topic in self._publishers if topic not in self._latched]
-        self._looked_at: float | None = None  # time of the last message of these, s from the first
+        self._looked_at: float | None = None  # time of the last message read from these topics, s from the first
         recorded = CLOCK in self._publishers
         if recorded:
             node.get_logger().info(f"{CLOCK} is that of the recording")
         self._clock = node.create_publisher(Clock, CLOCK, 10) if options.clock and not recorded else None
         self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
-        self._frames: set[str] = set()  # whose transforms are left to a node
+        self._frames: set[str] = set()  # frames whose transforms are left to a node
         self._published: list[str] = []  # lines of the log
         self._clouds = 0
 
     def play(self) -> None:
-        """Play to the end, or until a signal, and say how much it was.
+        """Play to the end, or until a signal, and log the number of messages.
 
         Raises:
-            UsageError: there is nothing in the stretch that is asked for.
+            UsageError: the requested part of the recording has no message.
             Dpm2Error: the log cannot be written; in lockstep, there is no odometry, or not of every cloud.
         """
         self._publish_latched()
@@ -110,7 +110,7 @@ class BagPlayer:
         while played and self._options.loop and not STOP.is_set():
             self._node.get_logger().info(f"{self._options.bag}: again from the start")
             count += (played := self._play_once())
-        if self._options.loop and not self._timed:  # what is latched stays there
+        if self._options.loop and not self._timed:  # latched messages remain available
             STOP.wait()
         self._await_delivery()
         for note in self._bag.notes:
@@ -125,7 +125,7 @@ class BagPlayer:
         self._node.get_logger().info(f"{self._options.bag}: {count} messages played, {self._clouds} of them clouds")
 
     def _make_publishers(self) -> dict[str, Any]:
-        """Latched topics first: a subscriber that has discovered a later one then has these."""
+        """Publishers by topic. Latched ones come first: a subscriber that has discovered a later one then has these."""
         requested = self._options.topics or tuple(self._bag.types)
         publishers = {}
         for topic in sorted(requested, key=lambda topic: topic not in self._latched):
@@ -147,10 +147,10 @@ class BagPlayer:
         return publishers
 
     def _publish_latched(self) -> None:
-        """Every latched message at once: calibration is wanted before the first cloud, from wherever one starts.
+        """Publish every latched message at once: calibration must precede the first cloud, wherever playing starts.
 
-        Of /tf_static the last transform of each frame, all together: a recording may repeat them thousands of times,
-        and a subscriber takes only the last hundred messages or so.
+        Of /tf_static only the last transform of each frame is published, all together: a recording may repeat them
+        thousands of times, and a subscriber receives only the last hundred messages or so.
         """
         placed = dict[str, Any]()
         for topic, _, data in self._bag.playable([topic for topic in self._latched if topic in self._publishers]):
@@ -164,7 +164,7 @@ class BagPlayer:
             self._publishers[naming.TF_STATIC].publish(message)
 
     def _transforms(self, data: bytes) -> dict[str, Any]:
-        """Those of a message, by the frame that each places; what cannot be used is left out, with a warning."""
+        """The transforms of a message, by child frame; an invalid one is left out, with a warning."""
         out, log = dict[str, Any](), self._node.get_logger()
         try:
             message = deserialize_message(data, TFMessage)
@@ -182,7 +182,7 @@ class BagPlayer:
         return out
 
     def _await_subscribers(self) -> None:
-        """Until the clouds (or, without any, anything) have their subscribers; not for ever."""
+        """Wait, at most for `Options.wait`, until the clouds (or, without any, the other topics) have subscribers."""
         options, log = self._options, self._node.get_logger()
         given = [topic for topic in self._publishers if not is_result(topic)] or list(self._publishers)
         clouds = [topic for topic in given if self._bag.types[topic] in CLOUDS] or given
@@ -204,7 +204,7 @@ class BagPlayer:
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
     def _leave_to_nodes(self) -> None:
-        """What nodes of dpm2 publish now is not played beside it."""
+        """Leave out the topics that nodes of dpm2 publish now."""
         left = published_here(self._node, self._timed)
         if not left:
             return
@@ -216,16 +216,16 @@ class BagPlayer:
         self._node.get_logger().warning(f"{', '.join(left)}: left out, as nodes publish these now{frames}")
 
     def _listeners(self, topics: Sequence[str]) -> int:
-        """Subscriptions, or, of nodes with the name that is waited for, nodes: one robot may have two LiDARs."""
+        """Number of subscriptions or, if a node's name is given, of nodes with it: a robot may have two LiDARs."""
         if not self._options.listener:
             return sum(self._publishers[topic].get_subscription_count() for topic in topics)
         found = [info for topic in topics for info in self._node.get_subscriptions_info_by_topic(topic)]
         return len({info.node_namespace for info in found if info.node_name == self._options.listener})
 
     def _await_delivery(self) -> None:
-        """What is on its way must not end with the process: clouds above all; those that do not arrive are reported.
+        """Wait until the last messages have arrived, above all the clouds; clouds that do not arrive are reported.
 
-        A receipt for the last message, if it is small, may come only seconds after the message.
+        The acknowledgment of the last message, if it is small, may arrive only seconds after the message.
         """
         began = time.monotonic()
         for topic in sorted(self._publishers, key=lambda topic: self._bag.types[topic] not in CLOUDS):
@@ -250,7 +250,7 @@ class BagPlayer:
             if STOP.is_set():
                 return count
             now = max(now, log_time) if self._lockstep is None else log_time
-            if self._lockstep is None or self._lockstep.awaits(topic):  # there other messages are ahead of the clouds
+            if self._lockstep is None or self._lockstep.awaits(topic):  # in lockstep, other messages may be ahead
                 self._tick(now)
             published = time.monotonic_ns()
             self._publishers[topic].publish(data)
@@ -261,10 +261,10 @@ class BagPlayer:
         return count
 
     def _pace(self, log_time: int, origin: int, began: float) -> tuple[int, float]:
-        """Until a message is due, of a recording that begins at `origin` ns and was begun at `began` s; returns both.
+        """Wait until a message is due, if `origin` ns of the recording was played at `began` s; returns both.
 
-        Where it was due long ago, as the process was stopped or the disk kept it waiting, it is the beginning of the
-        rest: what was due meanwhile, all at once, would be more than who listens has room for.
+        If it was due long ago, since the process was stopped or the disk was slow, both are set to this message: all
+        messages that were due in the meantime, sent at once, would be more than the subscribers' queues can store.
         """
         due = began + (log_time - origin) * 1e-9 / self._options.rate
         while (left := due - time.monotonic()) > 0 and not STOP.is_set():
@@ -277,7 +277,7 @@ class BagPlayer:
         return log_time, time.monotonic()
 
     def _selected(self) -> Iterator[tuple[str, int, bytes]]:
-        """The messages of the stretch that is asked for."""
+        """The messages of the requested part of the recording."""
         origin = first = last = None
         for topic, log_time, data in self._bag.playable(self._timed):
             if origin is None or first is None:

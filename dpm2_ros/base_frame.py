@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frame's pose is published, and where the LiDAR is in it: known from /tf_static, never assumed."""
+"""The frame whose pose is published, and the LiDAR's pose in it: read from /tf_static, never assumed."""
 
 from __future__ import annotations
 
@@ -11,58 +11,58 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_SAME = 1e-5  # m, and of a rotation's matrix: what rounding makes of one place
+_SAME = 1e-5  # m, and of a rotation's matrix: rounding error of the same pose
 
 
 class BaseFrame:
-    """The frame that was asked for, once it is reachable; else the root above the LiDAR, also where that changes.
+    """The requested frame, once /tf_static connects it; without a request the root above the LiDAR, also if it changes.
 
-    /tf_static has several publishers, which come in any order: a driver's knows the parts of the sensor, that of the
-    robot where the sensor is. A frame with a parent in /tf_static must have no second one in /tf.
+    /tf_static has several publishers, which arrive in any order: a driver publishes the frames within the sensor, the
+    robot the pose of the sensor. A frame with a parent in /tf_static must not have a second one on /tf.
 
     Attributes:
-        name: whose pose it is; empty before it is known.
-        problem: why it is not known, or which place of the LiDAR in it does not count yet, in words.
-        above: the root above the frame that was asked for; where that is another one, it has a parent in /tf_static.
+        name: the frame whose pose is published; empty before it is known.
+        problem: why it is not known, or that a new pose of the LiDAR in it is not used yet, in words.
+        above: the root above the requested frame. If it is another frame, the requested one has a parent in /tf_static.
         T_start_lidar: (4, 4) LiDAR in the frame with which the drive began: its first pose is the origin of odom.
-        T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent came later.
+        T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent arrived later.
     """
 
     def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
-        """`wanted`: the frame that was asked for, or empty; `own`: frames that this node is a parent with."""
+        """`wanted`: the requested frame, or empty; `own`: frames that this node publishes as parents."""
         self._wanted, self._own = frame_name(wanted), own
-        self._tree: TransformTree | None = None  # that of the last look
+        self._tree: TransformTree | None = None  # of the last `look`
         self.name = self.problem = ""
         self.above = self._wanted
         self.T_start_lidar = self.T_base_start = np.eye(4)
-        self._T_base_lidar: Array = np.eye(4)  # by the last look
+        self._T_base_lidar: Array = np.eye(4)  # by the last `look`
 
     @property
     def child_problem(self) -> str:
-        """Why it must not be a child on /tf, in words; empty where it may."""
+        """Why the frame must not be a child on /tf, in words; empty if it may."""
         if self.above == self._wanted:
             return ""
         return f"{self._wanted} has a parent in /tf_static, and no frame has two: name {self.above} as ros.base_frame"
 
     @property
     def optional(self) -> bool:
-        """Whether the LiDAR's own frame would do."""
+        """Whether the LiDAR's own frame may be used."""
         return not self._wanted
 
     def restart(self) -> None:
-        """A new drive begins, in the frame and with the LiDAR's place of this moment."""
+        """Begin a new drive, with the present frame and the present pose of the LiDAR in it."""
         self.T_start_lidar, self.T_base_start = self._T_base_lidar, np.eye(4)
         if self.name:
             self.problem = ""
 
     def forget(self) -> None:
-        """Another LiDAR: neither its place nor the root above it is known yet."""
+        """Begin with another LiDAR: neither its pose nor the root above it is known yet."""
         self._tree, self.name, self.T_base_start = None, "", np.eye(4)
 
     def look(self, tree: TransformTree, lidar_frame: str) -> bool:
-        """Find the frame, or see whether it has changed; returns whether it has.
+        """Find the frame, or check whether it has changed; returns whether it is a new one.
 
-        Where the LiDAR has moved in it, the drive goes on with the place of before, and `problem` says so.
+        If the LiDAR has moved in it, the drive continues with the pose from before, and `problem` reports it.
         """
         if tree is self._tree:
             return False

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build `tf2_msgs` for a ROS 2 that came from pip: `python -m dpm2_ros.build_tf2_msgs` (about 5 s, once).
 
-/tf needs tf2_msgs/TFMessage, which no wheel carries. The wheels do bring ROS's own generators, so the message is
-generated and compiled here from its one-line definition. All generated sources go into a single shared object, which
+/tf needs tf2_msgs/TFMessage, which no wheel contains. The wheels do contain ROS's own generators, so the message is
+generated and compiled here from its one-line definition. All generated sources are linked into one shared object, which
 is the Python extension and, by links from PREFIX/lib, the two type-support libraries that ROS 2 opens by name. ROS 2
-computes the same type hash for it as for the official package, so both sides talk.
+computes the same type hash for it as for the official package, so both are compatible.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from dpm2_core.errors import Dpm2Error, exit_code
 
 DEFINITION = "geometry_msgs/TransformStamped[] transforms\n"
 TYPE_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
-"""What ROS 2 Jazzy's own tf2_msgs/msg/TFMessage has; endpoints with another hash do not connect."""
+"""Type hash of tf2_msgs/msg/TFMessage in ROS 2 Jazzy; endpoints with another hash do not connect."""
 
 MODULE = f"tf2_msgs_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
 SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""Fast DDS wants both: the first to (de)serialize, the second to announce the type to other machines."""
+"""Fast DDS needs both: the first to (de)serialize, the second to announce the type to other machines."""
 
 
 def available() -> bool:
@@ -129,7 +129,7 @@ def _compile(package: Path) -> None:
 
 
 def _tidy(package: Path) -> None:
-    """Keep what a Python process imports."""
+    """Remove all files that a Python process does not import."""
     for suffix in ("c", "cpp", "h", "hpp", "o"):
         for leftover in package.rglob(f"*.{suffix}"):
             leftover.unlink()
@@ -147,7 +147,7 @@ def _run(command: list[str]) -> None:
 
 
 def main() -> int:
-    """Build unless it is there; exit code 1 and one line where it cannot be built (the nodes then run without /tf)."""
+    """Build it unless it exists; exit code 1 and one line if it cannot be built (the nodes then run without /tf)."""
     if available():
         print("tf2_msgs: already installed")
         return 0

@@ -3,7 +3,7 @@
 
 Covariances: the core's is [rotation rad, translation m] of xi in T @ Exp(xi), that is, along the axes of the body;
 ROS wants [translation, rotation about fixed axes] along the axes of the header's frame. Both describe the error at the
-body's own position, so that a rotation of each block by R, and a swap, leads from one to the other.
+body's own position, so that a rotation of each block by R, and a swap, convert one to the other.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def pose_to_msg(T: Array) -> Pose:
 
 
 def poses_to_msgs(T: Array) -> list[Pose]:
-    """(N, 4, 4) to geometry_msgs/Pose: many rotations take little longer than one."""
+    """(N, 4, 4) to geometry_msgs/Pose; many rotations at once take little longer than one."""
     quaternions, positions = se3.quaternion(T).tolist(), T[:, :3, 3].tolist()
     return [
         Pose(position=Point(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
@@ -87,7 +87,7 @@ def covariance_from_ros(numbers: Array, R: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """Pose and motion of one frame of the vehicle: the LiDAR's, or one that is rigidly tied to it.
+    """Pose and motion of one frame of the vehicle: the LiDAR's, or one that is rigidly connected to it.
 
     Attributes:
         stamp: ns. T_odom_body: (4, 4).
@@ -104,13 +104,13 @@ class BodyMotion:
         return cls(result.stamp, result.T_odom_lidar, result.covariance, result.twist)
 
     def of_other(self, T_other_body: Array) -> BodyMotion:
-        """That of another frame of the same rigid body, in the same odom."""
+        """The motion of another frame of the same rigid body, in the same odometry frame."""
         A = se3.adjoint(T_other_body)
         T_odom_other = self.T_odom_body @ se3.inverse(T_other_body)
         return BodyMotion(self.stamp, T_odom_other, A @ self.covariance @ A.T, A @ self.twist)
 
     def of_base(self, T_base_body: Array, T_start_odom: Array) -> BodyMotion:
-        """That of the base, in an odom that begins at the base's first pose: T_start_odom (4, 4) is odom in it."""
+        """The motion of the base, in an odometry frame that begins at its first pose; T_start_odom: odom in it."""
         moved = self.of_other(T_base_body)
         return replace(moved, T_odom_body=T_start_odom @ moved.T_odom_body)
 
@@ -122,7 +122,7 @@ def odometry_to_msg(
 
     Args:
         covariance: (6, 6) of the pose since the start, as in `Registration`.
-        seconds: length of the last step, which turns its covariance into that of the twist.
+        seconds: duration of the last step, to convert its covariance to that of the twist.
     """
     message = edge_to_msg(motion.T_odom_body, covariance, motion.stamp, odom_frame, body_frame)
     message.twist.twist = Twist(linear=vector(motion.twist[3:]), angular=vector(motion.twist[:3]))
@@ -143,14 +143,14 @@ def columns_to_msg(columns: Mapping[str, NDArray[Any]], stamp: int, frame_id: st
 
 
 def bytes_to_array(data: bytes | memoryview) -> array.array[int]:
-    """What the data of a message is set to fastest."""
+    """An array of the bytes: the type that is assigned fastest to the data of a message."""
     out = array.array("B")
     out.frombytes(data)
     return out
 
 
 def keyframe_name(robot: str, id: int, session: str = "") -> str:
-    """`kf_12`, in a namespace `robot/kf_12`, of one drive `robot/kf_12.5f3a9c01`: what a keyframe is called."""
+    """Name of a keyframe: `kf_12`, in a namespace `robot/kf_12`, of one drive `robot/kf_12.5f3a9c01`."""
     last = f"kf_{id}.{session}" if session else f"kf_{id}"
     return f"{robot}/{last}" if robot else last
 
@@ -182,8 +182,8 @@ def edge_to_msg(T: Array, covariance: Array, stamp: int, parent: str, child: str
 
 
 def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Array) -> Keyframe:
-    """The same place seen from the base: its pose, in an odom that begins at the base's first pose (see `of_base`),
-    cloud and LiDAR, descriptors, edge, fix and picture."""
+    """The keyframe in the base's frame: its pose, in an odometry frame that begins at the base's first pose (see
+    `of_base`), cloud and LiDAR origin, descriptors, edge, fix and thumbnail."""
     edge, A = keyframe.edge, se3.adjoint(T_base_lidar)
     if edge is not None:
         T_before_this = T_base_lidar @ edge.T_target_source @ se3.inverse(T_base_lidar)
@@ -197,7 +197,7 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Arra
         fix=fix,
         thumbnail=None if picture is None else moved_thumbnail(picture, T_base_lidar),
         T_odom_kf=T_start_odom @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
-        up=None,  # a base stands
+        up=None,  # a base is level
         cloud=se3.transform(T_base_lidar, keyframe.cloud),
         origin=T_base_lidar[:3, :3] @ keyframe.origin + T_base_lidar[:3, 3],
         edge=edge,

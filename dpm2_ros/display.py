@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What RViz and Foxglove show of the map: the optimized path, and the pose graph with its loops."""
+"""Messages for RViz and Foxglove: optimized path, pose graph with its loops, occupancy grid, projected clouds."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
 from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg, poses_to_msgs
 
-_REST = 4.0  # times as long as the work at one message took, from its begin to that of the next at least
-_AGAIN = -1  # in place of the changes that were shown
+_REST = 4.0  # times the work on one message: least time from its start to that of the next
+_AGAIN = -1  # value of `_shown` if the message must be built again
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
 
@@ -64,7 +64,7 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
 
 
 def loop_to_msg(loop: Edge, stamp: int, from_name: str, to_name: str) -> DiagnosticArray:
-    """What became of a loop candidate, and why: OK for an accepted one, WARN for one rejected."""
+    """The result of a loop candidate, with its reason: OK for an accepted one, WARN for a rejected one."""
     result = loop.registration
     numbers = {"confidence": result.confidence, "overlap": result.overlap, "rmse (m)": result.rmse}
     values = [KeyValue(key="method", value=result.method)]
@@ -99,15 +99,15 @@ def grid_to_msg(grid: Grid, stamp: int, frame_id: str) -> OccupancyGrid:
 
 
 class Projection:
-    """The cloud painted into its images, for checking an extrinsic; made only while there is a subscriber."""
+    """Images with the cloud projected into them, to check an extrinsic; made only while there is a subscriber."""
 
     def __init__(self, node: Node, second: bool) -> None:
-        """`second`: whether there is a second camera, which has a topic of its own."""
+        """`second`: whether there is a second camera, whose images have their own topic."""
         names = ["dpm2/projection", *["dpm2/second_projection"] * second]
         self._publishers = [node.create_publisher(Image, name, 1) for name in names]
 
     def show(self, frame: Frame, cameras: Sequence[str], beside: Mapping[str, tuple[int, Any]]) -> None:
-        """Each image of a frame; by the topics of the cameras, and the messages of these topics."""
+        """Publish each image of a frame; `cameras`: topics of the cameras; `beside`: see `Bundle`."""
         for image in frame.images:
             topic = image.camera.name
             publisher = self._publishers[cameras.index(topic)]
@@ -122,26 +122,27 @@ class Projection:
 
 
 class Display:
-    """A large message that is built only if it has a subscriber, has changed, and its period has passed.
+    """A large message that is built only if it has a subscriber, the map has changed, and its period has passed.
 
-    Of a large map it takes longer: after so much work the thread of the map has three times as long for the rest.
+    For a large map, the period is longer: after the work on one message, the map's thread has three times as long for
+    all other work.
     """
 
     def __init__(self, publisher: Any, period: Callable[[], float], make: Callable[[], Any]) -> None:
-        """`make`: called in the map's thread; returns the message, or a generator that does, with pauses between the
-        parts of its work."""
+        """`make`: called in the map's thread; returns the message, or a generator that builds it in steps and returns
+        it."""
         self._publisher, self._period, self._make = publisher, period, make
         self._shown = 0
         self._last, self._worked = -np.inf, 0.0
         self._working = False
-        self._steps: Generator[None, None, Any] | None = None  # of what is being built
+        self._steps: Generator[None, None, Any] | None = None  # of the message that is being built
 
     def due(self, changes: int) -> bool:
         """Whether to publish now; if so, `publish` is expected to follow."""
         if self._working:
             return False
         if not self._publisher.get_subscription_count():
-            if self._steps is not None:  # who comes next gets the map of then
+            if self._steps is not None:  # the next subscriber gets the map of that time
                 self.again()
             return False
         if self._steps is None:
@@ -154,11 +155,11 @@ class Display:
         return True
 
     def again(self) -> None:
-        """What was made is not complete, or what is being made is of no use any more: due once more, from its begin."""
+        """Build the message again, from the start: it was incomplete, or the one being built is outdated."""
         self._steps, self._shown = None, _AGAIN
 
     def publish(self) -> None:
-        """Build and send it, or a part of the work for it."""
+        """Build and send the message, or do one step of that."""
         begin, steps, self._steps = time.monotonic(), self._steps, None
         try:
             made = steps or self._make()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Entry points: console scripts, `ros2 run dpm2_ros NAME`, and `python -m dpm2_ros.executables NAME`.
 
-Signals are caught before the slow imports, so that a process that is stopped while it starts ends cleanly as well.
+Signals are caught before the slow imports, so that a process also ends cleanly if it is stopped during its start.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def slam_node(arguments: Sequence[str] | None = None) -> int:
 
 
 def mapper_node(arguments: Sequence[str] | None = None) -> int:
-    """The map apart; `--lifecycle` likewise."""
+    """The mapper in a process of its own; `--lifecycle` as for slam_node."""
     return _run(partial(_spin, "mapper_node", "MapperNode"), arguments)
 
 
@@ -79,7 +79,7 @@ def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) 
         return exit_code(with_ros)
     finally:
         ignore_signals()
-        gc.freeze()  # Python looks through everything once more when it ends, for half a second
+        gc.freeze()  # else the garbage collection at Python's end takes half a second
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What slam_node and mapper_node have in common: two steps, configure and activate, with their ways back.
+"""The common part of slam_node and mapper_node: two steps, configure and activate, and how they are undone.
 
-A plain node takes both as soon as it is made. A managed one (`--lifecycle`) leaves them to Nav2's lifecycle manager or
-the like, over the services of rclpy's `LifecycleNodeMixin`. What a step has made, its way back ends.
+A plain node takes both steps when it is created. A managed one (`--lifecycle`) takes each when Nav2's lifecycle manager
+or the like requests it, by the services of rclpy's `LifecycleNodeMixin`. To undo a step ends all that it has created.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from dpm2_ros.settings import NodeConfig
 _KEEP_SERVICES = (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE)
 """Transitions that destroy no service."""
 _Snapshot = tuple[set[int], set[str]]
-"""Which entities of ROS, by their id(), and which attributes a node has had."""
+"""The entities of ROS, by their id(), and the names of the attributes that a node had at a time."""
 
 
 class ManagedNode(LifecycleNodeMixin, GuardedNode):
-    """A node with the settings of all nodes, and perhaps a map.
+    """A node with the settings of all nodes, and with a map if it opens one.
 
-    Its class has `configure` and `activate`, and calls `start` when the rest of it is made.
+    A subclass defines `configure` and `activate`, and calls `start` at the end of `__init__`.
 
     Raises:
         UsageError: a parameter that is not allowed.
@@ -42,11 +42,15 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
     def __init__(self, name: str) -> None:
         GuardedNode.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         self._config, self._robot = load_parameters(self), self.get_namespace().strip("/")
-        self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what was there before each, and its way back
+        self._taken: list[tuple[_Snapshot, ExitStack]] = []  # steps: what existed before each, and how to undo it
         follow_changes(self, self._config, self._apply)
 
     def declare_parameters(self, namespace: str, parameters: Any, ignore_override: bool = False) -> Any:
-        """As of `Node`, which declares all that are given; ROS reads an empty list as no value, which has no type."""
+        """As in `Node`, which declares all given parameters. ROS reads an empty list as no value, which has no type.
+
+        Raises:
+            UsageError: a parameter without a value.
+        """
         for name, value, descriptor in parameters:
             if value is None and not descriptor.dynamic_typing:
                 raise UsageError(f"ROS parameter: {name}: want a value, got an empty list")
@@ -56,30 +60,30 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         """Load the network, open the map, announce what will be published.
 
         Args:
-            back: gets what is to be done at the cleanup, also where this fails half-way; topics, services and timers
-                go without.
+            back: receives the callbacks of the cleanup, which also run if this fails half-way; topics, services and
+                timers need none.
 
         Raises:
-            UsageError, Dpm2Error: this cannot be done.
+            UsageError, Dpm2Error: the step is not possible.
         """
         raise NotImplementedError
 
     def activate(self, back: ExitStack) -> None:
-        """Listen from now on.
+        """Subscribe, and begin to work.
 
         Args:
-            back: gets what is to be done when it is deactivated, likewise.
+            back: receives the callbacks of the deactivation, in the same way.
 
         Raises:
-            UsageError, Dpm2Error: this cannot be done.
+            UsageError, Dpm2Error: the step is not possible.
         """
         raise NotImplementedError
 
     def start(self, managed: bool) -> None:
-        """Take both steps; `managed`: wait to be told.
+        """Take both steps; `managed`: when they are requested.
 
         Raises:
-            UsageError, Dpm2Error: one cannot be done. The node is closed.
+            UsageError, Dpm2Error: a step is not possible. The node is closed.
         """
         if managed:
             self._serve()
@@ -92,7 +96,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
             raise
 
     def close(self) -> None:
-        """End everything, whatever is under way; the map is saved.
+        """End everything, whatever is in progress; the map is saved.
 
         Raises:
             Dpm2Error: the map could not be written.
@@ -111,38 +115,38 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         return self._go(self.activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Active to inactive: the map stays."""
+        """Active to inactive: the map stays open."""
         return self._return(1)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """To unconfigured, also after a bug in a step, or to the end: the map is saved."""
+        """To unconfigured, also after a bug in a step, or to finalized: the map is saved."""
         return self._return(0)
 
     on_shutdown = on_error = on_cleanup
 
     def _open_map(self, back: ExitStack) -> MapperThread:
-        """The map of this node, until the cleanup."""
+        """Open the map of this node, until the cleanup."""
         self._mapper = mapper = MapperThread(self, self._config, self._robot)
         back.callback(mapper.close)
         return mapper
 
     def _apply(self, config: NodeConfig) -> None:
-        """Parameters that have changed while the node runs."""
+        """Apply parameters that have changed while the node runs."""
         self._config = config
         if self._mapper is not None:
             self._mapper.apply(config)
 
     def _serve(self) -> None:
-        # In a group of its own: while a transition waits, the other callbacks of its group do, too.
+        # In a group of its own: while a transition waits, the other callbacks of its group wait, too.
         LifecycleNodeMixin.__init__(self, callback_group=MutuallyExclusiveCallbackGroup())
         change = self._service_change_state.callback
 
         async def guarded(request: Any, response: Any) -> Any:
-            if request.transition.id not in _KEEP_SERVICES:  # a service that is destroyed cannot answer any more
+            if request.transition.id not in _KEEP_SERVICES:  # a destroyed service cannot respond any more
                 await until(lambda: not self.answering)
             try:
                 return change(request, response)
-            except Exception as error:  # rclpy raises for a transition that there is not, and would not answer
+            except Exception as error:  # rclpy raises for an unknown transition, and would not respond
                 self.get_logger().warning(f"transition {request.transition.id}: {error}")
                 response.success = False
                 return response
@@ -170,12 +174,12 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _return(self, steps: int) -> TransitionCallbackReturn:
-        """Undo all steps but so many."""
+        """Undo all but the first `steps` steps."""
         while len(self._taken) > steps:
             before, back = self._taken.pop()
             try:
                 back.close()
-            except Dpm2Error as error:  # the way back goes on: what could be saved is saved
+            except Dpm2Error as error:  # the rest is undone nevertheless: what could be saved is saved
                 self.get_logger().error(f"{error}")
             except Exception as error:
                 self.fail("transition", error)
@@ -187,7 +191,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         return {id(entity) for entity in entities}, set(vars(self))
 
     def _drop_since(self, before: _Snapshot) -> None:
-        """Destroy the publishers and the like that were made since, and let go of the attributes: a map is large."""
+        """Destroy the entities of ROS that were created since, and delete the attributes: a map is large."""
         kept, names = before
         ways = (
             (self.timers, self.destroy_timer),
@@ -198,7 +202,7 @@ class ManagedNode(LifecycleNodeMixin, GuardedNode):
         )
         for entities, destroy in ways:
             for entity in list(entities):
-                # Not what follows /clock, since use_sim_time was set: that is of the node, whatever its state.
+                # Not the subscription to /clock, if use_sim_time was set since: the node needs it in every state.
                 if id(entity) not in kept and getattr(entity, "topic_name", "") != CLOCK_TOPIC:
                     destroy(entity)
         for name in vars(self).keys() - names:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording into the graph exactly: a cloud goes out when the one before has its odometry, and never ahead of its
-images and IMU samples, nor of the cloud of a second LiDAR. So nothing depends on how long anything takes, and slam_node
-sees what `dpm2 run` sees.
+"""Plays a recording in lockstep: a cloud is published once the previous one has its odometry, and never before its
+images, its IMU samples and the cloud of a second LiDAR. So nothing depends on processing times, and slam_node processes
+the same input as `dpm2 run`.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from dpm2_ros.runtime import STOP
 ODOMETRY = "dpm2/odom"
 """Topic, in the namespace of the player."""
 TIMEOUT = 10.0
-"""Seconds that a cloud waits for its odometry. A node rejects one whose stamp repeats; then the next goes out."""
+"""Longest wait for the odometry of a cloud, s, after which the next one is published: a node rejects a repeated stamp.
+"""
 _SECOND = "input.second_points_topic"
 _AGAIN = 2.0
-"""Seconds without an answer after which a node is asked once more: Fast DDS drops an answer where the node has not
-found who asks within 0.1 s, and does not say so here."""
+"""Seconds without a response after which a node is asked once more: Fast DDS drops a response without an error here, if
+the node has not discovered the client within 0.1 s."""
 
 
 class Lockstep:
-    """The order and the pace of a player that waits for the node.
+    """Order and pace of a player that waits for the node.
 
     Args:
         node: of the player.
-        bag: what is played.
+        bag: the recording.
         publishers: by topic.
     """
 
@@ -49,14 +50,14 @@ class Lockstep:
         self._odometry = node.create_subscription(Odometry, ODOMETRY, self._on_odometry, qos)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._clouds: list[str] = []  # topics that get an odometry
-        self._joining: list[str] = []  # of second LiDARs, whose clouds join those
+        self._clouds: list[str] = []  # topics whose clouds get an odometry
+        self._joining: list[str] = []  # topics of second LiDARs, whose clouds are joined to those
         self._awaited: int | None = None  # stamp of the cloud whose odometry is awaited, ns; 0: it has no stamp
         self._beside: dict[str, int] = {}  # stamp of the last image or joining cloud, by topic
         self._sent = self._missing = 0
 
     def find(self, end: float) -> None:
-        """Wait, until `end` of the monotonic clock, for the node that turns clouds into odometry.
+        """Wait, until `end` of the monotonic clock, for the node that computes odometry from clouds.
 
         Raises:
             Dpm2Error: there is none.
@@ -71,7 +72,7 @@ class Lockstep:
             }
             taken = [cloud for cloud, found in takers.items() if found]
             if taken and self._odometry.get_publisher_count():
-                # Two LiDARs of one node make one odometry, that of the first: which is the second one the node says.
+                # Two LiDARs of one node have one odometry, that of the first; a parameter names the second.
                 among = nodes if len(clouds) > 1 else set()
                 self._joining = [second for node in sorted(among) if (second := self._second_of(*node)) in taken]
                 self._clouds = [cloud for cloud in taken if cloud not in self._joining]
@@ -82,7 +83,7 @@ class Lockstep:
                 raise Dpm2Error(f"lockstep: no node turns {' or '.join(clouds) or 'clouds'} into {topic}")
 
     def _check_alone(self, takers: Mapping[str, set[tuple[str, str]]]) -> None:
-        """Whether each node makes its odometry of one of the clouds."""
+        """Raises Dpm2Error unless each node computes its odometry from one of the cloud topics."""
         for one, other in combinations(self._clouds, 2):
             if common := takers[one] & takers[other]:
                 raise Dpm2Error(
@@ -91,7 +92,7 @@ class Lockstep:
                 )
 
     def _second_of(self, namespace: str, name: str) -> str:
-        """The topic of a node's second LiDAR by its parameters; empty if it does not answer, or has none."""
+        """The topic of a node's second LiDAR, by its parameter; empty if it does not respond, or has none."""
         client = self._node.create_client(GetParameters, f"{namespace.rstrip('/')}/{name}/get_parameters")
         try:
             if not client.wait_for_service(TIMEOUT):
@@ -108,15 +109,15 @@ class Lockstep:
             self._node.destroy_client(client)
 
     def begin(self) -> None:
-        """Before the first message: the calibration of each camera, which `dpm2 run` has from the start."""
+        """Before the first message: publish the CameraInfo of each camera, which `dpm2 run` has from the start."""
         for topic, publisher in self._publishers.items():
             if self._bag.types[topic] == CAMERA_INFO:
                 for _, _, data in islice(self._bag.playable([topic]), 1):
                     publisher.publish(bytes(data))
 
     def order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
-        """The same messages as `dpm2 run` takes them: a cloud after images, IMU and what joins it, of those that have a
-        subscriber.
+        """The same messages in the order of `dpm2 run`: each cloud follows its images, its IMU samples and the cloud
+        that is joined to it, as far as they have a subscriber.
         """
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
         beside = [t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._joining]
@@ -124,11 +125,12 @@ class Lockstep:
         return clouds_after_others(messages, self._clouds, others)
 
     def turn(self, topic: str, data: bytes) -> None:
-        """Before a message is published: wait, if it is a cloud, for the odometry of the one before.
+        """Before a message is published: wait, if it is a cloud, for the odometry of the previous cloud.
 
-        What goes with it, images and the cloud that joins it, went out before the wait, and so has arrived when it
-        ends. One that may be nearer to the cloud before than those that went out ahead of it came too late for it, and
-        waits as well; so does a fix, or a sample, that the cloud before would take if it were there.
+        The messages synchronized with a cloud (images and the cloud that is joined to it) are published before the
+        wait, and so have arrived when it ends. An image or joined cloud also waits if it may be closer to the previous
+        cloud than those published before that cloud: it comes too late for it. So does a fix or an IMU sample that the
+        previous cloud would use if it arrived in time.
 
         Raises:
             Dpm2Error: the node is gone.
@@ -146,11 +148,11 @@ class Lockstep:
             self._awaited, self._sent = stamp, self._sent + 1
 
     def awaits(self, topic: str) -> bool:
-        """Whether it has clouds that get an odometry."""
+        """Whether the clouds of that topic get an odometry."""
         return topic in self._clouds
 
     def conclude(self) -> None:
-        """After the last message: wait for the last odometry, and say how it went.
+        """After the last message: wait for the last odometry, and log the result.
 
         Raises:
             Dpm2Error: not every cloud had its odometry.
@@ -177,7 +179,7 @@ class Lockstep:
             self._executor.spin_once(timeout_sec=0.1)
 
     def _on_odometry(self, message: Odometry) -> None:
-        if self._awaited in (0, stamp_ns(message.header)):  # a cloud without a stamp gets the time of its arrival
+        if self._awaited in (0, stamp_ns(message.header)):  # a cloud without a stamp gets its arrival time
             self._awaited = None
 
 

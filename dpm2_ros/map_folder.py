@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names in the folder of maps: NAME.dpm2map and beside it a folder NAME. Nothing is overwritten."""
+"""Names in the folder of maps: NAME.dpm2map and, next to it, a folder NAME. Nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class MapFolder:
     """The maps of one robot, in a folder that others may use as well.
 
     Attributes:
-        folder: None where nothing is saved.
+        folder: None if nothing is saved.
     """
 
     def __init__(self, folder: Path | None, robot: str) -> None:
@@ -26,8 +26,7 @@ class MapFolder:
 
     @property
     def usual(self) -> Path:
-        """The file of a drive without a name of its own, as it is asked of `free`; without a name where nothing is
-        saved."""
+        """The default map file of a drive, an argument of `free`; an empty path if nothing is saved."""
         return Path() if self.folder is None else self.folder / f"{_NAME}{SUFFIX}"
 
     def file(self, name: str) -> Path:
@@ -41,21 +40,22 @@ class MapFolder:
         return self.folder / f"{name.removesuffix(SUFFIX)}{SUFFIX}"
 
     def of_robot(self, requested: Path) -> Path:
-        """The path of that name and the robot's."""
+        """The path, with the robot's name added to that of the file."""
         return requested.with_name(self._of_robot(requested.stem) + requested.suffix)
 
     def free(self, requested: Path) -> Iterator[Path]:
-        """Paths of that name, the robot's and a number that do not exist yet, nor a folder for their clouds, nor what
-        is left of a map that did."""
+        """Unused paths: `requested` with the robot's name and a number added. Neither the file, nor a folder for its
+        clouds, nor a write-ahead log that a former map left exists."""
         for path in numbered(self.of_robot(requested), requested.suffix):
             if not _taken(path) and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
     def claimed(self, name: str, file: Path | None) -> Path:
-        """A new folder of that name, or of the drive's map file, if it has one: never another drive's.
+        """Create a folder with that name or, if it is empty, with that of the drive's map file; never that of another
+        drive.
 
         Raises:
-            OSError: it cannot be made.
+            OSError: it cannot be created.
         """
         assert self.folder is not None
         own = file.stem if file is not None else self._of_robot(_NAME)
@@ -68,7 +68,7 @@ class MapFolder:
         raise AssertionError
 
     def hint(self) -> str:
-        """Which map is the youngest, in words; empty where there is none."""
+        """The newest map in the folder, in words; empty if there is none."""
         found = sorted(self.folder.glob(f"*{SUFFIX}"), key=_age) if self.folder is not None else []
         return f"; the youngest in {self.folder} is {found[-1]}" if found else ""
 
@@ -82,7 +82,7 @@ def file_beside(folder: Path) -> Path:
 
 
 def _taken(file: Path) -> bool:
-    """Whether there is a map, or what SQLite kept beside one that was moved and needs it."""
+    """Whether there is a map, or the write-ahead log that a moved map left behind and needs."""
     return file.exists() or left_log(file) is not None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A subscription that suits its publishers."""
+"""A subscription whose QoS and message type match its publishers."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from dpm2_ros.message_types import message_type
 from dpm2_ros.settings import RosSettings
 
 _IMAGES = (Image, CompressedImage)
-_IMU_DEPTH = 1000  # samples that may wait: those of a second
+_IMU_DEPTH = 1000  # samples that may wait: those of one second
 
 
 class MatchedSubscription:
-    """A subscription with the reliability that the publishers offer, and of CameraInfo with their durability.
+    """A subscription with the reliability that the publishers offer and, for CameraInfo, with their durability.
 
     A reliable subscriber never connects to a best-effort publisher, and a best-effort one loses data that a reliable
     publisher would have sent again. So it starts reliable, and `refresh`, called often, follows the publishers. It also
-    follows them from Image to CompressedImage and back, and from PointCloud2 to a Livox' CustomMsg, whose messages come
-    serialized.
+    changes the type with them: from Image to CompressedImage and back, and from PointCloud2 to Livox CustomMsg, whose
+    messages are passed on serialized.
 
     Attributes:
         topic: its full name, after remapping.
-        problem: why nothing comes although there is a publisher; else empty.
+        problem: why nothing is received although there is a publisher; else empty.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
@@ -43,11 +43,11 @@ class MatchedSubscription:
         self.refresh()
 
     def take(self) -> None:
-        """Call back, in the executor's thread, with all that has arrived."""
+        """Call the callback, in the executor's thread, with all messages that have arrived."""
         take_waiting(self._subscription)
 
     def refresh(self) -> None:
-        """Follow the publishers of this moment."""
+        """Adapt the subscription to the present publishers."""
         requested, offered = self._suits[0], self._node.get_publishers_info_by_topic(self.topic)
         best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
         if self._setting != "auto":
@@ -56,7 +56,7 @@ class MatchedSubscription:
             requested = ReliabilityPolicy.BEST_EFFORT if any(best_effort) else ReliabilityPolicy.RELIABLE
         latched = DurabilityPolicy.TRANSIENT_LOCAL
         keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
-        durability = latched if keeps else DurabilityPolicy.VOLATILE  # one that has been sent once, long ago
+        durability = latched if keeps else DurabilityPolicy.VOLATILE  # for one sent only once, long ago
         self.problem = ""
         kind = self._kind_of({info.topic_type for info in offered})
         if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
@@ -66,7 +66,7 @@ class MatchedSubscription:
             return
         before, other_type = self._subscription, kind is not now[2]
         raw = self._wanted is PointCloud2 and kind is not PointCloud2
-        if before is not None and other_type:  # DDS allows one type a topic
+        if before is not None and other_type:  # DDS allows one type per topic
             self._node.destroy_subscription(before)
         keep = HistoryPolicy.KEEP_LAST
         qos = QoSProfile(depth=self._depth, history=keep, reliability=requested, durability=durability)

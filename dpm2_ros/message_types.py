@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message classes by the names that others give: of ROS' own packages and Livox' only, since a name is imported."""
+"""Message classes by names from recordings and publishers. Only packages of ROS and Livox, since names are imported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NAME = re.compile(r"(\w+)/(?:msg/)?([A-Z]\w*)")
 
 
 def message_type(kind: str) -> Any | None:
-    """The class of a type such as sensor_msgs/msg/PointCloud2; None if it is not in `PACKAGES`, or not here."""
+    """The class of a type such as sensor_msgs/msg/PointCloud2; None if it is not in `PACKAGES`, or not installed."""
     name = _NAME.fullmatch(kind)
     if name is None or name[1] not in PACKAGES:
         return None

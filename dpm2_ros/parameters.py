@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every configuration value as a ROS parameter of the same name; `python -m dpm2_ros.parameters` writes their page.
 
-Order of precedence: defaults, the YAML file named by `config_file`, parameters. They are read once, at the start, but
-for those that may change while a node runs.
+Later sources override earlier ones: defaults, the YAML file named by `config_file`, parameters. They are read once, at
+the start, except those that may change while a node runs.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def load_parameters(node: Node) -> NodeConfig:
     """The node's configuration; afterwards every value is declared, described and read-only.
 
     Args:
-        node: made with automatically_declare_parameters_from_overrides=True, so that what was given can be seen,
-            misspelt names included.
+        node: created with automatically_declare_parameters_from_overrides=True, so that all given parameters are
+            visible, misspelt names included.
 
     Raises:
         UsageError: an unknown parameter or a value that is not allowed.
@@ -56,7 +56,7 @@ def load_parameters(node: Node) -> NodeConfig:
     declared = {
         name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items() if name not in _OF_RCLPY
     }
-    # `ros2 param dump` writes null for what is not set, which rcl reads as a text.
+    # `ros2 param dump` writes null for unset values, which rcl reads as a text.
     unset = {name for name, info in fields.items() if info.default is None}
     given = {n: value for n, value in declared.items() if value is not None and not (value == "null" and n in unset)}
     file = given.pop(CONFIG_FILE, "")
@@ -67,8 +67,8 @@ def load_parameters(node: Node) -> NodeConfig:
     if unknown := sorted(set(given) - set(fields)):
         raise UsageError(f"unknown parameter {', '.join(unknown)}; docs/parameters.md lists them")
     path = Path(os.path.expanduser(file)) if file else None
-    load_settings(NodeConfig, path)  # its mistakes are its own
-    # Only what is given: a preset may change the rest.
+    load_settings(NodeConfig, path)  # checked alone, to report its errors as those of the file
+    # Only the given values: a preset may change the rest.
     tree = _with({} if path is None else read_settings(NodeConfig, path), given)
     config = settings_from(NodeConfig, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
@@ -85,12 +85,13 @@ def load_parameters(node: Node) -> NodeConfig:
 def _check_topic(node: Node, name: str, topic: str) -> None:
     try:
         node.resolve_topic_name(topic)
-    except Exception as error:  # RCLError, whose text ends with a place in the source of ROS
+    except Exception as error:  # RCLError, whose text ends with a line of ROS' source code
         raise UsageError(f"{name}: {str(error).partition(', at /')[0]}, got {topic!r}") from None
 
 
 def follow_changes(node: Node, config: NodeConfig, apply: Callable[[NodeConfig], None]) -> None:
-    """Hand new settings on whenever one of `CHANGEABLE` is set; a value that is not allowed is refused, with why."""
+    """Call `apply` with the new settings whenever one of `CHANGEABLE` is set. An invalid value is rejected, with the
+    reason."""
     from rcl_interfaces.msg import SetParametersResult
 
     current = config
@@ -111,7 +112,7 @@ def follow_changes(node: Node, config: NodeConfig, apply: Callable[[NodeConfig],
 
 
 def _with(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The same tree, with parameters put in; those that are lists come as arrays."""
+    """The same tree, with the given parameters set; lists arrive as arrays."""
     for name, value in given.items():
         put(NodeConfig, tree, name.split("."), value.tolist() if hasattr(value, "tolist") else value)
     return tree
@@ -141,7 +142,7 @@ def _descriptor(description: str, value: Any, info: FieldInfo | None) -> Paramet
 
 
 def _plain(value: Any) -> Any:
-    """As ROS has it: no tuples, enumerations or paths."""
+    """A value of a type that ROS has: no tuples, enumerations or paths."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, (tuple, list)):
@@ -154,7 +155,7 @@ def _text(info: FieldInfo) -> str:
 
 
 def _limits(info: FieldInfo) -> list[Any]:
-    """annotated_types of the field, also where they sit inside `X | None` or an alias."""
+    """annotated_types of the field, also those inside `X | None` or an alias."""
     found = list(info.metadata)
     for part in typing.get_args(info.annotation):
         found += getattr(part, "__metadata__", ())

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording that was made while nodes of dpm2 ran has what they published, too. Where such nodes run again, both
-would come in turns: poses of then and of now on one topic, and on /tf two places for one frame."""
+"""Leaves out results of dpm2 in a recording. A recording made while nodes of dpm2 ran also contains their messages. If
+such nodes run again, both would be mixed: old and new poses on one topic, and two poses of one frame on /tf."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from dpm2_ros.tf_message import TFMessage
 
 
 def is_result(topic: str) -> bool:
-    """Whether it is a topic of dpm2's own."""
+    """Whether it is a topic that dpm2 publishes."""
     return "/dpm2/" in topic
 
 
 def published_here(node: Node, topics: Iterable[str]) -> list[str]:
-    """Those of the topics that nodes of dpm2 other than this one publish now."""
+    """Those of the topics that other nodes of dpm2 publish now."""
     own = node.get_name()
     return [
         topic
@@ -31,7 +31,7 @@ def published_here(node: Node, topics: Iterable[str]) -> list[str]:
 
 
 def odometry_frames(bag: Bag, topics: Iterable[str]) -> set[str]:
-    """The frames of the odometry of these topics: what the recording has on /tf from or to one of them is dpm2's."""
+    """The frames of the odometry on these topics: transforms from or to one of them on the recorded /tf are dpm2's."""
     first = [next(bag.decoded(topic), None) for topic in topics if topic.endswith(f"/{ODOMETRY}")]
     return {frame_name(message.header.frame_id) for message in first if message is not None}
 
@@ -40,7 +40,7 @@ def without_frames(data: bytes, frames: Collection[str]) -> bytes:
     """A serialized TFMessage without the transforms from or to these frames; empty if there is no other."""
     try:
         transforms = deserialize_message(data, TFMessage).transforms
-    except Exception:  # rclpy raises RMWError or RuntimeError; who listens says what is wrong with it
+    except Exception:  # rclpy raises RMWError or RuntimeError; subscribers report what is wrong
         return data
     kept = [t for t in transforms if not {frame_name(t.header.frame_id), frame_name(t.child_frame_id)} & {*frames}]
     return bytes(serialize_message(TFMessage(transforms=kept))) if kept else b""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a message of a cloud's size comes from one process to another: what `dpm2 doctor` asks of DDS.
+"""Tests whether DDS transfers a message of a cloud's size from one process to another, for `dpm2 doctor`.
 
 `python -m dpm2_ros.round_trip` prints {"rmw": its name, "ms": from sending to receiving} as JSON.
 """
@@ -22,14 +22,14 @@ from dpm2_ros.runtime import end_ros, ros_context
 
 SIZE = 2_000_000
 """Bytes: 120,000 points."""
-_PATIENCE = 10.0  # s for which messages are sent
+_PATIENCE = 10.0  # s during which messages are sent
 
 
 def receive(topic: str) -> dict[str, object]:
-    """Start a process that sends, and wait for one of its messages.
+    """Start a process that sends, and wait for its messages.
 
     Raises:
-        Dpm2Error: none came.
+        Dpm2Error: none arrived.
     """
     ros_context([])
     node = rclpy.create_node("dpm2_round_trip_receiver")
@@ -54,7 +54,7 @@ def receive(topic: str) -> dict[str, object]:
 
 
 def send(topic: str) -> None:
-    """Five messages a second, until the process is ended, or for as long as one waits for them."""
+    """Send five messages per second, until the process is ended, but at most for `_PATIENCE`."""
     ros_context([])
     node = rclpy.create_node("dpm2_round_trip_sender")
     publisher = node.create_publisher(UInt8MultiArray, topic, qos_profile_sensor_data)
@@ -66,7 +66,7 @@ def send(topic: str) -> None:
 
 
 def main() -> int:
-    """With a topic as argument, the sender."""
+    """Run the receiver or, with a topic as argument, the sender."""
     if len(sys.argv) > 1:
         return exit_code(lambda: send(sys.argv[1]))
     return exit_code(lambda: print(json.dumps(receive(f"/dpm2_round_trip_{os.getpid()}"))))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The life of a process: signals, spinning, which thread comes first. One or several SIGINT or SIGTERM end it cleanly,
-and so does a terminal that is closed.
+"""The life of a process: signals, spinning, priorities of threads. One or several SIGINT or SIGTERM end it cleanly, and
+so does a closed terminal.
 
-rclpy's own handlers give up at the second SIGINT, which `ros2 launch` sends, and with them a map that is being saved.
+With rclpy's own handlers, the second SIGINT, which `ros2 launch` sends, would end the process while it saves a map.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ from dpm2_ros.share import share_directory
 from dpm2_ros.shared_memory import free_shared_memory
 
 _SWITCH = 5e-4
-"""s until a thread must hand Python's lock on. The odometry asks for it tens of times per frame; with the usual 5 ms a
-network in the thread of the map keeps it waiting each time."""
-_SLICE = 0.05  # s after `Stop.set` within which who waits goes on
+"""s after which a thread must release Python's global lock. The odometry acquires it tens of times per frame; with the
+default of 5 ms, a network in the thread of the map delays the odometry each time."""
+_SLICE = 0.05  # s after `Stop.set` within which `Stop.wait` returns
 _PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
-_NICER = 10  # steps of niceness: a tenth of the fraction of the odometry where both want a processor
+_NICER = 10  # steps of niceness: a tenth of the odometry's share if both compete for a processor
 
 
 class Stop:
     """As `threading.Event`, for signal handlers.
 
-    An event's `set` waits for ever in a handler that interrupts its `wait` or `set`; and any lock, also that of a
-    queue, waits for its whole timeout when the signal comes right before it begins. Sleeping in slices has neither.
+    An event's `set` blocks for ever in a handler that interrupts its `wait` or `set`. And any lock, also that of a
+    queue, waits for its whole timeout if the signal arrives right before the wait begins. Sleeping in slices avoids
+    both.
     """
 
     def __init__(self) -> None:
@@ -50,11 +51,11 @@ class Stop:
         return self._is_set
 
     def set(self) -> None:
-        """From here on `is_set`, and no `wait` waits."""
+        """From now on `is_set` is true, and `wait` returns."""
         self._is_set = True
 
     def wait(self, timeout: float = math.inf) -> bool:
-        """Until `set`, or for `timeout` s.
+        """Wait until `set`, or for `timeout` s.
 
         Returns:
             Whether it is set.
@@ -70,22 +71,22 @@ STOP = Stop()
 
 
 def catch_signals() -> None:
-    """From here on SIGINT, SIGTERM and a terminal that is closed set `STOP` and nothing else."""
+    """From here on SIGINT, SIGTERM and a closed terminal set `STOP` and do nothing else."""
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: STOP.set())
     hang_up_as_terminated()
 
 
 def ignore_signals() -> None:
-    """From here on SIGINT and SIGTERM do nothing, for a process that ends: Python keeps this, and no other handler."""
+    """From here on SIGINT and SIGTERM do nothing, for a process that ends: Python then resets all other handlers."""
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, signal.SIG_IGN)
 
 
 def use_dds_profile() -> None:
-    """From here on Fast DDS has the shared memory that clouds need, unless the user has configured it.
+    """From here on Fast DDS uses the shared memory that clouds need, unless the user has configured it.
 
-    It reads the variable when the process makes its first participant; that of Jazzy has only the older name.
+    It reads the variable when the process creates its first participant; that of Jazzy reads only the older name.
     """
     configured = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") or Path("DEFAULT_FASTRTPS_PROFILES.xml").is_file()
     if os.environ.get(_PROFILE) or (configured and not os.environ.get(_NEW_NAME)):
@@ -97,13 +98,13 @@ def use_dds_profile() -> None:
 
 
 def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
-    """rclpy.init with the DDS profile and without its signal handlers, and without what killed processes have left.
+    """Call rclpy.init, with the DDS profile and without its signal handlers; free the memory of killed processes.
 
     Args:
         domain: None takes that of the environment.
 
     Raises:
-        UsageError: `--ros-args` that ROS does not understand, or it cannot start, as without a folder for its logs.
+        UsageError: `--ros-args` is invalid, or ROS cannot start, as without a folder for its logs.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -120,11 +121,11 @@ def ros_context(arguments: Sequence[str], domain: int | None = None) -> None:
 
 
 def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -> int:
-    """Make a node, spin it until a signal comes, close it; nothing of that if one came before.
+    """Create a node, spin it until a signal arrives, close it; nothing of that if a signal arrived before.
 
     Args:
-        load: imports the node, which takes seconds: wrong arguments are answered before. What it returns makes a
-            `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
+        load: imports the node, which takes seconds: invalid arguments are reported before. The function that it returns
+            creates a `GuardedNode` with `close()`, which saves what must be saved and may raise Dpm2Error.
         arguments: those of the process, without its name.
     """
     if STOP.is_set():
@@ -133,7 +134,7 @@ def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -
     nodes = list[Any]()
     try:
         make = load()
-        gc.freeze()  # each search for garbage through what was imported would take longer than a frame
+        gc.freeze()  # a garbage collection of all imported objects would take longer than a frame
         if not STOP.is_set():  # else no map is opened, no network loaded
             sys.setswitchinterval(_SWITCH)
             nodes.append(make())
@@ -144,7 +145,7 @@ def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -
 
 
 def _spin(node: Any) -> None:
-    """Until a signal comes; then close it."""
+    """Spin a node until a signal arrives, then close it."""
     from rclpy.executors import SingleThreadedExecutor
 
     executor = SingleThreadedExecutor()
@@ -155,7 +156,7 @@ def _spin(node: Any) -> None:
                 executor.spin_once(timeout_sec=0.1)
             except Exception as error:  # of a service, or of rclpy itself; callbacks are guarded
                 node.fail("executor", error)
-                STOP.wait(0.01)  # what fails each time leaves the rest some time
+                STOP.wait(0.01)  # if it fails each time, other threads can still work
     finally:
         try:
             node.close()
@@ -166,14 +167,14 @@ def _spin(node: Any) -> None:
 def end_ros(*nodes: Any, within: float = 20.0) -> None:
     """Destroy nodes and shut ROS down.
 
-    Before Fast DDS deletes a participant it waits until none of its listeners runs. Built for a glibc before 2.30, as
-    in the wheels, that wait (`DomainParticipantImpl::set_listener`) computes a time that has overflowed, spins, and
-    keeps the lock without which a listener cannot end: of 80 times that five nodes were stopped together one left a
-    process that never ended. Here the listeners come first, so that there is none to wait for.
+    Before Fast DDS deletes a participant, it waits until none of its listeners runs. Built for a glibc before 2.30, as
+    in the wheels, that wait (`DomainParticipantImpl::set_listener`) computes a time that overflows. It spins, and holds
+    the lock that a listener needs to end: when five nodes were stopped together 80 times, one process never ended. Here
+    the listeners have priority, so that there is none to wait for.
 
     Args:
-        within: s, after which the process ends with exit code 1 and says where it was. It takes 0.02 s, and 2 s on a
-            busy machine.
+        within: s after which the process ends with exit code 1 and prints where it was. Usually it takes 0.02 s, and
+            2 s on a busy machine.
     """
     import rclpy
 
@@ -192,7 +193,7 @@ def end_ros(*nodes: Any, within: float = 20.0) -> None:
 
 @contextmanager
 def _on_one_processor() -> Iterator[None]:
-    """All threads of this process: what wakes up there interrupts what has a lower priority."""
+    """Run all threads of this process on one processor: a thread that wakes up interrupts one of lower priority."""
     if sys.platform != "linux":
         yield
         return
@@ -212,7 +213,7 @@ def _allow(processors: set[int]) -> None:
 
 
 def lower_priority() -> None:
-    """Of this thread, and of those that it starts: a map may wait, the next scan may not."""
-    if sys.platform == "linux":  # elsewhere a thread has no number of its own for this
+    """Lower the priority of this thread and of those that it starts: the map may wait, the next scan may not."""
+    if sys.platform == "linux":  # elsewhere a single thread has no priority that can be set like this
         thread = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICER)

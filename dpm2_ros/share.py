@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the installed files are: DDS profile, RViz layout, launch file."""
+"""The folder of the installed files: DDS profile, RViz layout, launch file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def share_directory() -> Path:
     """Folder with config/ and launch/: the source tree of an editable or symlinked install, else share/dpm2_ros.
 
     Raises:
-        Dpm2Error: neither is there.
+        Dpm2Error: neither exists.
     """
     candidates = [Path(__file__).resolve().parents[1]]
     # colcon: PREFIX/lib/pythonX.Y/site-packages/dpm2_ros/share.py, and so with pip; --user and --target differ.

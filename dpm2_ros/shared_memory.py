@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared memory that killed processes have left: Fast DDS frees its own at the end, but not that of others.
+"""Frees shared memory of killed processes: Fast DDS frees its own at the end, but not that of other processes.
 
-With our profile each is 35 MB. A robot whose node is killed and started again, over and over, would fill its memory.
+With dpm2's profile each segment has 35 MB. On a robot whose node is killed and restarted again and again, they would
+fill the memory.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ _YOUNG = 60.0  # s; Fast DDS makes a lock file first, and locks it then
 
 
 def free_shared_memory(folder: Path = Path("/dev/shm")) -> None:
-    """Remove the segments of Fast DDS whose process is gone, as `fastdds shm clean` does.
+    """Remove the segments of Fast DDS whose process has ended, as `fastdds shm clean` does.
 
-    A process holds the lock on the file `NAME_el` beside its segment as long as it lives. What may not be opened,
-    such as files of other users, stays.
+    A running process holds the lock on the file `NAME_el` next to its segment. Files that cannot be opened, such as
+    those of other users, are not removed.
     """
     for lock in folder.glob("fastrtps_*_el"):
         segment = lock.with_name(lock.name.removesuffix("_el"))
@@ -33,4 +34,4 @@ def free_shared_memory(folder: Path = Path("/dev/shm")) -> None:
                 segment.unlink(missing_ok=True)
                 lock.unlink(missing_ok=True)
         except OSError:
-            continue  # held, or another's
+            continue  # locked, or of another user

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/tf, where its message is there."""
+"""Publishes on /tf, if its message type is available."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from dpm2_ros.conversions import transform_to_msg
 from dpm2_ros.guard import excerpt, take_waiting
 from dpm2_ros.tf_message import TFMessage
 
-_KNOWN = 500  # transforms of a frame that are kept: all that may come back before they are looked for
+_KNOWN = 500  # sent transforms kept per child: all that may be received again before they are compared
 _RECENT = 5.0  # s
 _Link = tuple[str, int, float, float, float]
-"""Parent, stamp (ns) and place of a transform: two nodes that follow the same clouds have the same stamps."""
+"""Parent, stamp (ns) and translation of a transform: two nodes that use the same clouds have the same stamps."""
 _REMEDY = "see ros.odom_source, or leave it to one of the two by ros.publish_tf_odom or ros.publish_tf_map"
 
 
 class TransformBroadcaster:
-    """Publishes one transform of /tf, of one child or several, and tells where another node places such a child, too.
+    """Publishes transforms of one parent on /tf, and detects another node that publishes a transform of such a child.
 
     Args:
         enabled: False publishes nothing.
@@ -36,33 +36,33 @@ class TransformBroadcaster:
     def __init__(self, node: Node, parent: str, enabled: bool, inverted: bool = False) -> None:
         self._node, self._parent, self._inverted = node, parent, inverted
         self._publisher = self._heard = None
-        self._sent: dict[str, dict[_Link, None]] = {}  # by child, of late
-        self._other: tuple[float, str] | None = None  # when another node was heard last, and what is wrong, in words
+        self._sent: dict[str, dict[_Link, None]] = {}  # recent ones, by child
+        self._other: tuple[float, str] | None = None  # when another node last sent one, and the problem in words
         if not enabled:
             return
         if TFMessage is None:
             node.get_logger().error("no /tf: tf2_msgs is missing; `python -m dpm2_ros.build_tf2_msgs` builds it")
             return
         self._publisher = node.create_publisher(TFMessage, TF, 100)
-        # Looked at now and then alone: there may be a thousand messages a second.
+        # Read only now and then: there may be a thousand messages per second.
         self._heard = node.create_subscription(TFMessage, TF, self._on_tf, 100, callback_group=_Unspun())
 
     def send(self, T_parent_child: Array, stamp: int, child: str) -> None:
-        """(4, 4) at a stamp in ns."""
+        """Publish a transform (4, 4) at a stamp in ns."""
         if self._publisher is None:
             return
         link = (T_parent_child, stamp, self._parent, child)
         if self._inverted:
             link = (se3.inverse(T_parent_child), stamp, child, self._parent)
         stamped = transform_to_msg(*link)
-        sent = self._sent.setdefault(stamped.child_frame_id, {})  # changed here, looked at in another thread
+        sent = self._sent.setdefault(stamped.child_frame_id, {})  # changed here, read in another thread
         sent[_link(stamped)] = None
         if len(sent) > _KNOWN:
             del sent[next(iter(sent))]
         self._publisher.publish(TFMessage(transforms=[stamped]))
 
     def problem(self) -> str:
-        """Which other node places a frame that this one places, in words; empty where none does. For the executor."""
+        """Which frame another node publishes, too, in words; empty if there is none. Only for the executor's thread."""
         if self._heard is not None:
             take_waiting(self._heard)
         if self._other is None or time.monotonic() - self._other[0] > _RECENT:
@@ -85,7 +85,7 @@ def _link(stamped: Any) -> _Link:
 
 
 class _Unspun(CallbackGroup):
-    """Of what no executor takes: its messages wait, the oldest give way."""
+    """Group of a subscription that no executor serves: its messages wait, and the oldest are dropped."""
 
     def can_execute(self, entity: Any) -> bool:
         """Never."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The message of /tf, where tf2_msgs is there: part of every ROS installation, built by `dpm2_ros.build_tf2_msgs` for
-ROS from pip. Apart: the player of bags needs nothing else of `dpm2_ros.tf`."""
+"""The message type of /tf, if tf2_msgs is available: it is part of every ROS installation, and
+`dpm2_ros.build_tf2_msgs` builds it for ROS from pip. In its own module: bag_player needs nothing else of `dpm2_ros.tf`.
+"""
 
 from __future__ import annotations
 
@@ -12,4 +13,4 @@ with suppress(ImportError):
     from tf2_msgs.msg import TFMessage as TFMessage  # type: ignore[no-redef]
 
 MOST_TRANSFORMS = 500
-"""In a message that is read."""
+"""Largest number of transforms in a message that is read."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes publish, subscribe to and serve, asked of the nodes themselves.
+"""The topics and services of the nodes, read from running nodes.
 
 `python -m dpm2_ros.topics` writes docs/topics.md.
 """
@@ -45,7 +45,7 @@ def endpoints(node: Any) -> Iterator[Endpoint]:
 
 
 def describe() -> dict[str, list[Endpoint]]:
-    """The endpoints of slam_node and mapper_node, made one after the other and closed; ROS must be initialized."""
+    """The endpoints of slam_node and mapper_node, which are created one after the other; ROS must be initialized."""
     from dpm2_ros.mapper_node import MapperNode
     from dpm2_ros.slam_node import SlamNode
 
@@ -54,7 +54,7 @@ def describe() -> dict[str, list[Endpoint]]:
     for name, make in makers.items():
         node = make()
         try:
-            found[name] = list(dict.fromkeys(endpoints(node)))  # two parts of a node may publish the same
+            found[name] = list(dict.fromkeys(endpoints(node)))  # two parts of a node may have the same publisher
         finally:
             node.close()
             node.destroy_node()

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process does only once (loading libraries, starting their threads, tuning kernels), before the first cloud."""
+"""Work that a process does only once (loading libraries, starting their threads, tuning kernels): done before the first
+cloud."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_ros.runtime import STOP
 
-_FRAMES = 3  # the first begins the map, the second finds the speed, the third is like all others
+_FRAMES = 3  # the first begins the map, the second measures the speed, the third is like all others
 _PERIOD = 100_000_000  # ns
 _SPEED = 1.0  # m per frame
 _SIZE = 640, 192  # pixels
@@ -21,23 +22,23 @@ _SIZE = 640, 192  # pixels
 
 @functools.cache
 def warm_up(settings: SlamSettings) -> None:
-    """Drive a short synthetic street with these settings, in a SLAM of its own that is then thrown away.
+    """Process a short synthetic street with these settings, in a temporary SLAM system.
 
     Raises:
-        UsageError: a network has no weights to run with.
+        UsageError: a network has no weights.
     """
     slam = make_slam(settings)
     for n in range(_FRAMES):
         if STOP.is_set():
             return
-        slam.odometry.request_keyframe()  # so that the network and the map work on each
+        slam.odometry.request_keyframe()  # so that the network and the map process each frame
         frame = Frame(n * _PERIOD, _street(n * _SPEED), images=_image() if slam.uses_images else (), index=n)
         slam.process(frame)
     slam.mapper.finish()
 
 
 def _street(x: float) -> Points:
-    """(N, 4) points, m, of ground and staggered house fronts, from x along it."""
+    """(N, 4) points, m, of the ground and staggered house fronts, seen from x along the street."""
     rng = np.random.default_rng(0)
     along, across = rng.uniform(-40, 40, (2, 8000))
     ground = np.column_stack([along, across / 4, np.full(8000, -1.7)])
@@ -50,7 +51,7 @@ def _street(x: float) -> Points:
 
 
 def _image() -> tuple[Image, ...]:
-    """Noise, from a camera that looks along the street."""
+    """An image of noise, from a camera that looks along the street."""
     width, height = _SIZE
     K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
     T_lidar_cam = se3.make(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.3, 0.0, -0.1])
