@@ -23,8 +23,9 @@ RECORDS = REPOSITORY / "benchmarks"
 COMMANDS: dict[str, Sequence[str]] = {
     "geometric": (), "neural": (), "hard": (), "paper": (), "gaps": (),
     "covariance": ("--threads", "1"), "tilt": (), "sensor": (), "relocalise": ("--pairs", "200"),
-    "pose-graph": (), "map": (), "roads": (), "fleet": (), "indoor": (), "motion": (), "beside": (),
-    "imu": ("--threads", "1"), "finetune": (),
+    "pose-graph": (), "loop-cost": (), "diffslam": (), "map": (), "roads": (), "fleet": (), "indoor": (),
+    "motion": (), "beside": (), "imu": ("--threads", "1"),
+    "traffic": ("--threads", "1", "--repetitions", "3"), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, fast ones first."""
 TARGETS = {"livox": "bench-livox"}
