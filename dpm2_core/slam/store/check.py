@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is wrong with a map file; its good part as another one."""
+"""Checks a map file, and writes its good part to another one."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from dpm2_core.slam.store.salvage import Findings, Salvage
 def check_map(
     path: Path, recover: Path | None = None, complete: Callable[[MapData], MapData] = lambda data: data
 ) -> Findings:
-    """Check a map file without changing it; write the good part of it to a new file if wanted.
+    """Check a map file without changing it; optionally write its good part to a new file.
 
     Args:
-        complete: is given that part, and gives it back with what can be made anew of what was lost.
+        complete: receives the good part, and returns it with recomputed replacements of lost data.
 
     Raises:
-        UsageError: no map at all, or one of another version; `recover` is no new file. Dpm2Error: nothing can be read,
+        UsageError: not a map, or one of another version; `recover` is not a new file. Dpm2Error: nothing can be read,
             `recover` cannot be written, or there is no room for a copy in the folder for temporary files.
     """
     if not path.is_file():
@@ -52,10 +52,10 @@ def check_map(
 
 
 def _copy(path: Path, copy: Path) -> None:
-    """Copy a map with its FILE-wal; while a program writes to it, what is in it at one instant."""
+    """Copy a map with its FILE-wal; while a program writes to it, its state at one instant."""
     source = path.resolve()
     if Path(f"{source}-shm").exists() and not foreign_log(source):
-        # A damaged file, which SQLite cannot read, is copied as it lies there.
+        # A damaged file that SQLite cannot read is copied byte by byte.
         with suppress(sqlite3.Error), closing(connect(source, "ro")) as sql, closing(sqlite3.connect(copy)) as target:
             sql.execute("BEGIN")
             sql.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
@@ -67,7 +67,7 @@ def _copy(path: Path, copy: Path) -> None:
 
 
 def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
-    """The copy of the map as a database; with a new first page where the old one makes no sense."""
+    """The copy of the map as a database; with a new first page if the old one is invalid."""
     try:
         sql: sqlite3.Connection = connect(copy, "rw")
         schema.check(sql, path)
@@ -81,7 +81,7 @@ def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
 
 
 def _with_new_header(copy: Path) -> sqlite3.Connection:
-    """The first page holds the schema, which is the same in all maps: that of an empty one serves."""
+    """Replace the first page, which has the schema and is the same in all maps, by that of an empty map."""
     empty = copy.with_name("empty")
     with closing(connect(empty, "rwc")) as sql:
         schema.create(sql)

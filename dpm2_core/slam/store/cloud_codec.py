@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud in few bytes: centimeters and 8-bit intensities, differences from point to point, deflated.
+"""Compact cloud format: centimeters and 8-bit intensities, differences between consecutive points, deflated.
 
 A keyframe cloud of 18 thousand points takes 64 kB instead of 280: 3.6 bytes per point. Points keep their order, in
-which neighbors of a LiDAR's beam follow each other; that is what makes the differences small.
+which neighbors in a LiDAR's beam follow each other, so that the differences are small.
 
-Where the LiDAR was goes with its cloud, unless that is the origin of the cloud's frame: rays are cast from there.
+The position of the LiDAR is stored with its cloud, unless it is the origin of the cloud's frame: rays start there.
 
-What is unpacked comes from a file or over a network: its size is bounded before it is inflated.
+Packed clouds come from a file or over a network: their size is limited before they are inflated.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Points
 
 QUANTUM = 0.01
-"""Step of the coordinates, m: half the noise of a good LiDAR, so that the rounding (sigma 3 mm) is lost in it."""
+"""Step of the coordinates, m: half the noise of a good LiDAR, so that rounding (sigma 3 mm) is insignificant."""
 COARSEST = 1.0
-"""Largest step, m: what reaches beyond 32 km is no LiDAR's cloud."""
+"""Largest step, m: no LiDAR's cloud reaches beyond 32 km."""
 _FINEST = 1e-4
 MAX_POINTS = 1 << 21
-"""Of one cloud: eight sensors with 128 beams of 2,048 points together."""
+"""Maximum per cloud: eight sensors with 128 beams of 2,048 points together."""
 _HEADER = struct.Struct("<If")  # points, quantum
-_ORIGIN, _ELSEWHERE = struct.Struct("<3f"), 1 << 31  # behind the header, where this bit of the points says so
+_ORIGIN, _ELSEWHERE = struct.Struct("<3f"), 1 << 31  # after the header if this bit of the number of points is set
 _BYTES = 7  # of a point, inflated
 _LARGEST = 32767
 
 
 class CodecError(UsageError, ValueError):
-    """Bytes that are not what they should be, or a cloud that cannot be packed; one line."""
+    """Invalid bytes, or a cloud that cannot be packed; the text is one line."""
 
 
 def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
-    """(M, 4) [x, y, z in m, intensity 0..1] as bytes; what reaches beyond 327 m is rounded more coarsely.
+    """(M, 4) [x, y, z in m, intensity 0..1] as bytes; a cloud beyond 327 m is rounded more coarsely.
 
     Args:
-        origin: (3,) m, where in the same frame the LiDAR was; None: at its origin.
+        origin: (3,) m, position of the LiDAR in the same frame; None: at its origin.
 
     Raises:
         CodecError: values that are not finite, points or LiDAR beyond 32 km, or more than `MAX_POINTS`.
@@ -56,7 +56,7 @@ def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
     if not np.abs(seen_from).max() <= _LARGEST:
         raise CodecError(f"a cloud seen from {seen_from} m: too far away")
     steps = np.rint(points[:, :3].astype(np.float64) / quantum).astype(np.int64)
-    # Differences wrap around at 16 bits, and unwrap when they are summed at 16 bits.
+    # Differences wrap around at 16 bits, and unwrap when they are summed with 16 bits.
     delta = np.diff(steps, axis=0, prepend=0).astype("<i2")
     planes = np.ascontiguousarray(delta.T).view(np.uint8).reshape(3, -1, 2).transpose(0, 2, 1)  # low bytes, high bytes
     intensity = np.rint(np.clip(points[:, 3], 0, 1) * 255).astype(np.uint8)
@@ -67,7 +67,7 @@ def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
 
 
 def unpack_cloud(data: bytes) -> Points:
-    """(M, 4) float32 of `pack_cloud`, finite, its own array.
+    """(M, 4) float32 of `pack_cloud`, finite, a new array.
 
     Raises:
         CodecError: the bytes are not a packed cloud.
@@ -87,7 +87,7 @@ def unpack_cloud(data: bytes) -> Points:
 
 
 def origin_of(data: bytes) -> Array:
-    """(3,) m, where the LiDAR of a packed cloud was, in the cloud's frame.
+    """(3,) m, position of the LiDAR of a packed cloud, in the cloud's frame.
 
     Raises:
         CodecError: the bytes are not a packed cloud.
@@ -96,7 +96,7 @@ def origin_of(data: bytes) -> Array:
 
 
 def _parts(data: bytes) -> tuple[int, float, Array, bytes]:
-    """How many points, their quantum, where the LiDAR was, and what is to be inflated."""
+    """Number of points, quantum, position of the LiDAR, and the deflated bytes."""
     if len(data) < _HEADER.size:
         raise CodecError(f"not a packed cloud: {len(data)} bytes")
     count, quantum = _HEADER.unpack_from(data)
@@ -120,14 +120,14 @@ def unpack_mask(data: bytes, count: int) -> NDArray[np.bool_]:
     """(count,) booleans of `pack_mask`.
 
     Raises:
-        CodecError: the bytes are not a mask of so many.
+        CodecError: the bytes are not a mask of this size.
     """
     raw = _inflated(data, (count + 7) // 8, f"packed mask of {count} points")
     return np.unpackbits(np.frombuffer(raw, np.uint8))[:count].astype(bool)
 
 
 def _inflated(data: bytes, size: int, what: str) -> bytes:
-    """Exactly `size` bytes, and never more than one beyond them in memory."""
+    """Exactly `size` bytes; at most one more is ever in memory."""
     inflater = zlib.decompressobj()
     try:
         raw = inflater.decompress(data, size + 1)

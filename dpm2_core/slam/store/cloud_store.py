@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframe clouds on disk: the memory of a drive does not grow with its clouds."""
+"""Keyframe clouds on disk, so that the memory of a drive does not grow with its clouds."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ Reader = Callable[[int], bytes | None]
 
 @dataclass(frozen=True, eq=False)
 class Loan:
-    """Whose cloud a redundant keyframe shows: that of `lender`, where it came back to, moved by T_kf_lender (4, 4)."""
+    """Loan of a redundant keyframe: it shows the cloud of `lender`, the revisited one, moved by T_kf_lender (4, 4)."""
 
     lender: int
     T_kf_lender: Array
 
 
 class SpillFile:
-    """Append-only pieces of bytes in an anonymous file, gone when the process is.
+    """Append-only pieces of bytes in an anonymous file, which is removed when the process ends.
 
-    A disk that is full or not there is no reason to lose a map: the pieces then stay in memory.
+    If the disk is full or missing, the pieces stay in memory, so that no map is lost.
     """
 
     def __init__(self) -> None:
         self._where: list[tuple[int, int] | bytes] = []  # offset and length, or the bytes themselves
         self._end = 0
-        self._file: BinaryIO | None = None  # none before there is a piece
+        self._file: BinaryIO | None = None  # None before the first piece
 
     def append(self, data: bytes) -> int:
-        """Keep a piece; returns its number."""
+        """Store a piece; returns its number."""
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="dpm2_", buffering=0)  # noqa: SIM115
@@ -65,11 +65,11 @@ class SpillFile:
 
 
 class CloudStore(LazySequence[Points]):
-    """The packed clouds of keyframes 0, 1, ...: in the map file where it holds them, else in a temporary one.
+    """The packed clouds of keyframes 0, 1, ...: in the map file if it has them, else in a temporary file.
 
-    An item is the (M, 4) float32 cloud without the points that were found to move; `whole` has them too. A keyframe
-    that a revisit made redundant borrows that of the keyframe it came back to. Its own tells how the place looks now,
-    which is what robots plan by: it is kept until the next one borrows there.
+    An item is the (M, 4) float32 cloud without moving points; `whole` includes them. A keyframe that is redundant, as a
+    revisit, borrows the cloud of the older keyframe. Its own cloud shows how the place looks now, which navigation
+    needs: it is kept until the next keyframe borrows there.
 
     Attributes:
         name: of the map, for errors.
@@ -86,7 +86,7 @@ class CloudStore(LazySequence[Points]):
 
         Args:
             stored: reads a packed cloud from the file.
-            moving: packed mask, or None, of each that is in the file.
+            moving: packed mask, or None, of each keyframe in the file.
             loans: of those among them that borrow.
             name: of the map, for errors.
         """
@@ -99,17 +99,18 @@ class CloudStore(LazySequence[Points]):
         self._newest = {loan.lender: index for index, loan in sorted(self._loans.items())}  # borrower of each lender
 
     def append(self, packed: bytes) -> None:
-        """The cloud of the next keyframe: in memory until the map file has it, or else the next one comes."""
+        """Add the cloud of the next keyframe: in memory until the map file has it, or until the next one is added."""
         if self._where and isinstance(last := self._where[-1], bytes):
             self._where[-1] = self._spill.append(last)
         self._where.append(packed)
 
     def set_stored(self, index: int) -> None:
-        """The map file has it now."""
+        """The map file has this cloud now."""
         self._where[index] = None
 
     def borrow(self, index: int, loan: Loan) -> int | None:
-        """Let a keyframe borrow the cloud of an older one, which does not; returns whose own cloud is gone."""
+        """Let a keyframe borrow the cloud of an older one that has its own; returns the keyframe whose cloud is
+        dropped."""
         before = self._newest.get(loan.lender)
         self._loans[index] = loan
         if before is None:
@@ -125,19 +126,20 @@ class CloudStore(LazySequence[Points]):
         return index not in self._loans and index not in self._newest
 
     def loan(self, index: int) -> Loan | None:
-        """Whose cloud it shows, where that is not its own."""
+        """The keyframe's loan; None if it shows its own cloud."""
         return self._loans.get(index)
 
     @property
     def own(self) -> NDArray[np.bool_]:
-        """(N,) which keyframes do not borrow."""
+        """(N,) mask of keyframes that do not borrow."""
         own = np.ones(len(self), np.bool_)
         own[list(self._loans)] = False
         return own
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(N,) which keyframes have their own clouds: those that do not borrow, and the newest that do."""
+        """(N,) mask of keyframes with their own clouds: those that do not borrow, and the newest borrower of each
+        lender."""
         kept = self.own
         kept[list(self._newest.values())] = True
         return kept
@@ -148,15 +150,15 @@ class CloudStore(LazySequence[Points]):
         return loan is None or self._newest[loan.lender] == index
 
     def set_moving(self, index: int, moving: NDArray[np.bool_]) -> None:
-        """Leave those points (M,) of a cloud out from now on."""
+        """Leave out those points (M,) of a cloud from now on."""
         self._moving[index] = pack_mask(moving)
 
     def moving(self, index: int) -> bytes | None:
-        """The packed mask of points that move; None: none is known."""
+        """The packed mask of moving points; None if none are known."""
         return self._moving.get(index)
 
     def packed(self, index: int) -> bytes | None:
-        """The bytes of a keyframe's own cloud; None where it is given up."""
+        """The bytes of a keyframe's own cloud; None if it was given up."""
         where = self._where[index]
         if not self.keeps(index):
             return None
@@ -165,7 +167,7 @@ class CloudStore(LazySequence[Points]):
         return where if where is not None or self._stored is None else self._stored(index)
 
     def whole(self, index: int) -> Points:
-        """A keyframe's own cloud (M, 4) with all its points; without any where it is given up.
+        """A keyframe's own cloud (M, 4) with all its points; empty if it was given up.
 
         Raises:
             Dpm2Error: it is damaged.
@@ -175,7 +177,7 @@ class CloudStore(LazySequence[Points]):
             return NO_POINTS if data is None else unpack_cloud(data)
 
     def seen(self, index: int) -> Points:
-        """What a keyframe saw itself: (M, 4) without the points that move; none where its cloud is given up.
+        """A keyframe's own cloud (M, 4) without moving points; empty if it was given up.
 
         Raises:
             Dpm2Error: it is damaged.
@@ -185,7 +187,7 @@ class CloudStore(LazySequence[Points]):
             return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]
 
     def seen_from(self, index: int) -> Array:
-        """(3,) m, where the LiDAR was then, in the keyframe's frame.
+        """(3,) m, position of the LiDAR for the keyframe's own cloud, in the keyframe's frame.
 
         Raises:
             Dpm2Error: it is damaged.
@@ -195,7 +197,7 @@ class CloudStore(LazySequence[Points]):
             return np.zeros(3) if data is None else origin_of(data)
 
     def origin(self, index: int) -> Array:
-        """(3,) m, where the LiDAR was that saw an item, in the keyframe's frame.
+        """(3,) m, position of the LiDAR for an item, in the keyframe's frame.
 
         Raises:
             Dpm2Error: it is damaged.
@@ -215,7 +217,7 @@ class CloudStore(LazySequence[Points]):
         return len(self._where)
 
     def item(self, index: int) -> Points:
-        """(M, 4) without the points that move.
+        """(M, 4) without moving points.
 
         Raises:
             Dpm2Error: it is damaged.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sequence whose items are made when they are asked for."""
+"""A sequence whose items are computed when they are accessed."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 class LazySequence(Sequence[T_co]):
-    """Of `__len__` and `item`: positions from the end, and slices, which are lists."""
+    """Sequence based on `__len__` and `item`; supports negative indices, and slices, which are lists."""
 
     @abstractmethod
     def item(self, index: int) -> T_co:
-        """The item at a position, 0 <= index < len."""
+        """The item at an index, 0 <= index < len."""
 
     @overload
     def __getitem__(self, index: int) -> T_co: ...

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All clouds of a map as one, in memory no more than that one takes."""
+"""All clouds of a map as one, with no more memory than this one takes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _TOGETHER = 50  # clouds between two pauses
 
 
 def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[int] | None = None) -> Points:
-    """The cloud (M, 4) float32 of a map in its frame, one point in each voxel of `voxel` m.
+    """The cloud (M, 4) float32 of a map in its frame, one point per voxel of `voxel` m.
 
-    `nodes`: those whose clouds are in it; None: all.
+    `nodes`: keyframes whose clouds are included; None: all.
     """
     steps = map_cloud_in_steps(clouds, poses, voxel, range(len(poses)) if nodes is None else nodes)
     while True:
@@ -31,7 +31,7 @@ def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[in
 def map_cloud_in_steps(
     clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[int]
 ) -> Generator[None, None, Points]:
-    """`map_cloud` with a pause after every 50 clouds, some 0.1 s of work: the clouds may be worked with in it."""
+    """`map_cloud` with a pause after every 50 clouds, about 0.1 s of work; other code may use the clouds in a pause."""
     cells, parts = VoxelCells(voxel), [NO_POINTS]
     for count, node in enumerate(nodes, 1):
         if clouds.loan(node) is None:

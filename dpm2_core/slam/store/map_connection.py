@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map file is opened: to write, to read as it lies there, or from a copy; what SQLite complains of, in words."""
+"""Opens a map file: for writing, for reading in place, or from a copy; errors of SQLite become one line of text."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, name_map, remove_map
 
 BUSY = 5.0
-"""s to wait for another program: a reader never blocks the writer for long, another writer is an error."""
+"""s to wait for another program: a reader never blocks the writer for long; another writer is an error."""
 _HEAD = b"SQLite format 3"
-_MAKING = Lock()  # `part_beside` is one file for the whole process
+_MAKING = Lock()  # `part_beside` returns one file for the whole process
 
 
 class MapConnection(NamedTuple):
-    """An open map file, and the folder of the copy that stands for it, if there is one: both are to be closed."""
+    """An open map file, and the folder of the copy that is used instead of it, if there is one: close both."""
 
     sql: sqlite3.Connection
     copy: tempfile.TemporaryDirectory[str] | None = None
@@ -36,20 +36,20 @@ class MapConnection(NamedTuple):
 
 
 def create_map(path: Path) -> MapConnection:
-    """Make a new, empty map file, and open it to write. A kill on the way leaves no file of that name.
+    """Make a new, empty map file, and open it for writing. After a kill half-way there is no file of that name.
 
     Raises:
         UsageError: see `check_new`. Dpm2Error: it cannot be made.
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        target = path.resolve()  # a symbolic link stays one
+        target = path.resolve()  # a symbolic link stays a link
         with _MAKING, named(path, target):
             _make(target)
         try:
             return open_map(path, read_only=False)
         except BaseException:
-            remove_map(path)  # as on a full disk: it would be in the way of the next one
+            remove_map(path)  # else it would block the next attempt, such as after a full disk
             raise
 
 
@@ -58,18 +58,18 @@ def _make(path: Path) -> None:
     try:
         part.touch()
         with closing(_connect(part, "rw")) as sql:
-            schema.create(sql)  # not in FILE-wal, the end of which a power cut may take
+            schema.create(sql)  # not in FILE-wal, whose end a power failure may take
         name_map(part, path)
     finally:
         remove_map(part)
 
 
 def open_map(path: Path, read_only: bool) -> MapConnection:
-    """Open a map file. Read-only, no byte of it changes.
+    """Open a map file. With `read_only` none of its bytes changes.
 
     Raises:
-        UsageError: no map, one of another version, or one with the log of another. Dpm2Error: it cannot be read, or
-            written, or is damaged.
+        UsageError: not a map, one of another version, or one with the log of another map. Dpm2Error: it cannot be read,
+            or written, or is damaged.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
@@ -95,17 +95,17 @@ def _connect(path: Path, mode: str) -> Connection:
 
 
 def _open_to_read(path: Path) -> MapConnection:
-    """As it lies there where it is whole; with FILE-wal as a reader of that; from a copy where not even that can be."""
+    """Open it in place if it is complete; with FILE-wal as a reader of both; else from a copy."""
     wal = Path(f"{path.resolve()}-wal")  # SQLite names it after the file, not after a link to it
     if not wal.exists() or not wal.stat().st_size:
-        if _head(path)[18] == 1:  # closed, with a journal on rollback: a reader leaves no trace
+        if _head(path)[18] == 1:  # closed, with a rollback journal: a reader leaves no files
             return MapConnection(_connect(path, "ro"))
         return MapConnection(_connect(path, "ro&immutable=1"))
     connection = _connect(path, "ro")
     try:
         connection.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
         return MapConnection(connection)
-    except sqlite3.OperationalError:  # a folder that cannot be written: SQLite needs FILE-shm to read FILE-wal
+    except sqlite3.OperationalError:  # a read-only folder: SQLite needs FILE-shm to read FILE-wal
         connection.close()
         folder = tempfile.TemporaryDirectory(prefix="dpm2_map_")
         copy = Path(folder.name) / "map"
@@ -114,17 +114,17 @@ def _open_to_read(path: Path) -> MapConnection:
 
 
 def _head(path: Path) -> bytes:
-    """The first 100 bytes, zeros where the file is shorter; see the SQLite file format."""
+    """The first 100 bytes, with zeros if the file is shorter; see the SQLite file format."""
     with path.open("rb") as file:
         return file.read(100).ljust(100, b"\0")
 
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """What SQLite and the system complain of, in one line that names the file.
+    """Turn errors of SQLite and the system into one line that names the file.
 
     Raises:
-        Dpm2Error: in the place of their errors.
+        Dpm2Error: instead of their errors.
     """
     try:
         yield

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole map in memory, but for its clouds, which stay in the file: what mapper and tools begin with."""
+"""A whole map in memory, except its clouds, which stay in the file; used by the mapper and the tools."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ Describe = Callable[[int], Descriptors | None]
 
 @dataclass(eq=False)
 class MapData:
-    """A map. A node is a position among the keyframes.
+    """A map. A node is an index into the keyframes.
 
     Attributes:
         keyframes: without clouds. poses: (N, 4, 4) optimized T_map_kf.
-        edges: odometry and loops, rejected ones too. trail: keyframes that were pruned. sessions: who wrote it.
-        clouds: of each keyframe, read from the file when asked for.
+        edges: odometry and loops, rejected ones too. trail: removed keyframes. sessions: the drives that wrote it.
+        clouds: of each keyframe, read from the file when needed.
         thumbnail: JPEG of a node, or None.
-        describe: descriptors of a node that are in the file, where `keyframes` were read without; or None.
-        georeference: where on Earth it is; None where no fixes have told.
+        describe: descriptors of a node from the file, if `keyframes` were read without them; or None.
+        georeference: pose of the map on Earth; None if no fixes have determined it.
     """
 
     keyframes: list[Keyframe]
@@ -67,15 +67,15 @@ class MapData:
 
     @property
     def constraints(self) -> list[Edge]:
-        """The edges that hold: odometry and accepted loops."""
+        """The valid edges: odometry and accepted loops."""
         return [edge for edge in self.edges if edge.ok]
 
 
 def load_map(store: MapStore, descriptors: bool = True) -> MapData:
-    """Read a map, which stays open for its clouds; `descriptors` False leaves those in the file, too.
+    """Read a map, which stays open for its clouds; with `descriptors` False those also stay in the file.
 
     Raises:
-        Dpm2Error: it is damaged; the message says where.
+        Dpm2Error: it is damaged; the message states where.
     """
     try:
         with store.snapshot():
@@ -125,7 +125,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
 
 
 def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], dict[int, Loan]]:
-    """Keyframes with their odometry's pose, and descriptors if wanted; those that borrow."""
+    """Keyframes with their odometry pose, and descriptors if requested; and the loans of those that borrow."""
     keyframes, loans = [], {}
     for position, (_, (node, keyframe, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
         if node != position:
@@ -133,7 +133,7 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
         keyframes.append(keyframe)
         if loan is not None:
             loans[node] = loan
-    for node, loan in loans.items():  # a lender has a cloud of its own: there are no chains, and so no circles
+    for node, loan in loans.items():  # a lender has its own cloud: there are no chains, and so no cycles
         if not 0 <= loan.lender < len(keyframes) or loan.lender in loans:
             raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}, which has none")
     if descriptors:
@@ -151,7 +151,7 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
 
 
 def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
-    """Number and noun of each row of a table; which row an error is about is added to it."""
+    """Number and object of each row of a table; errors name their row."""
     for row in store.rows(table):
         with _of("fix" if table == "fixes" else table.removesuffix("s"), row[0]):
             made = make(row)
@@ -167,13 +167,13 @@ def _of(what: str, number: int) -> Iterator[None]:
 
 
 def borrowing(keyframe: Keyframe, keyframes: Sequence[Keyframe], loan: Loan) -> Keyframe:
-    """The keyframe with the descriptors of another one, moved to its own frame; their features take no memory."""
+    """The keyframe with the descriptors of its lender, moved to its own frame; the features are shared in memory."""
     lent = keyframes[loan.lender].descriptors
     return replace(keyframe, descriptors=None if lent is None else lent.moved(loan.T_kf_lender))
 
 
 def save_as(data: MapData, path: Path) -> None:
-    """Write a map to a new file, which appears whole or not at all; clouds pass through one at a time.
+    """Write a map to a new file, which appears whole or not at all; only one cloud at a time is in memory.
 
     Raises:
         UsageError: see `check_new`. Dpm2Error: it could not be written.
@@ -183,16 +183,16 @@ def save_as(data: MapData, path: Path) -> None:
     try:
         with named(path, part), MapStore.create(part) as store:
             append_map(store, data)
-        name_map(part, path)  # another program may have made one meanwhile
+        name_map(part, path)  # fails if another program has made one meanwhile
     finally:
         remove_map(part)
 
 
 def append_map(store: MapStore, data: MapData) -> None:
-    """Write a map behind what is in the file; its nodes and sessions count on. Clouds pass through one at a time.
+    """Append a map to a file; its nodes and sessions are numbered after those of the file. Only one cloud at a time is
+    in memory.
 
-    An edge goes into the file with the later of its keyframes, as a drive writes it: of a file that was cut off, what
-    is left then hangs together.
+    An edge is written with the later of its keyframes, as in a drive: if writing is interrupted, the rest is connected.
 
     Raises:
         Dpm2Error: it could not be written.
@@ -219,7 +219,7 @@ def append_map(store: MapStore, data: MapData) -> None:
 
 
 def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:
-    """A map whose edges, trail and sessions count on after so many nodes, and the last session of another map."""
+    """A map with edges, trail and sessions renumbered, to follow this number of nodes and sessions of another map."""
     return replace(
         data,
         keyframes=[replace(keyframe, session=keyframe.session + sessions) for keyframe in data.keyframes],
@@ -230,9 +230,9 @@ def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:
 
 
 def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: Iterable[RemovedKeyframe]) -> MapData:
-    """The map of some of its nodes, lenders among them, with those of `edges` and `trail` that are between and at them.
+    """The map of some of its nodes, lenders among them, with those of `edges` and `trail` between and at them.
 
-    All is given in the numbers of `data`, and renumbered.
+    All arguments have the numbers of `data`; the result is renumbered.
     """
     where = list(nodes)
     new = {node: i for i, node in enumerate(where)}
@@ -254,7 +254,7 @@ def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: It
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Where a robot was in a session: stamps (K,) in ns and (K, 4, 4) T_map_kf."""
+    """Trajectory of a robot in a session: stamps (K,) in ns and (K, 4, 4) T_map_kf."""
 
     robot: str
     session: int
@@ -263,10 +263,10 @@ class Way:
 
 
 def ways(data: MapData) -> list[Way]:
-    """Each drive as it went, through keyframes that were pruned as well; of a robot and session in turn.
+    """The trajectory of each drive, including removed keyframes; one robot and session after the other.
 
-    A session has several where the odometry began anew, as after a recording that was played again; of keyframes that
-    were pruned that is not known. Ids tell the order, not stamps: a clock may be set back.
+    A session has several if the odometry restarted, as when a recording was played again; among removed keyframes this
+    is not known. Ids give the order, not stamps, since a clock may be set back.
     """
     led = odometry_by_node(data.edges)
     steps: list[tuple[str, int, int, int, int | None, Array]] = [
@@ -288,7 +288,7 @@ def ways(data: MapData) -> list[Way]:
 def trajectory(data: MapData) -> tuple[list[int], Array]:
     """Stamps (ns) and (K, 4, 4) T_map_kf of all `ways`, one after the other, the earliest first.
 
-    The frame with which a drive was cut off and went on, a keyframe of both sessions, is there once.
+    The frame where a drive was interrupted and continued is a keyframe of both sessions, but is included once.
     """
     stamps, poses, ends = list[int](), [data.poses[:0]], set[tuple[str, int]]()
     for way in sorted(ways(data), key=lambda way: way.stamps[0]):
@@ -300,10 +300,10 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
 
 
 def odometry_by_node(edges: Iterable[Edge]) -> dict[int, Edge]:
-    """The odometry by the node that it leads to: no node has two before it, or two after it."""
+    """The odometry edges by the node that they lead to: no node has two predecessors, or two successors."""
     chain: dict[int, Edge] = {}
     left: set[int] = set()
-    # Nearest nodes first: what pruning has left goes round about.
+    # Nearest nodes first: edges that pruning has composed may skip nodes.
     odometry = (edge for edge in edges if edge.ok and edge.kind == "odometry" and edge.from_node < edge.to_node)
     for edge in sorted(odometry, key=lambda edge: edge.to_node - edge.from_node):
         if edge.to_node not in chain and edge.from_node not in left:

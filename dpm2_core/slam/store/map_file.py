@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map file and what SQLite keeps beside it, FILE-wal foremost: they are copied, moved and removed together."""
+"""A map file and the files that SQLite keeps next to it, mainly FILE-wal: copied, moved and removed together."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import explaining
 
 SUFFIX = ".dpm2map"
-"""Of the name of a map file, unless another one is given."""
+"""Suffix of a map file's name, unless another one is given."""
 
 _CLOSED, _LOGGED = 1, 2  # see `_write_version`
 _WHAT_TO_DO = "move it to where that map is, or remove it"
 
 
 def copy_with_log(path: Path, copy: Path) -> None:
-    """Copy what of a map file and its FILE-wal is there, as it lies there.
+    """Copy a map file and its FILE-wal, as far as they exist, byte by byte.
 
     Raises:
         OSError: it could not be read or written.
@@ -31,10 +31,10 @@ def copy_with_log(path: Path, copy: Path) -> None:
 
 
 def missing_log(path: Path) -> str:
-    """Why the last keyframes of a map file may not be there, in words; empty where nothing says so.
+    """Why the last keyframes of a map file may be missing, in words; empty if there is no sign of it.
 
-    Who closes a map leaves one file, whose header says that there is no other. Where it says that there is, the writer
-    was killed, and FILE-wal is needed; a map that is moved or copied without it opens as if nothing were missing.
+    A closed map is one file, whose header states that there is no log. If the header states that there is one, the
+    writer was killed and FILE-wal is needed. A map moved or copied without it opens as if nothing were missing.
 
     Raises:
         OSError: it could not be read.
@@ -46,23 +46,23 @@ def missing_log(path: Path) -> str:
 
 
 def foreign_log(path: Path) -> str:
-    """Why FILE-wal is not that of the map file beside it, in words; empty where nothing says so.
+    """Why FILE-wal does not belong to the map file next to it, in words; empty if there is no sign of it.
 
-    A map that was closed has none. So it lies there where one replaced, as a copy from before, another whose writer was
-    killed; SQLite would read the one with the pages of the other.
+    A closed map has no FILE-wal. If there is one, the map has replaced another one whose writer was killed, such as by
+    a copy from a backup; SQLite would mix the pages of the two.
 
     Raises:
         OSError: it could not be read.
     """
     wal = Path(f"{path.resolve()}-wal")
     there = _holds(wal)
-    if there and _write_version(path) == _CLOSED and _holds(wal):  # asked again: a map may be closed meanwhile
+    if there and _write_version(path) == _CLOSED and _holds(wal):  # checked again: a map may be closed meanwhile
         return f"{wal} is not of this map, which was closed, but of one that was here before; {_WHAT_TO_DO}"
     return ""
 
 
 def _write_version(path: Path) -> int:
-    """Of the header of a database, whether it has a log: see the SQLite file format. 0 of a file that is too short."""
+    """Whether a database has a log, from its header: see the SQLite file format. 0 for a file that is too short."""
     with path.open("rb") as file:
         return int.from_bytes(file.read(19)[18:])
 
@@ -70,17 +70,17 @@ def _write_version(path: Path) -> int:
 def _holds(log: Path) -> bool:
     try:
         return log.stat().st_size > 0
-    except OSError:  # there is none, or its map cannot be reached either, which is said of that
+    except OSError:  # it does not exist, or the map cannot be accessed either, which is reported for the map
         return False
 
 
 def move_map(source: Path, target: Path) -> None:
-    """Give a map that was closed another name; the map that had it goes, with what SQLite keeps beside it. A symbolic
-    link stays one.
+    """Rename a closed map; an existing map of that name is replaced, with the files that SQLite keeps next to it. A
+    symbolic link stays a link.
 
     Raises:
-        Dpm2Error: not all of it is in that one file, since the disk was full, or it is not there; the map that was
-            there stays.
+        Dpm2Error: the map is not complete in one file, since the disk was full, or does not exist; the existing map is
+            kept.
     """
     _check_whole(source, target)
     with explaining(target):
@@ -89,10 +89,10 @@ def move_map(source: Path, target: Path) -> None:
 
 
 def name_map(source: Path, target: Path) -> None:
-    """Give a map that was closed a name that no file has; of two programs that want the same one, one gets it.
+    """Rename a closed map to a name that no file has; if two programs want the same name, only one gets it.
 
     Raises:
-        UsageError: there is a file already, or what SQLite kept beside one. Dpm2Error: as `move_map`.
+        UsageError: the file, or a log of SQLite for it, exists already. Dpm2Error: as `move_map`.
     """
     _check_whole(source, target)
     check_new(target)
@@ -101,30 +101,30 @@ def name_map(source: Path, target: Path) -> None:
         source.unlink()
     except FileExistsError:
         raise already_there(target) from None
-    except OSError:  # a file system without hard links, as of memory cards
+    except OSError:  # a file system without hard links, as on memory cards
         if target.exists():
             raise already_there(target) from None
         move_map(source, target)
 
 
 def check_new(path: Path) -> None:
-    """Raises UsageError if a map that is made there would not be new: there is a file already, or what SQLite kept
-    beside one, which it would take for the new one's."""
-    there, left = path.exists(), left_log(path)  # a path that may not be entered is an error of that name
-    if there or path.exists():  # asked again: of a map that another program makes now the file is there before its log
+    """Raises UsageError if a new map cannot be made there: there is a file already, or a log that SQLite kept next to
+    an old one and would use for the new one."""
+    there, left = path.exists(), left_log(path)  # an inaccessible path is reported as an error of that path
+    if there or path.exists():  # checked again: another program makes the file of a new map before its log
         raise already_there(path)
     if left is not None:
         raise UsageError(f"{left}: the last keyframes of a map that was moved or removed without them; {_WHAT_TO_DO}")
 
 
 def left_log(path: Path) -> Path | None:
-    """What SQLite kept beside a map file, if there is any of it."""
+    """A log that SQLite kept next to a map file, if there is one."""
     logs = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-journal"))
     return next(filter(_holds, logs), None)
 
 
 def already_there(path: Path) -> UsageError:
-    """What to raise where a map is to be made, and there is a file."""
+    """The error if a map is to be made where a file exists."""
     return UsageError(f"{path}: there is a file already")
 
 
@@ -135,14 +135,14 @@ def _check_whole(source: Path, target: Path) -> None:
 
 
 def remove_map(path: Path) -> None:
-    """Remove a map file, if it is there, with what SQLite keeps beside it. What cannot be removed stays: whoever asks
-    has the reason already, as that the file system can only be read."""
+    """Remove a map file, if it exists, with the files that SQLite keeps next to it. Errors are ignored: the caller has
+    the reason already, such as a read-only file system."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
         _remove_log(path)
 
 
 def _remove_log(path: Path) -> None:
-    """Remove what SQLite keeps beside a map file: another map of that name would be read with it, and be damaged."""
+    """Remove the files that SQLite keeps next to a map file: another map of that name would be damaged by them."""
     for suffix in ("-wal", "-shm", "-journal"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map as one file, written as the drive goes on: `kill -9` at any instant loses at most the keyframe in flight.
+"""The map as one file, written during the drive: `kill -9` at any time loses at most the keyframe in progress.
 
-SQLite in WAL mode: one transaction per keyframe; other processes read while one writes. A map that was closed is that
-one file; beside one whose writer was killed, or is alive, FILE-wal belongs to it. `synchronous=NORMAL`: a power cut may
-take the last seconds with it, but never the map.
+SQLite in WAL mode: one transaction per keyframe; other processes can read during a write. A closed map is a single
+file; if its writer was killed or is still running, there is also FILE-wal, which belongs to it. `synchronous=NORMAL`: a
+power failure may lose the last seconds, but never the map.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from dpm2_core.slam.store.rows import (
 
 @dataclass
 class Change:
-    """What goes into the file together, or not at all.
+    """Data that is written in one transaction.
 
     Attributes:
-        keyframes: node, keyframe (its cloud is not looked at), packed cloud or None, JPEG or None.
+        keyframes: node, keyframe (its cloud is not used), packed cloud or None, JPEG or None.
         edges: in the order of the map; appended to those of the file.
-        poses: T_map_kf (4, 4) by node. moving: packed mask by node. trail: what was pruned.
-        georeference: as it is from now on; None: as it was.
-        judged: edges of the file by their number, as they are from now on.
+        poses: T_map_kf (4, 4) by node. moving: packed mask by node. trail: removed keyframes.
+        georeference: the new one; None: unchanged.
+        judged: edges of the file by their number, with their new state.
         loans: of the keyframes that borrow. given_up: nodes whose own clouds are no longer needed.
     """
 
@@ -64,7 +64,7 @@ class Change:
 
 
 class MapStore:
-    """An open map file. Not for two threads at once."""
+    """An open map file. Use it in one thread at a time."""
 
     def __init__(self, path: Path, connection: MapConnection, read_only: bool) -> None:
         """Use `create` and `open`."""
@@ -79,16 +79,16 @@ class MapStore:
 
     @classmethod
     def create(cls, path: Path) -> MapStore:
-        """A new, empty map; `begin_session` comes next. Raises as `create_map` does."""
+        """Make a new, empty map; call `begin_session` next. Raises as `create_map`."""
         return cls(path, create_map(path), read_only=False)
 
     @classmethod
     def open(cls, path: Path, read_only: bool = True) -> MapStore:
-        """A map that is there; see `open_map`, also for what it raises."""
+        """Open an existing map; see `open_map`, also for its errors."""
         return cls(path, open_map(path, read_only), read_only)
 
     def begin_session(self, config: str = "", weights: str = "") -> int:
-        """Note that this program writes from now on; returns the number of the session, from 1.
+        """Record that this program writes from now on; returns the number of the session, from 1.
 
         Raises:
             Dpm2Error: it could not be written.
@@ -101,14 +101,14 @@ class MapStore:
         return self.session
 
     def add_sessions(self, sessions: Iterable[Session]) -> None:
-        """Take over those of other maps."""
+        """Add the sessions of other maps."""
         with self._transaction() as sql:
             rows = [(s.number, s.program, s.started, s.config, s.weights) for s in sessions]
             sql.executemany("INSERT INTO sessions VALUES (?,?,?,?,?)", rows)
         self._newest = max([self._newest, *(row[0] for row in rows)])
 
     def write(self, change: Change) -> None:
-        """Take a change in, whole or not at all.
+        """Write a change, whole or not at all.
 
         Raises:
             Dpm2Error: it could not be written: a full disk, a read-only file, another writer.
@@ -136,19 +136,19 @@ class MapStore:
                 _insert(sql, "georeference", [georeference_row(change.georeference)])
 
     def _check_alone(self, sql: sqlite3.Connection) -> None:
-        """Two programs that go on from the same last keyframe would give the same number to different ones."""
+        """Raise if another program writes: both would give the same numbers to different keyframes."""
         newest = sql.execute("SELECT coalesce(max(session), 0) FROM sessions").fetchone()[0]
         if self.session and newest > self._newest:
             raise Dpm2Error(f"{self.path}: another program has begun to write to it")
 
     @property
     def in_place(self) -> bool:
-        """Whether its path still is the file that was opened, and not one that was removed or moved since."""
+        """Whether the opened file is still at its path, and was not removed or moved since."""
         return _identity(self.path) == self._file
 
     @property
     def size(self) -> int:
-        """Keyframes in it.
+        """Number of keyframes.
 
         Raises:
             Dpm2Error: it cannot be read.
@@ -158,7 +158,7 @@ class MapStore:
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """All that is written in this block goes into the file at its end, or not at all.
+        """All writes in this block become one transaction.
 
         Raises:
             Dpm2Error: it could not be written.
@@ -171,10 +171,10 @@ class MapStore:
                 self._together = False
 
     def rows(self, table: str, columns: str = "", where: str = "") -> Iterator[tuple[Any, ...]]:
-        """Rows of a table in their order, without checksums; `where`: a condition of SQL.
+        """Rows of a table in their order, without checksums; `where`: an SQL condition.
 
         Raises:
-            Dpm2Error: damage; `dpm2 map check` says how much.
+            Dpm2Error: damage; `dpm2 map check` shows how much.
         """
         names = () if columns else schema.CONTENT.get(table, ())
         requested = ", ".join((*names, "crc")) if names else columns or "*"
@@ -182,7 +182,7 @@ class MapStore:
             before = None
             query = f"SELECT rowid, {requested} FROM {table} {where and f'WHERE {where}'} ORDER BY rowid"
             for key, *row in self._connection.execute(query):
-                if before is not None and key <= before:  # a tree whose pages lead in a circle has no end
+                if before is not None and key <= before:  # a damaged tree with a cycle of pages has no end
                     raise sqlite3.DatabaseError(f"malformed: {table} {key} comes after {before}")
                 before = key
                 if names and row.pop() != schema.row_crc(*row):
@@ -190,7 +190,7 @@ class MapStore:
                 yield tuple(row)
 
     def payload(self, node: int, what: str) -> bytes | None:
-        """`cloud`, `descriptors` or `thumbnail` of a node; None where it has none.
+        """`cloud`, `descriptors` or `thumbnail` of a node; None if it has none.
 
         Raises:
             Dpm2Error: it cannot be read, or is damaged.
@@ -200,7 +200,7 @@ class MapStore:
 
     @property
     def weights(self) -> list[str]:
-        """With which its descriptors were made, session by session; empty where none were."""
+        """Ids of the weights that made its descriptors, session by session; empty for sessions without."""
         return [weights for (weights,) in self.rows("sessions", "weights")]
 
     @property
@@ -209,9 +209,9 @@ class MapStore:
         return any(self.payload(node, "descriptors") for (node,) in self.rows("keyframes", "node"))
 
     def close(self) -> None:
-        """End it. The last one to write leaves a single file behind, without FILE-wal."""
+        """Close the file. The last writer leaves a single file, without FILE-wal."""
         if not self.read_only:
-            with suppress(sqlite3.Error):  # there is a reader, or the disk is full: FILE-wal stays, and nothing is lost
+            with suppress(sqlite3.Error):  # with a reader, or a full disk, FILE-wal stays, and nothing is lost
                 self._connection.execute("PRAGMA busy_timeout = 200")
                 self._connection.execute("PRAGMA journal_mode = DELETE")
         self._opened.close()
@@ -224,7 +224,7 @@ class MapStore:
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
-        """All that is read in this block is of one instant, whatever another process writes meanwhile.
+        """All reads in this block see one state, whatever another process writes meanwhile.
 
         Raises:
             Dpm2Error: it cannot be read.
@@ -237,8 +237,8 @@ class MapStore:
                 self._connection.execute("ROLLBACK")
 
     def copy_to(self, path: Path) -> None:
-        """All that is in it now as another map file, whole or not at all; an older one there is replaced. Nothing
-        where `path` leads to its own file.
+        """Copy the current content to another map file, whole or not at all; an older file there is replaced. Does
+        nothing if `path` leads to its own file.
 
         Raises:
             Dpm2Error: it could not be written.
@@ -250,8 +250,8 @@ class MapStore:
             try:
                 with closing(sqlite3.connect(part)) as copy:
                     self._connection.backup(copy)
-                    copy.execute("PRAGMA locking_mode = EXCLUSIVE")  # without shared memory, which no share has
-                    copy.execute("PRAGMA journal_mode = DELETE")  # it is one file, and says so
+                    copy.execute("PRAGMA locking_mode = EXCLUSIVE")  # needs no shared memory, which network shares lack
+                    copy.execute("PRAGMA journal_mode = DELETE")  # a single file, also by its header
                 move_map(part, path)
             finally:
                 remove_map(part)
@@ -278,7 +278,7 @@ def _insert(sql: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What a file is, whatever its name; None where there is none."""
+    """Device and inode of a file, whatever its name; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

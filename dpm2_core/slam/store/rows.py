@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between the nouns and the rows of a map file; see schema.py.
+"""Conversion between objects and the rows of a map file; see schema.py.
 
-A row may come from anyone, with a correct checksum: what is made of it is of the right types, finite and within bounds.
+A row may come from an untrusted source, with a correct checksum: all types, finiteness and ranges are checked.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from dpm2_core.slam.store.cloud_store import Loan
 from dpm2_core.slam.store.schema import row_crc
 
 FARTHEST = 1e7
-"""m from the origin: from there on float32 clouds are meters off. No pose of a map lies beyond."""
+"""m from the origin: beyond, float32 clouds are meters off. All poses of a map are nearer."""
 MAX_ID = 2**31 - 1
-"""Of a keyframe, and of anything else that is counted: the next one still fits everywhere."""
+"""Largest id of a keyframe, and of any other count: the next one still fits into all formats."""
 _LONGEST_NAME = 255
-_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, the sum of what follows
-_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # steps there always are
+_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, sum of the bits of the arrays that follow
+_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # there are always steps
 
 
 @dataclass(frozen=True, eq=False)
 class RemovedKeyframe:
-    """A keyframe that is no longer there: `T_node_kf` (4, 4) from a node that is."""
+    """A removed keyframe: `T_node_kf` (4, 4) is its pose relative to an existing node."""
 
     id: int
     robot: str
@@ -62,7 +62,7 @@ def bytes_array(data: Any, side: int) -> Array:
     """(side, side) float64.
 
     Raises:
-        ValueError: not so many bytes, or none.
+        ValueError: wrong number of bytes, or no bytes.
     """
     if not isinstance(data, bytes) or len(data) != 8 * side * side:
         size = len(data) if isinstance(data, bytes) else "no"
@@ -71,10 +71,10 @@ def bytes_array(data: Any, side: int) -> Array:
 
 
 def pose_of(data: Any) -> Array:
-    """(4, 4) of its bytes.
+    """(4, 4) pose from its bytes.
 
     Raises:
-        ValueError: not a finite rigid transform to a place on Earth.
+        ValueError: not a finite rigid transform, or too far from the origin.
     """
     T = bytes_array(data, 4)
     if why := why_no_pose(T):
@@ -83,14 +83,14 @@ def pose_of(data: Any) -> Array:
 
 
 def why_no_pose(T: Array) -> str:
-    """Why no keyframe of a map can be at (4, 4), in words; empty where one can."""
+    """Why (4, 4) cannot be the pose of a keyframe, in words; empty if it can."""
     if not se3.is_rigid(T):
         return "not a finite rigid transform"
     return f"farther than {FARTHEST / 1000:.0f} km from the origin" if np.abs(T[:3, 3]).max() > FARTHEST else ""
 
 
 def pack_descriptors(d: Descriptors) -> bytes:
-    """xyz float32, features int8, steps float32; axes, up, and a scale other than 1, float32, if there are any."""
+    """xyz float32, features int8, steps float32; axes, up, and a scale other than 1, float32, if available."""
     scale = None if d.scale == 1 else np.array([d.scale])
     others = {_AXES: d.axis, _UP: d.up, _SCALE: scale}
     parts = _STEPS + sum(bit for bit, part in others.items() if part is not None)
@@ -104,7 +104,7 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     """The inverse of `pack_descriptors`.
 
     Raises:
-        ValueError: the bytes are no descriptors.
+        ValueError: the bytes are not descriptors.
     """
     if len(data) < _DESCRIPTORS.size:
         raise ValueError("no descriptors: too few bytes")
@@ -135,17 +135,17 @@ def with_crc(*values: Any) -> tuple[Any, ...]:
 
 
 def keyframe_row(node: int, keyframe: Keyframe, session: int, loan: Loan | None) -> tuple[Any, ...]:
-    """Of table `keyframes`; `session`: the one that is being written."""
+    """A row of table `keyframes`; `session`: the one that is being written."""
     k = keyframe
     lent = (None, None) if loan is None else (int(loan.lender), array_bytes(loan.T_kf_lender))
     return with_crc(node, k.id, k.robot, k.session or session, k.stamp, k.index, array_bytes(k.T_odom_kf), *lent)
 
 
 def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, Loan | None]:
-    """Node, keyframe without cloud and descriptors, and whose cloud it borrows, of a row of `keyframes`.
+    """Node, keyframe without cloud and descriptors, and its loan, from a row of `keyframes`.
 
     Raises:
-        ValueError: a value that no keyframe has.
+        ValueError: an invalid value.
     """
     node, id, robot, session, stamp, frame, T, lender, T_lent = row
     _check_types((stamp, frame), robot)
@@ -158,7 +158,7 @@ def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, Loan | None]:
 
 
 def edge_row(number: int, edge: Edge) -> tuple[Any, ...]:
-    """Of table `edges`."""
+    """A row of table `edges`."""
     r = edge.registration
     T, covariance = array_bytes(r.T_target_source), array_bytes(r.covariance)
     # SQLite has no NaN
@@ -168,10 +168,10 @@ def edge_row(number: int, edge: Edge) -> tuple[Any, ...]:
 
 
 def edge_of(row: tuple[Any, ...]) -> Edge:
-    """Of a row of table `edges` without its checksum.
+    """The edge of a row of table `edges` without its checksum.
 
     Raises:
-        ValueError: a value that no edge has; the nodes may be any.
+        ValueError: an invalid value; the nodes are not checked.
     """
     _, kind, from_node, to_node, T, covariance, ok, confidence, rmse, method, reason = row
     _check_types((from_node, to_node, ok), kind)
@@ -195,15 +195,15 @@ def check_ends(edge: Edge, nodes: Container[int]) -> None:
 
 
 def removed_row(p: RemovedKeyframe) -> tuple[Any, ...]:
-    """Of table `trail`."""
+    """A row of table `trail`."""
     return with_crc(p.id, p.robot, p.session, p.stamp, p.node, array_bytes(p.T_node_kf))
 
 
 def removed_of(row: tuple[Any, ...]) -> RemovedKeyframe:
-    """Of a row of table `trail` without its checksum.
+    """The removed keyframe of a row of table `trail` without its checksum.
 
     Raises:
-        ValueError: a value that none has; the node may be any.
+        ValueError: an invalid value; the node is not checked.
     """
     id, robot, session, stamp, node, T_node_kf = row
     _check_types((stamp, node), robot)
@@ -212,15 +212,15 @@ def removed_of(row: tuple[Any, ...]) -> RemovedKeyframe:
 
 
 def fix_row(node: int, fix: Fix) -> tuple[Any, ...]:
-    """Of table `fixes`."""
+    """A row of table `fixes`."""
     return with_crc(node, fix.stamp, *fix.geodetic.tolist(), array_bytes(fix.covariance), *fix.antenna.tolist())
 
 
 def fix_of(row: tuple[Any, ...]) -> tuple[int, Fix]:
-    """Node and fix of a row of table `fixes`.
+    """Node and fix from a row of table `fixes`.
 
     Raises:
-        ValueError: a value that no fix has; the node may be any.
+        ValueError: an invalid value; the node is not checked.
     """
     node, stamp, *place, covariance, x, y, z = row
     _check_types((node, stamp))
@@ -228,32 +228,32 @@ def fix_of(row: tuple[Any, ...]) -> tuple[int, Fix]:
 
 
 def georeference_row(georeference: Georeference) -> tuple[Any, ...]:
-    """Of table `georeference`."""
+    """A row of table `georeference`."""
     return with_crc(0, *georeference.origin.tolist(), array_bytes(georeference.T_enu_map))
 
 
 def georeference_of(row: tuple[Any, ...]) -> Georeference:
-    """Of a row of table `georeference`.
+    """The georeference of a row of table `georeference`.
 
     Raises:
-        ValueError: a value that none has.
+        ValueError: an invalid value.
     """
     _, *place, T = row
     return Georeference(_numbers(place), pose_of(T))
 
 
 def _numbers(values: list[Any]) -> Array:
-    """Raises ValueError unless they are numbers with a fraction."""
+    """The values as an array. Raises ValueError unless they are floating-point numbers."""
     if not all(isinstance(value, float) for value in values):
         raise ValueError("something else where a number belongs")
     return np.array(values)
 
 
 def session_of(row: tuple[Any, ...]) -> Session:
-    """Of a row of table `sessions`.
+    """The session of a row of table `sessions`.
 
     Raises:
-        ValueError: a value that none has.
+        ValueError: an invalid value.
     """
     number, *texts = row
     _check_counts(number)
@@ -263,7 +263,7 @@ def session_of(row: tuple[Any, ...]) -> Session:
 
 
 def _check_types(numbers: tuple[Any, ...], name: Any = "") -> None:
-    """SQLite lets any column hold anything. Raises ValueError unless it is integers and a name of bearable length."""
+    """Raises ValueError unless they are integers and a name of limited length: SQLite columns accept any type."""
     if not all(isinstance(number, int) for number in numbers):
         raise ValueError("something else where a whole number belongs")
     if not isinstance(name, str) or len(name) > _LONGEST_NAME:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a damaged map file is good: row by row, each checked by itself."""
+"""Recovers the good part of a damaged map file: row by row, each checked separately."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData, odometry_by_node, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
-_SMALLEST = 20  # bytes of a row: a file has at most so many as fit, and a small one no row 2^62
-_HIDDEN = 30_000  # rows in succession that one damaged page of a tree can hide
+_SMALLEST = 20  # bytes of a row: limits the number of rows, so that a small file cannot have a row 2^62
+_HIDDEN = 30_000  # consecutive rows that one damaged page of a tree can hide
 _BRIDGE_COVARIANCE = isotropic(0.05, 0.5)  # of an edge that bridges a lost keyframe
 
 
 @dataclass
 class Findings:
-    """What a check found.
+    """Results of a check.
 
     Attributes:
-        problems: one line each; empty: the map is sound.
-        keyframes: that can be used. lost: keyframes that cannot; where the end of the map cannot be read, at least so
-            many. lost_clouds: usable, but without their payload.
+        problems: one line each; empty if the map is good.
+        keyframes: number of usable ones. lost: number of unusable ones; a lower bound if the end of the map cannot be
+            read. lost_clouds: number of usable ones without their payload.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -43,15 +43,15 @@ class Findings:
 
 
 class Salvage:
-    """Reads what can be read of a map."""
+    """Reads as much of a map as possible."""
 
     def __init__(self, sql: sqlite3.Connection, size: int, findings: Findings) -> None:
-        """`size`: of the file, bytes."""
+        """`size`: file size, bytes."""
         self._sql, self._most, self._findings = sql, size // _SMALLEST, findings
         self._last = {table: self._last_row(table) for table in schema.CONTENT}
 
     def run(self) -> MapData:
-        """All that is good, without gaps."""
+        """All good data, without gaps."""
         keyframes, loans = self._keyframes()
         poses = self._poses(keyframes)
         good = sorted(keyframes)
@@ -65,7 +65,7 @@ class Salvage:
         self._fixes(keyframes)
         edges = self._edges(keyframes)
         trail = self._trail(keyframes)
-        # A map in the old numbers with holes, of which the good nodes are then taken.
+        # A map with the old numbers and gaps; the good nodes are then taken from it.
         nothing = pack_cloud(NO_POINTS)
         filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS, session=1)
         whole = MapData(
@@ -134,7 +134,7 @@ class Salvage:
         return jpeg
 
     def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
-        """T_map_kf by node; one that is lost follows from the keyframe before, by odometry."""
+        """T_map_kf by node; a lost one is computed from the previous keyframe by odometry."""
         stored = dict(self._rows("poses"))
         poses: dict[int, Array] = {}
         T_map_odom = np.eye(4)
@@ -151,7 +151,7 @@ class Salvage:
         return poses
 
     def _fixes(self, keyframes: dict[int, Keyframe]) -> None:
-        """Give those that are good to their keyframes."""
+        """Assign the good fixes to their keyframes."""
         for row in self._rows("fixes"):
             with self._noted(f"keyframe {row[0]}: its fix is lost"):
                 node, fix = rows.fix_of(row)
@@ -164,7 +164,7 @@ class Salvage:
         return None
 
     def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
-        """Those between keyframes that are there, and what bridges the others."""
+        """Edges between existing keyframes, and edges that bridge lost ones."""
         edges, known = [], []
         for row in self._rows("edges"):
             with self._noted(f"edge {row[0]}"):
@@ -175,10 +175,10 @@ class Salvage:
         return [*edges, *self._bridges(known, keyframes)]
 
     def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe]) -> Iterator[Edge]:
-        """Odometry edges over the holes that lost keyframes and edges have left.
+        """Odometry edges over the gaps of lost keyframes and edges.
 
-        `known`: edges, also from and to lost keyframes. A node to which no odometry leads begins a drive; where edges
-        are lost, too, only if its frames are counted anew.
+        `known`: edges, also from and to lost keyframes. A node without an odometry edge to it begins a drive; if edges
+        are lost, too, only if its frame count restarts.
         """
         chain, some_lost = odometry_by_node(known), len(known) <= self._last["edges"]
         tied = {edge.to_node for edge in known if edge.kind == "odometry" and edge.from_node in keyframes}
@@ -212,7 +212,7 @@ class Salvage:
             return [Session(number, "", "", "", "") for number in sorted({k.session for k in keyframes.values()})]
 
     def _rows(self, table: str) -> Iterator[tuple[Any, ...]]:
-        """The good rows of a table, each fetched by its number so that a damaged page costs only what is on it."""
+        """The good rows of a table, each read by its number, so that a damaged page costs only its own rows."""
         for number in range(self._last[table] + 1):
             row = None
             with self._noted(f"{table} {number}"):
@@ -237,7 +237,7 @@ class Salvage:
         return tuple(row[:-1])
 
     def _last_row(self, table: str) -> int:
-        """Number of the last row of a table, -1 without any; where its end is damaged, of the first lost row."""
+        """Number of the last row of a table, -1 without any; if its end is damaged, of the first lost row."""
         with suppress(sqlite3.DatabaseError):
             first = self._sql.execute(f"SELECT coalesce(min(rowid), 0) FROM {table}").fetchone()[0]
             if first < 0:
@@ -253,7 +253,7 @@ class Salvage:
         return min(last, self._most)
 
     def _last_readable(self, table: str) -> int:
-        """Found from the first row upward: the way down to the last one leads over the damage."""
+        """Searched from the first row upward, since the path to the last one leads through the damage."""
         last, number = -1, 0
         while number <= min(last + _HIDDEN, self._most):
             with suppress(sqlite3.DatabaseError):
@@ -264,7 +264,7 @@ class Salvage:
 
     @contextmanager
     def _noted(self, what: str) -> Iterator[None]:
-        """What is found wrong within is a problem, and the check goes on after it."""
+        """Record errors in this block as a problem and continue."""
         try:
             yield
         except (ValueError, TypeError, KeyError) as error:
@@ -279,7 +279,7 @@ def _listed(numbers: list[int]) -> str:
 
 
 def _before(node: int, chain: Mapping[int, Edge], there: Container[int]) -> int | None:
-    """The node that is there from which odometry leads to another one, over lost ones; None: it begins among these."""
+    """The existing node from which odometry leads to another one, over lost ones; None if a drive begins there."""
     while node in chain:
         node = chain[node].from_node
         if node in there:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layout of a map file: an SQLite database, so that any program can read one, and a kill at any instant is no matter.
+"""Layout of a map file: an SQLite database, which any program can read, and which a kill at any time does not damage.
 
-Rows carry a CRC-32 of their content, since SQLite finds damaged pages of its trees, but not damage within a value.
+Rows have a CRC-32 of their content, since SQLite detects damaged pages of its trees, but not damage within a value.
 Numbers in blobs are little-endian: poses 16, covariances 36 float64, row by row.
 """
 
@@ -18,7 +18,7 @@ from dpm2_core.errors import UsageError
 APPLICATION_ID = 0x64706D32
 """The bytes `dpm2` at offset 68 of the file."""
 VERSION = 5
-"""In SQLite's user_version: that of the first release. None before it is read."""
+"""In SQLite's user_version: the version of the first release. Older ones cannot be read."""
 
 SCHEMA = """
 CREATE TABLE sessions (          -- every time that a program wrote to the map
@@ -116,11 +116,11 @@ CONTENT = {
     ),
     "georeference": ("id", "latitude", "longitude", "altitude", "T_enu_map"),
 }  # fmt: skip
-"""Columns of the tables with checksums, in the order in which the checksum takes them."""
+"""Columns of the tables with checksums, in the order of the checksum."""
 
 
 def row_crc(*values: bytes | str | int | float | None) -> int:
-    """CRC-32 of a row: type and length go in too, so that nothing moves from one column to the next unseen."""
+    """CRC-32 of a row, including types and lengths, so that values moved between columns are detected."""
     crc = 0
     for value in values:
         if isinstance(value, str):
@@ -138,16 +138,16 @@ def row_crc(*values: bytes | str | int | float | None) -> int:
 
 
 def create(connection: sqlite3.Connection) -> None:
-    """An empty map in an empty database, whole or not at all."""
+    """Make an empty map in an empty database, whole or not at all."""
     about = f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {VERSION};"
     connection.executescript(f"BEGIN; {SCHEMA} {about} COMMIT;")
 
 
 def check(connection: sqlite3.Connection, path: Path) -> None:
-    """Whether a database is a map of this version: it has its tables and nothing else.
+    """Check that a database is a map of this version: it has its tables and nothing else.
 
     Raises:
-        UsageError: the file is no map, or one of another version.
+        UsageError: the file is not a map, or one of another version.
         sqlite3.DatabaseError: it has other tables, or cannot be read.
     """
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps a map file up to date with the mapper; when it cannot, the drive goes on in memory and the file catches up."""
+"""Keeps a map file up to date with the mapper; if writing fails, the map continues in memory and is written later."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import array_bytes, edge_of
 
-_BATCH = 20  # keyframes a transaction while catching up: memory is that of so many clouds
+_BATCH = 20  # keyframes per transaction while catching up; their clouds are in memory
 STILL = 1e-4
-"""m and rad: poses that move by less are not worth writing."""
+"""m and rad: poses that move by less are not written."""
 
 
 class MapWriter:
-    """What the file does not have yet.
+    """The changes that the file does not have yet.
 
     Attributes:
-        problem: why the last attempt to write failed, in words, or that the file is no longer at its path; empty when
-            it is up to date.
+        problem: why the last attempt to write failed, in words, or that the file is no longer at its path; empty if it
+            is up to date.
     """
 
     def __init__(self, store: MapStore, clouds: CloudStore, poses: Array) -> None:
-        """`poses` (N, 4, 4) are those that the file has."""
+        """`poses` (N, 4, 4) are those in the file."""
         self.problem = ""
         self._store, self._clouds = store, clouds
         self._written = poses
@@ -38,13 +38,13 @@ class MapWriter:
         self._given_up: set[int] = set()
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
-        """A keyframe, whose cloud is in the cloud store, and the edges that came with it; or one anew, which borrows by
+        """Add a keyframe, whose cloud is in the cloud store, and its edges; or one again that borrows its cloud by
         now."""
         self._keyframes.append((node, keyframe, thumbnail))
         self._edges += edges
 
     def set_moving(self, node: int) -> None:
-        """The cloud store has a mask for that node."""
+        """The cloud store has a mask of moving points for that node."""
         self._moving.add(node)
 
     def give_up(self, node: int) -> None:
@@ -52,9 +52,9 @@ class MapWriter:
         self._given_up.add(node)
 
     def sync(self, poses: Array, georeference: Georeference | None, judged: Sequence[Edge] = ()) -> None:
-        """Write all that is new; (N, 4, 4) are the optimized poses. Never raises: see `problem`.
+        """Write all changes; (N, 4, 4) are the optimized poses. Never raises: see `problem`.
 
-        `judged`: loops as they are now: those of the file whose verdict is another one are rewritten.
+        `judged`: loops with their current verdict; loops in the file with a different one are rewritten.
         """
         try:
             while len(self._keyframes) > _BATCH:
@@ -68,7 +68,7 @@ class MapWriter:
     def _write(
         self, keyframes: list[tuple[int, Keyframe, bytes | None]], poses: Array, georeference: Georeference | None
     ) -> None:
-        """The first of the keyframes that are new, with all that is new of them and of those before."""
+        """Write the first of the new keyframes, with all changes of them and of earlier ones."""
         ends = max([len(self._written), *(node + 1 for node, *_ in keyframes)])
         change, poses = Change(georeference=georeference), poses[:ends]
         for node, keyframe, thumbnail in keyframes:
@@ -79,7 +79,7 @@ class MapWriter:
         change.poses = self._moved(poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
-        if len(keyframes) == len(self._keyframes):  # else those for which they are given up are not in the file yet
+        if len(keyframes) == len(self._keyframes):  # else the keyframes that replace them are not in the file yet
             change.given_up = list(self._given_up)
         self._store.write(change)
         for node, *_ in keyframes:
@@ -90,22 +90,22 @@ class MapWriter:
         self._given_up -= set(change.given_up)
         written = poses.copy()
         still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
-        written[still] = self._written[still]  # small moves add up until they are worth writing
+        written[still] = self._written[still]  # small moves add up until they are written
         self._written = written
 
     def _rewrite(self, judged: Sequence[Edge]) -> None:
-        """Bring the verdicts in the file up to date."""
-        # By the measurement, too: the search may have rejected another loop between the same two keyframes.
+        """Update the verdicts of loops in the file."""
+        # Identified by the measurement, too: the search may have rejected another loop of the same two keyframes.
         now = {_key(loop): loop for loop in judged if loop.kind == "loop"}
         rows = self._store.rows("edges", where="kind = 'loop'") if now else ()
-        # The last of those: one that waited for a second loop stands there as it was rejected, and as it was accepted.
+        # The last of equal keys: a loop that waited for a second one has two rows, rejected and later accepted.
         file = {_key(edge): (int(row[0]), edge) for row in rows for edge in [edge_of(row)]}
         known = [(number, loop, now[key]) for key, (number, loop) in file.items() if key in now]
         if changed := {number: new for number, loop, new in known if new.ok != loop.ok}:
             self._store.write(Change(judged=changed))
 
     def _moved(self, poses: Array) -> dict[int, Array]:
-        """Poses that the file does not have, by node."""
+        """Poses that are not in the file, by node."""
         known = min(len(self._written), len(poses))
         moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > STILL
         return {int(node): poses[node] for node in (*np.flatnonzero(moved), *range(known, len(poses)))}
