@@ -68,8 +68,7 @@ class Fixes:
         self._used.append(True)
 
     def chosen(self, placed: NDArray[np.bool_]) -> list[int]:
-        """Indices of the fixes to use, none before the georeference is known; `placed`: (N,) nodes that may have
-        some."""
+        """Indices of the fixes to use, none before the georeference is known; `placed`: (N,) allowed nodes."""
         return [] if self.georeference is None else [k for k, (node, _) in enumerate(self._fixes) if placed[node]]
 
     def kept(self, chosen: Sequence[int]) -> list[bool]:

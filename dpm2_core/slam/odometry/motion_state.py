@@ -42,8 +42,7 @@ class MotionState:
         sweep: the motion during the sweep of the last registered frame, if its points have shown it.
         change: (6,) change of the twist from one registered frame to the next.
         of_velocity: covariance (3, 3) of the twist's velocity, m/s.
-        left_open: covariance (3, 3), m, of the last step in the directions that the scene does not constrain; else
-            zero.
+        left_open: covariance (3, 3), m, of the last step in directions that the scene does not constrain; else zero.
         T_registered, seconds: the last registered pose (4, 4), and the time from it to the last frame.
         inertial: the IMU, once a frame had samples. reckoned: the motion to the current frame by the IMU, if it is
             known. other: another odometry, once a frame had a guess.
@@ -138,8 +137,7 @@ class MotionState:
         return self.steadily(twist, dt) if self.reckoned is None else self.T_registered @ self.reckoned.T
 
     def steadily(self, twist: Array, dt: float) -> Array:
-        """Pose (4, 4) at a constant velocity; from the last registered frame if an IMU has measured the rotation since
-        then."""
+        """Pose (4, 4) at a constant velocity; if an IMU measured the rotation, from the last registered frame on."""
         if self.turning is None:
             return predicted(self.T, twist, dt)
         return predicted(self.T_registered, twist, self.seconds + dt, self.turning)
@@ -159,8 +157,10 @@ class MotionState:
         return np.linalg.inv(covariance).astype(np.float64)
 
     def beginning(self, T: Array, seconds: float, half: float) -> Beginning:
-        """Start of the sweep of a frame at T (4, 4), `seconds` after the last registered one; it began `half` s
-        before."""
+        """Prior for the sweep of a frame at T (4, 4), `seconds` after the last registered one.
+
+        The sweep began `half` s before.
+        """
         if self.sweep is not None:
             return self.sweep.next(seconds, half, self.settings.steadiness)
         before, steadiness = self.T_registered, self.settings.steadiness
@@ -207,8 +207,7 @@ class MotionState:
             self.covariance[3:, 3:] += whole
 
     def _left_open(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
-        """Covariances (3, 3), m, of the motion in unconstrained directions: since they are so, and in the last
-        `seconds`.
+        """Covariances (3, 3), m, of the motion in unconstrained directions: in all that time, and in `seconds`.
 
         The covariance of a scan is limited to 1 m there; that of the motion is not, as each pose follows from the last.
         """

@@ -134,8 +134,7 @@ class OtherMotion:
         self.step = Step(T, covariance)
 
     def _is_unsteady(self, guess: Guess, seconds: float) -> bool:
-        """Whether a guess, `seconds` after the last registered frame, makes an impossible jump from the previous
-        guess."""
+        """Whether a guess, `seconds` after the last registered frame, cannot follow the previous guess by driving."""
         assert self._before is not None
         before, period = self._before, seconds - self._seconds
         T, T_steady = se3.inverse(before.T_other_lidar) @ guess.T_other_lidar, predicted(np.eye(4), self._twist, period)

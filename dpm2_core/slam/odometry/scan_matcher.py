@@ -71,7 +71,7 @@ class ScanMatcher:
         if led is not None and fits_there:
             return Match(scan, led, led=True)
         own = self._alone(frame, scan, T_predicted, dt)
-        # In a tunnel most of a scan fits at rest to a map that was made at rest: that does not determine the step.
+        # In a tunnel a map made at rest fits most of a scan at the same pose: that does not determine the step.
         if led is not None and own.result.worst_sigma >= OPEN:
             return Match(scan, led, led=True)
         return own
@@ -92,7 +92,7 @@ class ScanMatcher:
             beginning = without_imu.turning(measured)
         swept = self.registration.swept(match.scan, match.result, beginning)
         if swept is None:
-            if beginning is not without_imu:  # do the points contradict it because of the IMU?
+            if beginning is not without_imu:  # find out whether the points or the IMU contradict it
                 swept = self.registration.swept(match.scan, match.result, without_imu)
             timed = match.result.ok and len(match.scan.times) > 0
             match = match._replace(contradicted=timed and swept is None)
@@ -136,8 +136,7 @@ class ScanMatcher:
         widen = min(seconds / dt, 5.0)
         result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
         result = motion.gated(result, T_predicted, dt)
-        # A wrong rotation leads to a wrong pose where the scan is stuck; only the small part of fitting points shows
-        # it.
+        # A wrong rotation leads to a wrong pose where the scan gets stuck: only that few of its points fit shows it.
         if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
             steady = self._without_imu(frame, motion.twist, dt)
             if fits_better(steady.result, result):
@@ -149,8 +148,7 @@ class ScanMatcher:
         return Match(scan, turned if turned.ok else result)
 
     def _without_imu(self, frame: Frame, twist: Array, dt: float) -> Match:
-        """Match without the IMU, in prediction and scan, in case it is wrong: a wrong rotation distorts a scan as
-        well."""
+        """Match without the IMU in case it is wrong, in prediction and scan: a wrong rotation distorts a scan, too."""
         motion = self.motion
         seconds = motion.seconds + dt
         scan = self.registration.prepare(replace(frame, imu=None), twist)
@@ -159,8 +157,7 @@ class ScanMatcher:
         return Match(scan, motion.gated(result, T, dt))
 
     def _led_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
-        """The result from the other odometry's prediction, and whether the scan fits there; None without one, or far
-        off."""
+        """The result from the other odometry's prediction, if they agree, and whether the scan fits there."""
         motion = self.motion
         if motion.other is None or (step := motion.other.step) is None:
             return None, False

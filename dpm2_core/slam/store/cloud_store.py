@@ -109,8 +109,7 @@ class CloudStore(LazySequence[Points]):
         self._where[index] = None
 
     def borrow(self, index: int, loan: Loan) -> int | None:
-        """Let a keyframe borrow the cloud of an older one that has its own; returns the keyframe whose cloud is
-        dropped."""
+        """Let a keyframe borrow the own cloud of an older one; returns the keyframe whose cloud is dropped."""
         before = self._newest.get(loan.lender)
         self._loans[index] = loan
         if before is None:
@@ -138,8 +137,7 @@ class CloudStore(LazySequence[Points]):
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(N,) mask of keyframes with their own clouds: those that do not borrow, and the newest borrower of each
-        lender."""
+        """(N,) mask of keyframes that have their own clouds: those that do not borrow, and the newest borrowers."""
         kept = self.own
         kept[list(self._newest.values())] = True
         return kept

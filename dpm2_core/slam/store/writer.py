@@ -38,8 +38,7 @@ class MapWriter:
         self._given_up: set[int] = set()
 
     def add(self, node: int, keyframe: Keyframe, thumbnail: bytes | None, edges: Sequence[Edge]) -> None:
-        """Add a keyframe, whose cloud is in the cloud store, and its edges; or one again that borrows its cloud by
-        now."""
+        """Add a keyframe, whose cloud is in the cloud store, and its edges; or update one that borrows by now."""
         self._keyframes.append((node, keyframe, thumbnail))
         self._edges += edges
 
