@@ -2,7 +2,7 @@
 """Consistency of a loop with the odometry between its ends, or with another loop nearby.
 
 Two loops and the paths between their ends, by odometry or through the map, form a circle, which must close:
-one was: J. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging",
+J. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map Merging",
 ICRA 2018.
 """
 

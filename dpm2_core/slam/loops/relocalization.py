@@ -2,7 +2,7 @@
 """Global relocalization in a map, from one cloud, without any prior, at any position and heading.
 
 The descriptors find similar keyframes and a pose in each; the points decide. If the second best place fits nearly as
-well, there is no result: no pose is better than a wrong one. If the points do not determine the position along a road,
+well, there is no result, which is better than a wrong pose. If the points do not determine the position along a road,
 an image may: see `pictures`.
 """
 

@@ -279,7 +279,7 @@ class Mapper:
         return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving_window)))
 
     def _add_node(self, keyframe: Keyframe, way: Registration | None, last: int | None) -> list[Edge]:
-        """Add a node with an edge to its robot's `last` one, even if some between were lost; `way`: the edge sent."""
+        """Add a node with an edge to its robot's `last` one, even if some between were lost; `way`: its edge."""
         node, result = len(self.keyframes), way
         if result is not None and last is not None:
             before = self.keyframes[last]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Selects the scans that become keyframes, and the uncertainty of the edge from each to the previous one."""
+"""Selects the scans that become keyframes, and estimates the uncertainty of the edge from each to the previous one."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ class Odometry:
         return registration.because(_CARRIED)
 
     def _break(self, loops: bool) -> None:
-        """The motion from the keyframes so far to the next ones is known no better than the current pose."""
+        """Record a break: the motion from earlier to later keyframes is known no better than the current pose."""
         self._keyframes.add_uncertainty(self._motion.covariance)
         self._breaks.append((self.next_keyframe, loops))
 

@@ -46,7 +46,7 @@ class FusedScanRegistration:
         self, neural: NeuralScanRegistration, geometric: GeometricScanRegistration, always: bool = True
     ) -> None:
         """`always` False: use the network only if the points do not determine their pose: few fit, or a direction is
-        unconstrained. Of 700 pairs of scans, real and simulated, with unknown motion, all that did were right."""
+        unconstrained. Of 700 pairs of real and simulated scans with unknown motion, all whose points did were right."""
         self._neural = neural
         self._geometric = geometric
         self._always = always

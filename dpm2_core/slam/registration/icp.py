@@ -52,9 +52,10 @@ _NORMAL_NOISE = 0.12  # rad, of fitted normals; measured rms along smooth tunnel
 
 _UNFIT = 0.2  # fraction of unmatched points; 1 % of 870 scans, real and simulated, have it, 8 % in dense traffic
 _TOGETHER, _AT_REST = 0.15, 0.3
-"""Fraction of the points that fit only a second pose: none of those scans has half of it. With people who walk along,
-and with walls that slide past while moving objects are taken for static, it is 0.16 to 0.31. At rest, where the map was
-made, the beams hit much at the same distance again: with 16 beams in a hall full of shelves 0.17."""
+"""Fraction of the points that fit only a second pose, in motion and at rest: none of the 870 scans has half of it. With
+people who walk along, and with walls that slide past while moving objects are taken for static, it is 0.16 to 0.31. At
+rest, where the map was made, the beams hit much at the same distance again: with 16 beams in a hall full of shelves
+0.17."""
 _APART = 0.05  # m, from one pose to a second one
 _EQUAL = 0.02
 """Smaller differences of the points' mean log likelihood are not significant, such as along a tunnel."""

@@ -10,8 +10,9 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry.compiled import compiled
 
 ORDER = 3
-"""Degree of the motion during a sweep as a polynomial in time: a twist, its rate and the rate of that. Legs make 4
-steps per second, nearly half a step in a sweep of 0.1 s: with degree 2 its errors were 2 to 3 times as large."""
+"""Degree of the motion during a sweep as a polynomial in time: a twist, its rate and the rate of that. A legged
+robot makes 4 steps per second, nearly half a step in a sweep of 0.1 s: with degree 2 its errors were 2 to 3 times as
+large."""
 
 
 @compiled("Tuple((f8[::1], f8[:, ::1], f8[::1]))(f8[:, ::1], i4[::1], f8[:, ::1], f8[:, ::1], f8[::1])")

@@ -37,7 +37,7 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
 
 
 def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> bool:
-    """Whether two poses (4, 4) are within `most`, m and degrees; by default as from scan to scan."""
+    """Whether two poses (4, 4) are within `most`, m and degrees; by default a vehicle's change between scans."""
     meters, degrees = se3.apart(T, T_other)
     return meters <= most[0] and degrees <= most[1]
 
