@@ -25,7 +25,7 @@ from dpm2_core.slam.graph.worker import GraphWorker
 
 _log = logging.getLogger(__name__)
 SHORT = 50
-"""Loops; a smaller graph is solved in about 20 ms, faster than it is sent to another process."""
+"""Number of loops; a graph with fewer is solved in about 20 ms, faster than it is sent to another process."""
 _TOGETHER = 40  # pairs of nodes whose covariances are computed at once
 _FIXES = 10, 20
 """Fixes that may wait for an optimization: this number, or one in this number of all fixes."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Optimizes a pose graph in its own process: gtsam holds Python's lock while it works, and odometry must not wait.
 
-The process is a fresh interpreter, never a fork, which is safe with rclpy's threads and locks. It has its own session,
+The process is a fresh interpreter, which is safe with rclpy's threads and locks, never a fork. It has its own session,
 so that an interrupt from the terminal reaches only the program. It lives as long as its standard input: when the
 program ends, in whatever way, the process reads end of file and exits.
 """

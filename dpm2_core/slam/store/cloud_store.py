@@ -109,7 +109,7 @@ class CloudStore(LazySequence[Points]):
         self._where[index] = None
 
     def borrow(self, index: int, loan: Loan) -> int | None:
-        """Let a keyframe borrow the own cloud of an older one; returns the keyframe whose cloud is dropped."""
+        """Let a keyframe borrow from an older one with its own cloud; returns the keyframe whose cloud is dropped."""
         before = self._newest.get(loan.lender)
         self._loans[index] = loan
         if before is None:
