@@ -51,7 +51,7 @@ def without_dynamic_objects(net: DynamicObjectNet, points: Points) -> NDArray[np
     if not len(points):
         return np.zeros(0, bool)
     probability = net.probability(points)
-    # If hardly anything else is left, the network is wrong or has nothing to go by: part of a scan is still a scan.
+    # If hardly anything else is left, the network is wrong or lacks information: part of a scan is still a scan.
     bound = max(DYNAMIC, float(np.quantile(probability, 1 - _MOST)))
     return np.asarray(probability <= bound)
 

@@ -36,7 +36,7 @@ class TrajectoryRecorder:
 
     @property
     def keyframes(self) -> int:
-        """How many of the frames became keyframes."""
+        """Number of frames that became keyframes."""
         return len(self._keyframe)
 
     def add(self, tracked: OdometryResult) -> None:

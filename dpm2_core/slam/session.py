@@ -28,7 +28,7 @@ MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: create it, continue an interrupted drive, add another drive, or only read it."""
 _COMPARED = 500  # points of a cloud
 _APART = 0.75
-"""m, distance of three in four points: of the same frame 0.01, or the de-skewing; of another frame at least 1.1."""
+"""m, 75th percentile of the distances: for the same frame 0.01, or the de-skewing; for another frame at least 1.1."""
 _SAME_FRAME = isotropic(1e-4, 1e-3)  # rounding errors between two readings of the same frame
 
 
@@ -60,7 +60,7 @@ def open_session(path: Path | str, settings: SlamSettings, config: str, resume: 
         raise UsageError(
             f"--map {path}: there is a file already; --resume goes on with its drive, --extend adds another"
         )
-    # Remembered here: by the time of an error another node may have made a file with that name.
+    # Without `resume` no file was there above; if another node has made one since, `create` rejects it.
     there = resume and path.exists()
     store = MapStore.open(path, read_only=False) if there else MapStore.create(path)
     try:
