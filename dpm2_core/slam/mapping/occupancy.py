@@ -25,7 +25,9 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 _MOST = 400_000_000  # cells
 _LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes that are checked, and the fraction of them that must show ground
 _SQUARE = 5.0  # m: the steepest ramp rises by less than a storey within one
-_STOREY = 2.4  # m, allowed height between keyframes in a square: below a floor's, above that from a base to its LiDAR
+_STOREY = (
+    2.4  # m, allowed height difference of keyframes: less than a floor's height, more than a LiDAR's above its base
+)
 _OVER = np.diag(np.array([1, -1, -1], np.float32))  # rotated upside down
 
 

@@ -31,7 +31,7 @@ class KeyframeSettings(Settings):
     angle: float = Field(25.0, ge=0)
     """Rotation after which a scan becomes a keyframe, degrees, unless a keyframe nearby has a similar heading."""
     residual: float = Field(0.0, ge=0)
-    """Residual of registrations, m, at which `distance` shrinks to 1 m; with no residual it grows to twice its value,
+    """Residual of registrations, m, at which `distance` shrinks to 1 m; at zero residual it grows to twice its value,
     as in DeepPointMap. 0: `distance` is constant."""
     voxel: float = Field(0.3, gt=0)
     """Spacing of the points of a keyframe, m."""

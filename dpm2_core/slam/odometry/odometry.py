@@ -228,7 +228,7 @@ class Odometry:
     def _pauses(self, frame: Frame, dt: float) -> bool:
         """Whether the last registered scan is so old that a single scan is not accepted.
 
-        If scans were dropped for lack of time, the stream is slow, and the work after a pause would slow it further.
+        If scans were dropped for lack of time, the limit is higher: the work after a pause would drop even more.
         """
         least = SLOWEST if frame.dropped else self._settings.pause
         known = len(self._registration) > 0 and frame.problem is None
