@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot with an odometry of its own, whose wheels slip and jump: the map with it, beside the map without."""
+"""A robot with its own odometry, whose wheels slip and jump: the map with that odometry, and without it."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ WORLDS: dict[str, tuple[str, PresetName, int, float]] = {
     "building": ("loop", "indoor", 922, 1.2),
     "tunnel": ("straight", "tunnel", 923, 8.0),
 }
-"""Road, kind of world, its seed, speed in m/s."""
+"""Road, type of environment, seed, speed in m/s."""
 FRAMES = 300
 SLIP, JUMP = 0.02, 0.5
-"""Fraction of the way, and m, once in the middle."""
+"""Fraction of the distance; and m, once in the middle."""
 WAYS: dict[str, tuple[float, float, int] | None] = {
     "own": None,
     "slip": (SLIP, 0.0, FRAMES),
     "slip and jump": (SLIP, JUMP, FRAMES),
     "slip, then stops": (SLIP, 0.0, FRAMES // 2),
 }
-"""Slip, jump, and frames with it; None: the SLAM is alone."""
+"""Slip, jump, and number of frames with the odometry; None: the SLAM runs alone."""
 
 
 def bench_beside(options: Options) -> Report:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fine-tuning on drives with another LiDAR: errors on unseen worlds of it and of the old one, before and after."""
+"""Fine-tuning on drives with another LiDAR: errors on unseen worlds with it and with the old one, before and after."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ from dpm2_core.tables import record_table
 LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)
 """32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights know 64 from +2 to -24.8 deg, at 1.5 to 2 m."""
 DRIVES: tuple[PresetName, ...] = ("city", "suburb", "rural")
-"""One of each is fine-tuned on: 12 s long, seeds from 950,000."""
+"""One drive of each is used for fine-tuning: 12 s long, seeds from 950,000."""
 DRIVE_FRAMES = 120
 _TOWNS: dict[PresetName, float] = {"city": 0.35, "suburb": 0.35, "rural": 0.3}
 STEPS = "optimiser.steps=120"
-"""Two fifths of what `dpm2 finetune` takes by default: five trainings are to fit into twenty minutes of a processor."""
+"""Two fifths of the default of `dpm2 finetune`: five trainings must fit into twenty minutes of one processor."""
 UNSEEN = {
     "new": GenerateSettings(
         worlds=8, first_seed=960_000, frames=16, beams=LIDAR.beams, height=LIDAR.height, mixture=_TOWNS
     ),
     "old": GenerateSettings(worlds=8, first_seed=970_000, frames=16, mixture=_TOWNS),
 }
-"""Worlds for evaluation, of the new LiDAR and of the old one."""
+"""Worlds for evaluation, with the new LiDAR and the old one."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     "trajectory": (),
     "pairs": ("trajectory=0", "pairs=1"),
     "both": ("pairs=1",),
     "poses": ("trajectory=0", "pairs=1", "loss.pose=10"),
 }
-"""Losses: that of the trajectory, as `dpm2 finetune` has it, for every seed; with the pairs for the first, alone, and
-with the error of their poses."""
+"""Losses: the trajectory loss, default of `dpm2 finetune`, for every seed; with the first seed also that loss and the
+pair loss, the pair loss alone, and the pair loss with the error of the poses."""
 _MEDIANS = ("near_m", "far_m", "all_m", "all_deg")
 
 
 def bench_finetune(options: Options) -> Report:
     """Repetitions are seeds, overrides are of the fine-tuning; a training that is in finetune.json is not repeated.
 
-    `--only` names one of the arms.
+    `--only` names one of the variants.
     """
     wanted = trainings(options)
     path, folder = options.out / "finetune.json", options.cache / "finetune"
@@ -86,14 +86,14 @@ def bench_finetune(options: Options) -> Report:
 
 
 def trainings(options: Options) -> list[tuple[str, int]]:
-    """(variant, seed): the first seed of every variant, and then the other seeds of the trajectory's."""
+    """(variant, seed): the first seed of every variant, then the other seeds of the trajectory variant."""
     variants = requested(options, VARIANTS)
     rest = range(1, options.repetitions) if "trajectory" in variants else ()
     return [*((variant, 0) for variant in variants), *(("trajectory", seed) for seed in rest)]
 
 
 def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None:
-    """Drives, their references, the rehearsal and the unseen worlds; what is there stays."""
+    """Create drives, their references, the rehearsal and the unseen worlds; existing ones are kept."""
     sources = []
     for k, preset in enumerate(DRIVES):
         at = folder / "recorded" / preset
@@ -110,7 +110,7 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
 
 
 def _run(settings: FinetuneSettings, data: Path, out: Path, validations: dict[str, PairSet]) -> dict[str, Any]:
-    """One training, what it cost, and the errors that are left; one that was stopped goes on with the same settings."""
+    """One training, its cost, and the errors after it; an interrupted one continues with the same settings."""
     begin_training(out, settings, [weights_path(settings.weights)])
     cpu = process_time()
     weights = finetune(settings, out, data=data)
@@ -125,7 +125,7 @@ def _ratio(after: dict[str, Any], before: dict[str, Any]) -> dict[str, dict[str,
 
 
 def errors(pairs: PairSet, model: Any) -> dict[str, float]:
-    """Medians of the errors of translation, m, and rotation, deg, and the fraction that succeeds."""
+    """Median errors of translation, m, and rotation, deg, and the success rate."""
     rows = pairs.errors(model)
     near = rows[:, 0] <= NEAR
     good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
@@ -140,7 +140,7 @@ def errors(pairs: PairSet, model: Any) -> dict[str, float]:
 
 
 def report(same: dict[str, Any], before: dict[str, Any], runs: dict[str, Any]) -> Report:
-    """Errors before and after every training, which have `same` in common, and what each variant makes of them."""
+    """Errors before and after every training, which have `same` in common, and the ratios of each variant."""
     summary: dict[str, Any] = {}
     for variant, seeds in runs.items():
         summary[variant] = {

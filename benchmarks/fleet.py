@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fleets on a local cluster of Ray: pieces of roads in one map, an index of 200,000 places, kills, and two workers."""
+"""Fleets on a local Ray cluster: parts of roads in one map, an index of 200,000 places, kills, and two workers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
 METERS, LENGTH, SHARED = 150.0, 110.0, 40.0
-"""Of each road; of each of the drives along all of them, and what a drive has in common with the next, m."""
+"""Length of each road; length of each drive along the chained roads, and its overlap with the next drive, m."""
 DRIVES = 12
 PLACES, QUERIES, FOUND = 200_000, 500, 8
 KILLS = 20
@@ -55,12 +55,12 @@ _FAST = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.th
 
 
 def bench_fleet(options: Options) -> Report:
-    """The parts of the issue's table, or the one that `--only` names: town, index, kills, workers, growth, whole."""
+    """The parts of the benchmark, or the one that `--only` names: town, index, kills, workers, growth, whole."""
     parts: dict[str, Callable[[Path, Options], dict[str, Any]]] = {
         "town": bench_town, "index": bench_index, "kills": bench_kills, "workers": bench_workers,
         "growth": lambda folder, _: bench_growth(folder), "whole": lambda folder, _: bench_whole(folder),
     }  # fmt: skip
-    # With --only the other parts stay as they were measured.
+    # With --only the earlier results of the other parts are kept.
     before = {} if options.only is None else {name: earlier(options.out / "fleet.json", name) for name in parts}
     results: dict[str, Any] = {name: figures for name, figures in before.items() if figures}
     for name in requested(options, parts):
@@ -73,7 +73,7 @@ def bench_fleet(options: Options) -> Report:
 
 
 def bench_town(folder: Path, options: Options) -> dict[str, Any]:
-    """Roads end to end, driven piece by piece: true and wrong joins, errors, and what each added drive costs."""
+    """Chained roads, driven in parts: true and wrong joins, errors, and the cost of each added drive."""
     files = list(road_files(options))
     chained(files, METERS, folder / "way.txt")
     world = build_world(str(folder / "way.txt"), "suburb", FIRST_SEED)
@@ -118,19 +118,19 @@ def bench_town(folder: Path, options: Options) -> dict[str, Any]:
 
 
 def _key(poses: Array) -> str:
-    """Of a drive that is kept, so that another one is not taken for it."""
+    """Key of a cached drive, which distinguishes it from other drives."""
     weights = SlamSettings().weights_id()
     return hashlib.sha256(poses.round(6).tobytes() + weights.encode()).hexdigest()[:12]
 
 
 def _meet(one: Array, other: Array) -> bool:
-    """Whether enough keyframes of two drives are within half a step of each other: they saw the same place."""
+    """Whether enough keyframes of two drives are within one step of each other: they saw the same place."""
     apart = np.linalg.norm(one[:, None, :2, 3] - other[None, :, :2, 3], axis=-1).min(0)
     return int((apart <= STEP).sum()) >= ENOUGH
 
 
 def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], sizes: Mapping[str, int]) -> dict[str, Any]:
-    """APE, m, of a map, and of each drive by itself: alone, and in the map."""
+    """APE, m, of a map, and of each drive: by itself, and in the map."""
     with MapStore.open(out) as store:
         poses = load_map(store, descriptors=False).poses
     errors: dict[str, Any] = {"map": float(ape_rmse(np.concatenate([truth[name] for name in sizes]), poses))}
@@ -145,7 +145,7 @@ def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], sizes: Mapping[s
 
 
 def bench_index(folder: Path, options: Options) -> dict[str, Any]:
-    """Places on smooth ways through a space of few directions, as those of a drive are; time of this process alone."""
+    """Places on smooth paths through a low-dimensional space, as in real drives; processor time of this process."""
     rng = np.random.default_rng(0)
     scale = 0.8 ** np.arange(24)
     axes = np.linalg.qr(rng.normal(size=(WIDTH, 24)))[0].T
@@ -194,7 +194,7 @@ def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 class _Killer(View):
-    """Kills workers of running drives with -9 at random moments."""
+    """Kills workers of running drives with -9 at random times."""
 
     def __init__(self, seed: int) -> None:
         self.kills = 0
@@ -203,12 +203,12 @@ class _Killer(View):
         self._ended: set[str] = set()
 
     def begun(self, names: Sequence[str]) -> None:
-        """As `View`."""
+        """See `View`."""
         self._ended.clear()
         self._next = time.monotonic() + self._random.uniform(0, 6)
 
     def running(self, status: Mapping[str, Status]) -> None:
-        """As `View`."""
+        """See `View`."""
         running = [now for name, now in status.items() if name not in self._ended and now.where]
         if self.kills < KILLS and running and time.monotonic() >= self._next:
             self._next = time.monotonic() + self._random.uniform(0, 6)
@@ -217,7 +217,7 @@ class _Killer(View):
                 self.kills += 1
 
     def ended(self, outcome: Outcome) -> None:
-        """As `View`."""
+        """See `View`."""
         self._ended.add(outcome.name)
 
 
@@ -229,7 +229,7 @@ def _drives(folder: Path, count: int, frames: int) -> list[Part]:
 
 
 def bench_kills(folder: Path, options: Options) -> dict[str, Any]:
-    """Fleets of four drives until 20 workers were killed, each called until it is whole; beside one left alone."""
+    """Fleets of four drives until 20 workers were killed, each restarted until complete; also one left alone."""
     parts, killer = _drives(folder, 4, 60), _Killer(0)
     fleets, calls, equal = 0, 0, 0
     with Cluster(workers=2) as cluster:
@@ -253,7 +253,7 @@ def _equal(one: Path, other: Path) -> bool:
 
 
 def bench_workers(folder: Path, options: Options) -> dict[str, Any]:
-    """Wall time of four equal drives with one worker and with two, a thread each; what is not the drives' own time."""
+    """Wall time of four equal drives with one worker and with two, one thread each; and the overhead of the cluster."""
     parts = _drives(folder, 1, 200)
     four = [Part(f"{n}", part.work, part.arguments, part.inputs, True, 1) for part in parts for n in range(4)]
     out: dict[str, Any] = {"processors": processors()}

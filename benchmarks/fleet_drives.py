@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of drives as `dpm2 fleet run` leaves them, without its hours: keyframes every few meters of a simulated road."""
+"""Maps of drives as from `dpm2 fleet run`, but made in less time: keyframes every few meters of a simulated road."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from dpm2_core.slam.store.map_store import MapStore
 
 STEP = 5.0
 """m between two keyframes."""
-_DRIFT = np.array([0, 0, 3e-4, 0.01, 0.006, 0.0])  # of the odometry, a keyframe, rad and m
+_DRIFT = np.array([0, 0, 3e-4, 0.01, 0.006, 0.0])  # of the odometry, per keyframe, rad and m
 _COVARIANCE = isotropic(1e-3, 0.03)
-_TRAFFIC = 100.0  # s between two drives: by then other cars are there
+_TRAFFIC = 100.0  # s between two drives, so that the traffic differs
 
 
 def chained(files: Sequence[Path], meters: float, out: Path) -> None:
-    """Write the first so many meters of each of some files of KITTI poses as one way, each road where the last ends."""
+    """Write the first `meters` of each file of KITTI poses as one path; each road begins where the last one ends."""
     parts, T_way_road = [], np.eye(4)
     for file in files:
         poses = read_trajectory(file).poses
@@ -45,23 +45,23 @@ def chained(files: Sequence[Path], meters: float, out: Path) -> None:
 
 
 def poses_of(world: World, span: tuple[float, float], seed: int) -> Array:
-    """(N, 4, 4) true poses of a drive's keyframes, a little beside the lane; `span`: m of the way, `seed`: of where."""
+    """(N, 4, 4) true keyframe poses of a drive, slightly off the lane; `span`: m of the path, `seed`: of the offset."""
     rng = np.random.default_rng(seed)
     aside = se3.exp(np.append(rng.normal(size=3) * [0, 0, 0.02], rng.normal(size=3) * [0, 0.3, 0]))
     return np.array([world.pose_at(float(s)) for s in np.arange(*span, STEP)]) @ aside
 
 
 def odometry_of(poses: Array) -> Array:
-    """(N, 4, 4) where a drifting odometry has them."""
+    """(N, 4, 4) poses from a drifting odometry."""
     steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(_DRIFT)
     return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
 
 
 def write_drive(folder: Path, world: World, poses: Array, seed: int) -> None:
-    """A drive, as the SLAM maps it.
+    """Write a drive as the SLAM maps it.
 
     Args:
-        folder: new. poses: (N, 4, 4) true, of its keyframes. seed: of noise and traffic.
+        folder: must not exist. poses: (N, 4, 4) true, of its keyframes. seed: of noise and traffic.
     """
     rng, lidar, settings = np.random.default_rng([seed, 1]), Lidar(LidarConfig(columns=1024)), SlamSettings()
     odometry = odometry_of(poses)

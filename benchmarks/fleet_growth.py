@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive more costs a map that grows: its place in the index, in the graph and in the file; and the memory that a
-map of 20,000 keyframes takes when it is made at once.
+"""Cost of adding a drive to a growing map: in the index, in the graph and in the file. And the memory for creating a
+map of 20,000 keyframes at once.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.rows import Session
 
 DRIVES, KEYFRAMES, SHARED = 52, 100, 20
-"""Drives; keyframes of each, 5 m apart; those that it has in common with the next."""
+"""Number of drives; keyframes of each, 5 m apart; and keyframes that it shares with the next drive."""
 AT_ONCE = 200
-"""Drives of the map that is made at once: 20,000 keyframes."""
+"""Number of drives in the map that is created at once: 20,000 keyframes."""
 _NOISE = isotropic(1e-3, 0.02)
 _POINTS = 5000  # of a cloud
-_WINDOW = 5  # additions whose median is taken
+_WINDOW = 5  # additions over which the median is taken
 
 
 def bench_growth(folder: Path) -> dict[str, Any]:
-    """Processor time of each addition, without the search for loops, which is the same whatever the map has.
+    """Processor time of each addition, without the search for loops, which does not depend on the size of the map.
 
-    The drives are made up: true poses with noise, clouds of noise, loops of the truth, places that look alike where
-    they are the same.
+    The drives are artificial: true poses with noise, clouds of noise, true loops, and places that look alike if they
+    are the same.
     """
     rng = np.random.default_rng(0)
     count = (KEYFRAMES - SHARED) * DRIVES + SHARED
@@ -68,7 +68,7 @@ def bench_growth(folder: Path) -> dict[str, Any]:
 
 
 def bench_whole(folder: Path) -> dict[str, Any]:
-    """Drives as those of `bench_growth`, 20,000 keyframes, into a new map, in a process of its own: its memory."""
+    """Drives like those of `bench_growth`, 20,000 keyframes, into a new map, in a separate process: its memory."""
     rng = np.random.default_rng(1)
     way = _way((KEYFRAMES - SHARED) * AT_ONCE + SHARED)
     joins: list[Join] = []
@@ -77,12 +77,12 @@ def bench_whole(folder: Path) -> dict[str, Any]:
         save_as(_drive(way[at], rng), folder / f"d{number:03d}.dpm2map")
         if number:
             joins += _joins(f"d{number - 1:03d}", f"d{number:03d}", way, at)
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:  # a forked one would count this one's memory
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:  # a forked one would include this one's memory
         return process.submit(_at_once, folder, joins).result()
 
 
 def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
-    """As `merge` does it: the graph of all drives, then their maps into one file."""
+    """As in `merge`: the graph of all drives, then their maps into one file."""
     start, began = peak_mb(), time.process_time()
     with ExitStack() as stack:
         stores = [(path.stem, stack.enter_context(MapStore.open(path))) for path in sorted(folder.glob("d*.dpm2map"))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives with a hole: is the odometry right after it, and does it say so where it is not?"""
+"""Drives with a gap: is the odometry right after it, and does it report if it is not?"""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from dpm2_core.tables import FigureTable, record_table
 
 _SECONDS = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
 _PLACES = 5
-_BEFORE, _WARM, _AFTER = 10, 40, 30  # frames: at least before a gap, at most before and after it
+_BEFORE, _WARM, _AFTER = 10, 40, 30  # frames: least number before a gap, largest number before and after it
 _WRONG = 1.0  # m, across the gap
-_CHI2 = 14.16  # of 3 degrees of freedom: 3 sigma
+_CHI2 = 14.16  # for 3 degrees of freedom: 3 sigma
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Gap:
 
 
 def gaps(stamps: Sequence[int]) -> Iterator[Gap]:
-    """Those of each length that a drive with these stamps (ns) has room for, at places spread evenly over it."""
+    """The gaps of each length that fit into a drive with these stamps (ns), evenly spread over it."""
     period = frame_period(stamps)
     for seconds in _SECONDS:
         missing = round(seconds / period)
@@ -72,8 +72,8 @@ def bench_gaps(options: Options) -> Report:
 def evaluated(
     frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings, warm: int = _WARM
 ) -> dict[str, Any]:
-    """What the odometry does after one gap, of which it has had `warm` frames before, at most; errors are those of the
-    way from the last pose before it."""
+    """Results of the odometry after one gap, with at most `warm` frames before it; errors are of the motion since the
+    last pose before it."""
     odometry = make_odometry(settings)
     before = [odometry.process(frame) for frame in frames[max(gap.first - warm, 0) : gap.first]][-1]
     last, base, errors, states, uncovered = before, np.zeros((6, 6)), [], [], 0
@@ -104,19 +104,19 @@ def evaluated(
 
 
 def measured_on(frames: Sequence[Frame]) -> Frame:
-    """The last frame with the samples of all: an IMU goes on in a gap."""
+    """The last frame with the IMU samples of all frames: an IMU continues in a gap."""
     imus = [frame.imu for frame in frames if frame.imu is not None]
     return replace(frames[-1], imu=reduce(Inertial.then, imus) if imus else None)
 
 
 def _since(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:
-    """Covariance (6, 6) of a pose, that of the last registered one before it being `base`; as the ROS node adds up."""
+    """Covariance (6, 6) of a pose from `base`, that of the last registered pose; accumulated as in the ROS node."""
     A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ last.T_odom_lidar)
     return np.asarray(A @ base @ A.T + tracked.covariance)
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """How many gaps there are, are silently wrong, are bridged, and are broken; of each length and in all."""
+    """Number of gaps, and of those that are silently wrong, bridged, and broken; for each length and for all."""
     parts = {f"{s:g} s": [row for row in rows if row["seconds"] == s] for s in _SECONDS} | {"all": list(rows)}
     return {
         name: {

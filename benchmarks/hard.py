@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who survives what: the hardships of `hardships.py` for each registration and for KISS-ICP, with a picture."""
+"""Robustness: the hardships of `hardships.py` for each registration and for KISS-ICP, with an image of the results."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _BLIND = "slam.visual.enabled=false"
 _SYNTHETIC_FRAMES = 80
 _RATES = tuple(f"every {every}" for every in EVERY)
 _SYNTHETIC: tuple[tuple[str, PresetName, int], ...] = (("loop", "city", 940_000), ("random", "suburb", 940_001))
-"""Worlds that no training has seen, beside the real drives."""
+"""Worlds that were not used in training, in addition to the real drives."""
 
 
 def bench_hard(options: Options) -> Report:
     """Every method in every hardship on every drive, once, without images; `--only` chooses one method.
 
-    The picture is `hard.png` beside the record.
+    The image is `hard.png` next to the record.
 
     Raises:
         UsageError: there is no drive, or one has no ground truth.
@@ -63,7 +63,7 @@ def bench_hard(options: Options) -> Report:
 
 
 def draw(path: Path, results: Mapping[str, Any]) -> None:
-    """The picture: a table for each drive, a row for each hardship, a column for each method."""
+    """Draw a table for each drive, with a row for each hardship and a column for each method."""
     panels = {
         drive: {
             case: {method: (figures["verdict"], figures["error_m"]) for method, figures in methods.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What breaks odometries, made of any drive: few frames per second, gaps, blindness, fog, a bad start, kidnapping."""
+"""Failure cases for odometry, made from any drive: low frame rates, gaps, blindness, fog, a bad start, kidnapping."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 
 EVERY = (1, 3, 6, 10)
-"""Every so manieth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
+"""Only every Nth frame: at 10 Hz and 50 km/h 1.4, 4, 8 and 14 m apart."""
 GAPS, BLIND = (1.0, 2.0, 3.0, 5.0), (1.0, 2.0, 3.0)  # s
 FOG = {"fog 40 m": (0.4, 40.0), "fog 20 m": (0.6, 20.0)}
-"""Fraction of pulses that return from it, and how far one sees, m."""
+"""Fraction of pulses that return from the fog, and visibility, m."""
 _BEFORE, _AFTER = 14, 14  # frames around a gap or a blind sensor
-_START = 18  # frames of a drive that begins at a bad moment
-_AWAY = 2.0  # s that a robot is carried
-_RIGHT = 0.5, 0.02  # m, and of the way: no farther off is right
-_STILL = 3.0  # m/s, and
-_TURNING = 0.1  # rad/s: less is no curve
+_START = 18  # frames of a drive that starts in motion
+_AWAY = 2.0  # s, duration of a kidnapping
+_RIGHT = 0.5, 0.02  # m, and fraction of the distance: the largest error that is right
+_STILL = 3.0  # m/s: least speed of a start in motion
+_TURNING = 0.1  # rad/s: least rate of a start in a curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,9 @@ class Case:
     """One hardship.
 
     Attributes:
-        frames: what the method is given. truth: (N, 4, 4) their poses.
-        event: the first frame after what happens.
-        base: the last frame before it; errors are those of the way from there.
+        frames: input of the method. truth: (N, 4, 4) their poses.
+        event: the first frame after the event.
+        base: the last frame before the event; errors are of the motion since then.
     """
 
     name: str
@@ -47,9 +47,9 @@ class Case:
 
 
 def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
-    """All that a drive, its frames and their poses (N, 4, 4), has room for."""
+    """All cases that fit into a drive, given its frames and their poses (N, 4, 4)."""
     count = len(frames)
-    for every in [every for every in EVERY if count > every]:  # two frames at least
+    for every in [every for every in EVERY if count > every]:  # at least two frames
         yield Case(f"every {every}", list(frames[::every]), truth[::every])
     period = frame_period([frame.stamp for frame in frames])
     for kind, lengths in (("gap", GAPS), ("blind", BLIND)):
@@ -66,14 +66,14 @@ def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
 
 
 def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str, Any]:
-    """How far off the second half of what follows is, and what the method said of it.
+    """Error in the second half of the frames after the event, and whether the method reported it.
 
     Args:
-        poses: (N, 4, 4). states: of each frame; None where the method has none, and so never doubts.
+        poses: (N, 4, 4). states: of each frame; None if the method has none, and so reports no doubt.
 
     Returns:
-        `error_m`, the worst, m; `verdict`: `right`, `said` (wrong, but no wrong frame claimed to be tracking) or
-        `silent` (wrong without a word).
+        `error_m`, the largest, m; `verdict`: `right`, `said` (wrong, but no wrong frame has the state tracking) or
+        `silent` (wrong without a report).
     """
     base = case.base
     steps = np.linalg.norm(np.diff(case.truth[:, :3, 3], axis=0), axis=1)
@@ -89,7 +89,7 @@ def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str
 
 
 def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, missing: int) -> Case:
-    """Without some frames, or, for `blind`, with frames that show nothing but dirt on the window."""
+    """Without some frames, or, for `blind`, with frames that contain only dirt on the window."""
     start, stop = max(first - _BEFORE, 0), min(first + missing + _AFTER, len(frames))
     between = range(first, first + missing) if name.startswith("blind") else range(0)
     indices = [*range(start, first), *between, *range(first + missing, stop)]
@@ -98,7 +98,7 @@ def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, m
 
 
 def _dirty(frame: Frame) -> Frame:
-    """Some returns from the window itself."""
+    """A frame with only some returns from the window itself."""
     rng = np.random.default_rng(frame.index)
     points = np.c_[rng.uniform(-0.5, 0.5, (300, 3)), np.zeros(300)].astype(np.float32)
     return Frame(frame.stamp, points, index=frame.index)
@@ -111,7 +111,7 @@ def _foggy(frame: Frame, dust: float, sight: float) -> Frame:
 
 
 def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Case]:
-    """From where the vehicle is fastest, and from where it turns fastest."""
+    """Starts where the vehicle is fastest, and where it rotates fastest."""
     room = len(frames) - _START
     if room < 1:
         return
@@ -124,7 +124,7 @@ def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Ca
 
 
 def _kidnapped(frames: Sequence[Frame], truth: Array) -> Case:
-    """Carried back to where one has been, 2 s later: the stamps go on."""
+    """Moved back to an earlier position, 2 s later: the stamps continue."""
     half = len(frames) // 2
     back = half // 4
     again = range(back, min(back + _AFTER, half))

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an IMU is worth to a robot that turns at 100 deg/s, and to a car whose LiDAR pauses: the same scans with it,
-without, and with one that stops."""
+"""Benefit of an IMU for a robot that rotates at 100 deg/s, and for a car whose LiDAR pauses: the same scans with an
+IMU, without, and with one that stops."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ WORLDS: dict[str, tuple[PresetName, int, float, float]] = {
     "car park": ("car_park", 911, 3.0, 90.0),
     "suburb": ("suburb", 912, 2.0, 90.0),
 }
-"""Kind of world, its seed, speed in m/s, and by how many degrees the robot also turns to either side as it drives."""
+"""Type of environment, seed, speed in m/s, and angle in degrees by which the robot also rotates to either side."""
 FRAMES = 200
 LIDAR = LidarConfig(beams=16, columns=1024, height=0.8, car_body=False, min_range=0.4)
 LENGTHS = (5.0, 10.0)
-"""Of the KITTI metric's segments, m."""
+"""Lengths of the KITTI metric's segments, m."""
 WAYS: dict[str, Callable[[Frame], Frame]] = {
     "without": lambda frame: replace(frame, imu=None),
     "with": lambda frame: frame,
     "stops": lambda frame: frame if frame.index < FRAMES // 2 else replace(frame, imu=None),
 }
-"""Of each frame, what the odometry is given."""
+"""The input of the odometry for each frame."""
 CAR_FRAMES = 260
 CAR_LIDAR = LidarConfig()
-CAR = Ride(10.0, slows=0.8)  # by up to 2 m/s2
+CAR = Ride(10.0, slows=0.8)  # accelerations of up to 2 m/s2
 _OF_PAUSES = ("without", "with")
 
 
@@ -76,7 +76,7 @@ def bench_imu(options: Options) -> Report:
 
 
 def _pauses(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
-    """After each of many gaps: how it went, and the error up to 3 s later, over the gaps of each length."""
+    """Results after each of many gaps, and the error up to 3 s later, summarized by the length of the gap."""
     rows = [
         evaluated(frames, truth, gap, settings, warm=len(frames)) for gap in gaps([frame.stamp for frame in frames])
     ]
@@ -102,12 +102,12 @@ def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dic
 
 
 def _rates(poses: Array) -> NDArray[np.float64]:
-    """Of each step, deg/s."""
+    """Angular rate of each step, deg/s."""
     return np.degrees(se3.angle(se3.inverse(poses[:-1]) @ poses[1:])) / FRAME_PERIOD
 
 
 def _tilt(poses: Array, truth: Array) -> NDArray[np.float64]:
-    """Between the vertical that each pose says and the true one, degrees."""
+    """Angle between the vertical of each pose and the true one, degrees."""
     up = np.einsum("nij,nkj->nik", poses[:, :3, :3], truth[:, :3, :3])[:, 2, 2]
     return np.degrees(np.arccos(np.clip(up, -1, 1)))
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM in buildings with the settings of nobody: 16 beams that err as real ones, rooms, corridors, halls and stairs.
+"""SLAM in buildings with default settings: 16 beams with realistic errors; rooms, corridors, halls and stairs.
 
-Then what would be silently wrong: visits to each, at random places and headings, looked for in all maps, also in dust;
-and thirds of each drive as drives of their own in one map, most of which see different parts of a place that looks
-alike everywhere.
+Then possible silent errors: visits to each world, at random positions and headings, are searched in all maps, also in
+dust. And each third of a drive is added to one map as a drive of its own; most of them show different parts of a
+building that looks alike everywhere.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ WORLDS: dict[str, tuple[PresetName, int, int]] = {
     "building A": ("indoor", 900, 500), "building B": ("indoor", 901, 500),
     "car park A": ("car_park", 902, 300), "car park B": ("car_park", 903, 300),
 }  # fmt: skip
-"""Kind of world, its seed, and frames at 10 Hz."""
+"""Type of environment, seed, and number of frames at 10 Hz."""
 BEAMS = 16
 LENGTHS = (5.0, 10.0, 20.0)
-"""Of the KITTI metric's segments, m."""
+"""Lengths of the KITTI metric's segments, m."""
 
 
 def bench_indoor(options: Options) -> Report:

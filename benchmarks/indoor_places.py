@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places in buildings: found from one scan in a map, and drives joined to one map, or honestly not."""
+"""Indoor places: relocalization from one scan in a map, and drives joined into one map, or correctly left apart."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.tables import FigureTable, record_table
 
 HEIGHT = 0.8
-"""Of the LiDAR above the floor, m."""
+"""Height of the LiDAR above the floor, m."""
 VISITS, VISITS_SEED = 60, 5
-"""Random places and headings in each world."""
+"""Number of random positions and headings in each world, and the seed."""
 DUST = 0.3
-"""Fraction of the pulses that meet dust in visits of their own; the maps are made without."""
+"""Fraction of the pulses that hit dust in a second set of visits; the maps are made without dust."""
 WRONG_M, WRONG_DEG = 0.5, 5.0
-"""A loop that is off by more than either is wrong: the next room."""
+"""A loop with a larger error than either is wrong, such as to the next room."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """A scan as the SLAM keeps it, and T_map_lidar (4, 4) in the map of its own world."""
+    """A scan as the SLAM stores it, and T_map_lidar (4, 4) in the map of its own world."""
 
     keyframe: Keyframe
     truth: Array
@@ -64,7 +64,7 @@ def visits_to(config: DriveConfig, settings: SlamSettings) -> tuple[list[Visit],
 
 
 def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[Visit]], home: str) -> dict[str, Any]:
-    """Visits to the world of the map, and how many of those to the other worlds it takes for its own."""
+    """Visits to the world of the map, and how many visits to other worlds are wrongly located in the map."""
     localizer, rows, mistaken = make_localizer(settings, mapper), [], 0
     for name, of_world in visits.items():
         for visit in of_world:
@@ -78,7 +78,7 @@ def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[V
 
 
 def joins(drive: Path, settings: SlamSettings) -> dict[str, int]:
-    """Each two thirds of a drive in one map: how many pairs are joined rightly, wrongly, or stay apart."""
+    """Each ordered pair of thirds of a drive in one map: how many are joined correctly, wrongly, or not at all."""
     source = KittiSource(drive, InputSettings(images=False))
     config = Config(input=InputSettings(images=False), slam=settings)
     assert source.poses is not None
@@ -104,13 +104,13 @@ def _joined(mapper: Mapper, truth: Array) -> str:
 
 
 def is_wrong(truth: Array, loop: Edge) -> bool:
-    """Whether a loop between keyframes at `truth` (N, 4, 4) leads to another place: the next room."""
+    """Whether a loop between keyframes at `truth` (N, 4, 4) leads to another place, such as the next room."""
     meters, degrees = error_of(loop, truth)
     return meters > WRONG_M or degrees > WRONG_DEG
 
 
 def relocalise_table(worlds: dict[str, Any], key: str, title: str) -> FigureTable:
-    """What `relocalised` found, of the results under a key."""
+    """The results of `relocalised` under a key."""
     figures = ("right %", "no answer", "wrong", "median m", "other worlds' taken for it", "p95 s")
     table = FigureTable(title, names=["world"], figures=figures)
     for name, world in worlds.items():
@@ -122,6 +122,6 @@ def relocalise_table(worlds: dict[str, Any], key: str, title: str) -> FigureTabl
 
 
 def join_table(worlds: dict[str, Any]) -> FigureTable:
-    """What `joins` found."""
+    """The results of `joins`."""
     columns = {kind: f"{{joins[{kind}]}}" for kind in ("right", "apart", "wrong")}
     return record_table("two thirds of a drive in one map", ["world"], columns, worlds)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.livox_drive FOLDER SEQUENCE`: a public drive of another sensor as a KITTI sequence.
+"""`python -m benchmarks.livox_drive FOLDER SEQUENCE`: converts a public drive of another LiDAR to a KITTI sequence.
 
 FOLDER is datas/benchmark_realworld of github.com/hku-mars/BALM (Liu et al., "Efficient and consistent bundle adjustment
-on LiDAR point clouds", T-RO 2023): 177 scans of a Livox Avia at walking pace, two a second. It needs the extra
+on LiDAR point clouds", T-RO 2023): 177 scans of a Livox Avia at walking pace, two per second. It needs the extra
 `datasets`.
 """
 
@@ -22,10 +22,10 @@ _POSES = "alidarPose.csv"
 
 
 def write_sequence(folder: Path, sequence: Path) -> None:
-    """Scans, times and poses as KITTI's odometry has them.
+    """Write scans, times and poses in the layout of KITTI odometry.
 
     Raises:
-        UsageError: scans cannot be read, there are not as many poses as scans, or `sequence` is there.
+        UsageError: scans cannot be read, there are not as many poses as scans, or `sequence` exists already.
     """
     scans = CloudFolder(folder)
     try:
@@ -37,7 +37,7 @@ def write_sequence(folder: Path, sequence: Path) -> None:
     if sequence.exists():
         raise UsageError(f"{sequence}: is there already")
     poses = rows.reshape(-1, 4, 4)
-    times = poses[:, 3, 3].copy()  # where others have a 1
+    times = poses[:, 3, 3].copy()  # in place of the 1 of a transform
     poses[:, 3] = 0, 0, 0, 1
     (sequence / "velodyne").mkdir(parents=True)
     for frame in scans.frames():
@@ -45,7 +45,7 @@ def write_sequence(folder: Path, sequence: Path) -> None:
             raise UsageError(frame.problem)
         frame.points.astype("<f4").tofile(sequence / "velodyne" / f"{frame.index:06d}.bin")
     np.savetxt(sequence / "times.txt", times - times[0], "%.6f")
-    (sequence / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")  # the poses are the LiDAR's
+    (sequence / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")  # the poses are of the LiDAR
     write_kitti(sequence / "poses.txt", poses)
 
 

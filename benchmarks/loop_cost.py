@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a keyframe costs as the map grows, in time and memory: keyframes of random descriptors, but a real network."""
+"""Time and memory per keyframe as the map grows: keyframes with random descriptors, but a real network."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _EDGE = Registration(np.eye(4), np.eye(6) * 1e-4, 1.0, 0.1, "made")
 
 
 def bench_loop_cost(options: Options) -> Report:
-    """CPU time of `LoopCloser.close` a keyframe in maps of each size; candidates are compared, none is a loop.
+    """CPU time of `LoopCloser.close` per keyframe in maps of each size; candidates are compared, none is a loop.
 
-    And the resident memory of the largest map, the clouds being on disk.
+    And the resident memory of the largest map, with the clouds on disk.
     """
     settings = settings_of(options)
     world = build_world("straight", "suburb", seed=8, length=100.0)
@@ -37,17 +37,17 @@ def bench_loop_cost(options: Options) -> Report:
     loops = make_loops(settings)
     poses = np.tile(np.eye(4), (max(SIZES) + _MEASURED, 1, 1))
     poses[:, 0, 3] = 5.0 * np.arange(len(poses))  # a straight road of 100 km
-    parts = np.zeros(len(poses), np.intp)  # all are tied together
+    parts = np.zeros(len(poses), np.intp)  # all are connected
     few = SIZES[0]
     keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[:few])]
-    make_loops(settings).close(keyframes, [cloud] * few, poses[:few], parts[:few])  # torch takes its memory
+    make_loops(settings).close(keyframes, [cloud] * few, poses[:few], parts[:few])  # lets torch allocate its memory
     empty = resident_mb()
     for node in tracked(range(few, len(poses)), "map"):
         keyframes.append(_keyframe(node, poses[node], rng))
     for size in SIZES:
         clouds = [cloud] * len(keyframes)
         seconds = []
-        loops.close(keyframes[:size], clouds, poses[:size], parts[:size])  # takes in all that is new
+        loops.close(keyframes[:size], clouds, poses[:size], parts[:size])  # adds all new keyframes
         for last in range(size + 1, size + _MEASURED):
             started = process_time()
             loops.close(keyframes[:last], clouds, poses[:last], parts[:last])
@@ -62,7 +62,7 @@ def bench_loop_cost(options: Options) -> Report:
 
 
 def _keyframe(node: int, T: Array, rng: np.random.Generator) -> Keyframe:
-    """One with random descriptors of 16 directions, so that no two places are alike."""
+    """A keyframe with random descriptors of 16 directions, so that no two places are alike."""
     features = rng.normal(size=(256, 16)) @ rng.normal(size=(16, 128))
     xyz = (rng.normal(size=(256, 3)) * (20, 20, 2)).astype(np.float32)
     return Keyframe(node, node, node, se3.make(np.eye(3), T[:3, 3]), NO_POINTS, _EDGE if node else None, "",

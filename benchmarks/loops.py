@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops against the truth: how many were wrong, and which revisits were found."""
+"""Loops compared with the ground truth: wrong loops, and revisits that were found."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 WRONG_M, WRONG_DEG = 5.0, 5.0
-"""A loop that is off by more than either is wrong."""
+"""A loop with a larger error than either is wrong."""
 NEAR, GAP = 10.0, 50.0
-"""A revisit: a keyframe so near to an earlier one, m, with at least so much path between them, m."""
+"""A revisit: a keyframe at most this far from an earlier one, m, with at least this length of path between them, m."""
 
 
 def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
     """Counts of loops and revisits.
 
     Args:
-        loops: all that were tried.
+        loops: all candidates that were tried.
         truth: (N, 4, 4) true poses of the keyframes, in the order of the map.
 
     Returns:
-        accepted and wrong loops, the median error of the right ones, and for revisits in the same direction (within
-        45 deg), in reverse (beyond 135 deg) and across how many there were and for how many a right loop was accepted.
-        A keyframe counts as a revisit in the same direction if any earlier one near it looks there, and so on.
+        Accepted and wrong loops, and the median error of the right ones. For revisits in the same direction (within 45
+        deg), in reverse (beyond 135 deg) and across: their number, and how many have an accepted right loop. A keyframe
+        counts as a revisit in the same direction if any earlier one near it has that heading, and so on.
     """
     found: set[int] = set()
     errors, wrong, rejections = [], 0, Counter[str]()
@@ -58,13 +58,13 @@ def check_loops(loops: Sequence[Edge], truth: Array) -> dict[str, Any]:
 
 
 def error_of(loop: Edge, truth: Array) -> tuple[float, float]:
-    """How far a loop is off, m and degrees; (N, 4, 4) true poses of the keyframes."""
+    """Error of a loop, m and degrees, given (N, 4, 4) true poses of the keyframes."""
     T_from_to = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
     return se3.apart(T_from_to, loop.T_from_to)
 
 
 def revisits(truth: Array) -> dict[str, set[int]]:
-    """The keyframes that come back to an earlier place, by their heading there; (N, 4, 4) true poses."""
+    """The keyframes that return to an earlier position, by their heading there; (N, 4, 4) true poses."""
     positions = truth[:, :3, 3]
     path = arc_lengths(positions)
     heading = np.arctan2(truth[:, 1, 0], truth[:, 0, 0])

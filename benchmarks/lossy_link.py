@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bad network on one machine, for `make bench-robots`: two network namespaces and a link between them."""
+"""A simulated bad network on one machine, for `make bench-robots`: two network namespaces and a link between them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from dpm2_core.errors import UsageError
 
 LOSS = 0.01
-"""Of the packets that arrive at either end of the link."""
+"""Fraction of the packets dropped on arrival at either end of the link."""
 _INSIDE = "DPM2_OWN_NETWORK"
 _ROBOTS, _MAPPER = ("robots0", "10.73.0.1/24"), ("mapper0", "10.73.0.2/24")
 _RULES = """
@@ -25,15 +25,15 @@ nft add rule inet link arriving iifname {name} numgen random mod 10000 '<' {shar
 
 
 def inside() -> bool:
-    """Whether this process is in the namespace that `own_network` makes."""
+    """Whether this process runs in the namespace created by `own_network`."""
     return _INSIDE in os.environ
 
 
 def own_network(module: str) -> int:
-    """Run a module with the arguments of this process in a namespace that nothing outside shares; its exit code.
+    """Run a module with this process's arguments in a separate network namespace; returns its exit code.
 
     Raises:
-        UsageError: not root, or `unshare`, `ip` or `nft` are missing.
+        UsageError: not root, or `unshare`, `ip` or `nft` is missing.
     """
     missing = [tool for tool in ("unshare", "ip", "nft") if shutil.which(tool) is None]
     if os.geteuid() != 0 or missing:
@@ -43,13 +43,13 @@ def own_network(module: str) -> int:
 
 
 def make_link() -> None:
-    """The link; this process is at the robots' end of it."""
+    """Create the link; this process is at the robots' end of it."""
     _sh(f"ip link set lo up; ip link add {_ROBOTS[0]} type veth peer name {_MAPPER[0]}")
     _sh(f"ip address add {_ROBOTS[1]} dev {_ROBOTS[0]}; ip link set {_ROBOTS[0]} up" + _rules(_ROBOTS[0]))
 
 
 def start_mapper(arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> subprocess.Popen[bytes]:
-    """mapper_node at the other end, over UDP: shared memory would go past the link."""
+    """Start mapper_node at the other end, over UDP: shared memory would bypass the link."""
     name, address = _MAPPER
     node = shlex.join([sys.executable, "-m", "dpm2_ros.executables", "mapper_node", *arguments])
     script = f"""
@@ -64,13 +64,13 @@ def start_mapper(arguments: Sequence[str], environment: Mapping[str, str], log: 
             stdout=file,
             stderr=subprocess.STDOUT,
         )
-    # The process is in this namespace still when it starts: moving the link there changes nothing.
+    # The process starts in this namespace: moving the link there too early has no effect.
     _sh(f"while ip link show {name} > /dev/null 2>&1; do ip link set {name} netns {mapper.pid}; sleep 0.1; done")
     return mapper
 
 
 def switch_link(up: bool) -> None:
-    """Take the link away, or give it back."""
+    """Take the link down or up."""
     _sh(f"ip link set {_ROBOTS[0]} {'up' if up else 'down'}")
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sweeps in motion: raw scans, with the time of each point, of LiDARs on a car, on foot, on legs and in the air.
 
-No IMU. The velocity changes within each sweep, which bends its scan; what is measured is the step from scan to scan.
+No IMU. The velocity changes within each sweep, which distorts its scan; measured is the step from scan to scan.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ WORLDS: dict[str, tuple[PresetName, int, int, tuple[str, ...]]] = {
     "suburb": ("suburb", 920, 32, tuple(RIDES)),
     "building": ("indoor", 921, 16, ("walking", "waved", "legged")),
 }
-"""Kind of world, its seed, beams, and the rides through it."""
+"""Type of environment, seed, beams, and the rides through it."""
 FRAMES = 150
 OURS, BASELINE = ("dpm2", "dpm2 geometric"), "kiss-icp"
-_MOVING = 20  # frames, after which all that shakes does
+_MOVING = 20  # frames, after which all shakes have begun
 
 
 def bench_motion(options: Options) -> Report:
@@ -61,7 +61,7 @@ def _ours(frames: Iterable[Frame], robot: TurningRobot, settings: SlamSettings) 
 
 
 def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[str, Any]:
-    """Compared with the truth in the middle and at the end of the sweeps: what fits better counts.
+    """Compared with the truth in the middle and at the end of the sweeps; the better result counts.
 
     Raises:
         MissingPackageError: it is not installed.
@@ -74,7 +74,7 @@ def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[st
 
 
 def _errors(poses: Array, truth: Array) -> dict[str, float]:
-    """Of the steps from scan to scan: root mean squares, and the largest."""
+    """Errors of the steps from scan to scan: root mean square, and largest."""
     steps, true = (se3.inverse(T[:-1]) @ T[1:] for T in (poses, truth))
     off = np.array([se3.magnitude(T) for T in (se3.inverse(true) @ steps)[_MOVING:]])
     rms, worst = np.sqrt((off**2).mean(0)), off.max(0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which reference points of a frame meet one of the next frame: by the true motion, with no learning in it."""
+"""Which reference points of a frame are close to one of the next frame, given the true motion; nothing is learned."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from dpm2_core.sim.settings import LidarConfig, PresetName
 from dpm2_core.sim.world import build_world
 
 WITHIN = (0.2, 0.4)
-"""Distances at which two reference points count as the same place, m."""
+"""Largest distances of two reference points that count as the same point, m."""
 APART = (1, 3, 8)
-"""Frames between the two."""
+"""Distance between the two frames, in frames."""
 WITH_IMAGES = "salient, with images"
 _CHOSEN_BY = {"farthest points": "fps", "salient": "salient", WITH_IMAGES: "salient"}
 _SIMULATED: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park")
@@ -35,9 +35,9 @@ _FRAMES, _SEED = 30, 950_000
 
 
 def repeated(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Shares of every drive and of one simulated drive of each kind, as a real sensor sees it, and a figure of them.
+    """Shares for every drive and for one simulated drive of each kind, with a realistic sensor; and a figure of them.
 
-    No simulated ones with `--unseen`.
+    Simulated drives are left out with `--unseen`.
     """
     found: dict[str, Any] = {}
     with drives(options) as sources:
@@ -69,7 +69,7 @@ def _simulated(kind: PresetName, network: NetworkSettings) -> tuple[list[Frame],
 
 
 def shares(frames: Sequence[Frame], poses: Array, network: NetworkSettings, most: int) -> dict[str, Any]:
-    """By the way that they are chosen and the frames between: the mean over at most `most` pairs."""
+    """Shares by method of selection and frames apart: the mean over at most `most` pairs."""
     cropped = [crop(frame.points, network.points) for frame in frames]
     out: dict[str, Any] = {}
     for name, reference in _CHOSEN_BY.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalization in a saved map: random places, headings and offsets, other traffic than when the map was made."""
+"""Relocalization in a saved map: random positions, headings and offsets, with other traffic than during mapping."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from dpm2_core.slam.store.map_data import load_map
 from dpm2_core.slam.store.map_store import MapStore
 
 LATERAL = (-1.2, 3.0)
-"""m to the left of the drive: as far as cars at the kerb leave room, and into the other lane."""
+"""m to the left of the drive: from cars parked at the curb to the other lane."""
 APART = 5000.0
-"""Between the roads in the map, m: the one map of all of them."""
+"""Distance between the roads in the single map of all roads, m."""
 _NO_LOOPS = 1e9  # m between two keyframes of a loop
 _EDGE = isotropic(np.radians(0.15), 0.05)
 
@@ -46,7 +46,7 @@ class Road:
 
 
 def bench_relocalise(options: Options) -> Report:
-    """Survey the roads at a keyframe each 5 m, save the map, load it, and look for `pairs` random scans in it.
+    """Map the roads with a keyframe every 5 m, save the map, load it, and relocalize `pairs` random scans in it.
 
     Without `--source` also on a highway and in a tunnel, where the geometry looks alike everywhere.
 
@@ -73,7 +73,7 @@ def bench_relocalise(options: Options) -> Report:
 
 
 def survey(options: Options, settings: SlamSettings, file: Path, progress: Progress) -> list[Road]:
-    """Write the map of all roads, poses as they truly are: relocalization alone is measured."""
+    """Write the map of all roads with true poses, so that only relocalization is measured."""
     settings = settings.model_copy(update={"loops": settings.loops.model_copy(update={"gap": _NO_LOOPS})})
     roads: list[Road] = []
     with MapStore.create(file) as store:
@@ -96,7 +96,7 @@ def survey(options: Options, settings: SlamSettings, file: Path, progress: Progr
 
 
 def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tuple[Points, Array]]:
-    """Clouds of random visits, and T_map_lidar (4, 4) where they truly were taken."""
+    """Clouds of random visits, and the true T_map_lidar (4, 4) of each."""
     rng, lidar = np.random.default_rng(0), Lidar()
     lengths = np.array([road.drive.world.road.drive.length for road in roads])
     for _ in range(count):
@@ -110,6 +110,6 @@ def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tu
 
 
 def spaced(drive: SimulatedDrive, meters: float) -> list[int]:
-    """Frames of a drive that are so far apart along it."""
+    """Frames of a drive that are `meters` apart along it."""
     driven = drive.world.road.distance(drive.times)
     return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], meters)})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalization where the geometry looks alike everywhere: one scan on a highway and in a tunnel of a kilometer."""
+"""Relocalization where the geometry looks alike everywhere: one scan on a highway and in a tunnel of one kilometer."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from dpm2_core.slam.loops.pictures import KnownMap
 from dpm2_core.slam.settings import SlamSettings
 
 WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
-"""And their seeds."""
+"""Environments, and their seeds."""
 LENGTH = 1000.0
-"""Of each road, m, to which curves are added."""
+"""Length of each road, m, without added curves."""
 _CAMERA = CameraConfig(width=620, height=188, focal=360.0)
 _AHEAD = 0.1
-"""Headings differ by at most so much from those of the map, rad: a camera that looks back sees another picture."""
+"""Largest difference in heading from the map, rad: a camera that faces back sees another image."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """A place on the road, and the scan and the image from there."""
+    """A pose on the road, with a frame from there."""
 
     T_map_lidar: Array
     frame: Frame
@@ -42,10 +42,10 @@ class _Seen:
 def open_roads(
     settings: SlamSettings, network: DeepPointMap2, progress: Progress, spacing: float = 5.0, visits: int = 40
 ) -> dict[str, Any]:
-    """Random visits to each road, in other traffic, looked for in its map; without images, and with those of both.
+    """Random visits to each road, with other traffic, searched in its map; without images, and with images of both.
 
     Args:
-        spacing: of the keyframes of the map along the road, m.
+        spacing: distance of the map's keyframes along the road, m.
     """
     out: dict[str, Any] = {}
     for preset, seed in WORLDS.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One visit to a saved map, and the figures of many."""
+"""One visit to a saved map, and the summary of many."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from dpm2_core.slam.preprocess import Preprocessor
 from dpm2_core.slam.settings import SlamSettings
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
-"""A result no farther off is right."""
+"""Largest error of a result that is right."""
 
 
 def relocalizer_in(settings: SlamSettings, network: DeepPointMap2, known: KnownMap) -> Relocalizer:
-    """What looks for a scan in a map, of streets."""
+    """A relocalizer in a map of streets."""
     verifier = make_verifier(settings)
     return Relocalizer(settings.relocalise, settings.visual, ByScale(verifier, verifier), network, known)
 
 
 def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any]:
-    """Figures of results: found or not, m and degrees off, seconds."""
+    """Summary of results: found or not, error in m and degrees, seconds."""
     ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
     right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
     given = meters[ok]
@@ -49,7 +49,7 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
 def looked_for(
     find: Callable[[Keyframe], Registration], visit: Keyframe, truth: Array
 ) -> tuple[bool, float, float, float]:
-    """The result for `success_rates` of a visit; `truth` T_map_lidar (4, 4)."""
+    """The result of a visit, for `success_rates`; `truth` T_map_lidar (4, 4)."""
     started = perf_counter()
     result = find(visit)
     seconds = perf_counter() - started
@@ -57,10 +57,10 @@ def looked_for(
 
 
 def measured(frame: Frame, settings: SlamSettings) -> Points:
-    """The points (N, 4) of a frame at rest, as the SLAM prepares them."""
+    """The points (N, 4) of a frame at rest, preprocessed as in the SLAM."""
     return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))[0]
 
 
 def kept(points: Points, settings: SlamSettings) -> Points:
-    """Of such points those (M, 4) that a keyframe keeps."""
+    """The (M, 4) of these points that a keyframe stores."""
     return points[voxel_first(points, settings.keyframes.voxel, far=settings.keyframes.range)]

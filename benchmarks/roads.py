@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM on real roads: the synthetic city laid along trajectories of KITTI, with traffic, at full length."""
+"""SLAM on real roads: the synthetic city along trajectories of KITTI, with traffic, at full length."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from dpm2_core.tables import FigureTable, record_table
 ROADS: dict[str, PresetName] = {
     "00": "suburb", "05": "suburb", "06": "city", "07": "city", "08": "suburb", "09": "rural",
 }  # fmt: skip
-"""Sequences, and what kind of place stands along them."""
+"""Sequences, and the type of environment along them."""
 FIRST_SEED = 800_000
-"""Worlds that no training has seen: the number of the sequence is added."""
+"""Worlds that were not used in training: the number of the sequence is added."""
 _ERRORS = ("t_err_percent", "r_err_deg_per_100m", "ape_rmse_m", "final_drift_percent")
 
 
@@ -48,7 +48,7 @@ def bench_roads(options: Options) -> Report:
 
 
 def open_road(path: Path) -> SimulatedDrive:
-    """The drive along a file of poses, in the world that belongs to it."""
+    """The drive along a file of poses, in the world for that file."""
     number = int(path.stem) if path.stem.isdigit() else 99
     return SimulatedDrive(str(path), ROADS.get(path.stem, "suburb"), FIRST_SEED + number, name=path.stem)
 
@@ -75,7 +75,7 @@ def drive(path: Path, settings: SlamSettings, progress: Progress) -> dict[str, A
 
 
 def road_files(options: Options) -> Sequence[Path]:
-    """The pose files to drive along: those given, or `ROADS` of the KITTI excerpt.
+    """The pose files to drive along: those given, or `ROADS` from the KITTI excerpt.
 
     Raises:
         UsageError: one is missing.
@@ -89,7 +89,7 @@ def road_files(options: Options) -> Sequence[Path]:
 
 
 def _summary(roads: dict[str, Any]) -> dict[str, Any]:
-    """Loops of all roads together."""
+    """Loops of all roads combined."""
     total: dict[str, Any] = {"accepted": 0, "wrong": 0}
     for name in ("accepted", "wrong"):
         total[name] = sum(road["loops"][name] for road in roads.values())

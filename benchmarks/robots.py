@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-robots`: three slam_nodes on overlapping parts of a real road, and one mapper_node behind a bad network.
 
-The mapper has a network of its own, joined to the robots' by one link that loses packets and is gone for 30 s
+The mapper has its own network, connected to the robots' by one link that loses packets and is down for 30 s
 (`lossy_link`). The robots drive at the same time, along KITTI's sequence 07 in the synthetic city.
 """
 
@@ -41,14 +41,14 @@ ROAD = "07"
 SPANS = {"red": (0, 420), "blue": (340, 760), "green": (680, 1100)}
 """Frames of each robot; green ends where red began."""
 EVERY = 2
-"""Frames from one scan of a robot to the next, which is sent a second later: all four nodes share a machine."""
+"""Frames between two scans of a robot. They are sent one second apart, since all four nodes share a machine."""
 OUTAGE = (60, 90)
-"""Of the link, s after the robots set off."""
+"""Begin and end of the link's outage, s after the robots start."""
 _START, _PERIOD = 1_000_000_000, 100_000_000  # ns: stamps; the scans were taken at 10 Hz
 
 
 class _Scans(SpunNode):
-    """Publishes the scans of all robots; notes the keyframes that they make."""
+    """Publishes the scans of all robots, and records the keyframes that they create."""
 
     def __init__(self, source: SimulatedDrive) -> None:
         from nav_msgs.msg import Odometry
@@ -67,13 +67,13 @@ class _Scans(SpunNode):
         self.made[robot].add(id)
 
     def connected(self) -> bool:
-        """Whether all robots and the mapper are there."""
+        """Whether all robots and the mapper are connected."""
         heard = [self._node.count_publishers(f"/{name}/dpm2/keyframe_odom") for name in SPANS]
         mapper = [self._node.count_publishers(f"/{name}/dpm2/keyframes_received") for name in SPANS]
         return all(heard) and all(mapper) and all(lidar.get_subscription_count() for lidar in self._lidars.values())
 
     def send(self, tick: int) -> None:
-        """The next scan of each robot."""
+        """Publish the next scan of each robot."""
         for name, (first, _) in SPANS.items():
             n = first + EVERY * tick
             points = self._source.frame(n).points
@@ -83,7 +83,7 @@ class _Scans(SpunNode):
 def bench(
     out: Annotated[Path, typer.Option(help="Folder for robots.json.")] = Path("benchmarks"),
 ) -> int:
-    """All keyframes in one map, and its error beside that of one robot that drives all of the road alone."""
+    """All keyframes in one map, and its error compared with that of one robot that drives the whole road alone."""
     path = next(path for path in road_files(Options()) if path.stem == ROAD)
     source = open_road(path)
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
@@ -111,10 +111,10 @@ def bench(
 
 
 def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[int]], int]:
-    """The map of all robots, the ids of the keyframes that each made, and how many of them during the outage.
+    """The map of all robots, the ids of the keyframes that each created, and how many of them during the outage.
 
     Raises:
-        Dpm2Error: they did not start, or the map did not get all keyframes.
+        Dpm2Error: the nodes did not start, or the map did not receive all keyframes.
     """
     environment, path = ros_environment() | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, root / "town.dpm2map"
     processes: list[subprocess.Popen[bytes]] = []
@@ -170,7 +170,7 @@ def _read(path: Path) -> MapData:
 
 
 def _errors(source: SimulatedDrive, data: MapData) -> Array:
-    """How far the keyframes (K, 3) of the map, aligned as a whole, are from where they were made, m."""
+    """(K, 3) m: difference of the map's keyframes, aligned as a whole, from their true positions."""
     frames = np.array([(keyframe.stamp - _START) // _PERIOD for keyframe in data.keyframes])
     truth = source.poses[frames]
     T_world_map = align(data.poses[:, :3, 3], truth[:, :3, 3])
@@ -188,7 +188,7 @@ def _evaluated(data: MapData, name: str, made: set[int], errors: Array) -> dict[
 
 
 def _alone(source: SimulatedDrive) -> float:
-    """APE of the keyframes of one robot that drives all of the road in one process, without ROS, m."""
+    """APE of the keyframes of one robot that drives the whole road in one process, without ROS, m."""
     slam = make_slam(SlamSettings())
     for n in range(0, SPANS["green"][1], EVERY):
         slam.process(source.frame(n))

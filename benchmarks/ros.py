@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults:
-alone, and with an IMU, where the drive has one, and a subscriber for everything; then with the network for each scan.
+"""`make bench-ros`: the KITTI excerpt through bag, bag_player and slam_node at 10 Hz, with the node's own defaults.
+First alone, then with an IMU, if the drive has one, and a subscriber for every topic; then with the network for each
+scan.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ WITH: dict[str, tuple[dict[str, object], bool]] = {
     ", neural": ({"input.imu_topic": "/none", "slam.registration": "neural"}, False),
     ", refined": ({"input.imu_topic": "/none", "slam.registration": "refined"}, False),
 }
-"""Parameters of the node, and whether all that it publishes has a subscriber, as with RViz and Nav2."""
+"""Parameters of the node, and whether every topic that it publishes has a subscriber, as with RViz and Nav2."""
 FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_ms", "ape_rmse_m", "rpe_trans_m")
 
 
@@ -40,7 +41,7 @@ def bench(
     out: Annotated[Path, typer.Option(help="Folder for ros.json.")] = Path("benchmarks"),
     repetitions: Annotated[int, typer.Option(min=1, help="Replays of every drive.")] = 3,
 ) -> int:
-    """Replay every drive at its own speed and evaluate the poses; medians, and the worst of what must not happen."""
+    """Replay every drive at its own rate and evaluate the poses; medians, and the worst number of dropped clouds."""
     options = Options(sources=sources or (), repetitions=repetitions)
     results: dict[str, dict[str, float | int | None]] = {}
     with drives(options) as found, tempfile.TemporaryDirectory(prefix="dpm2_bench_ros_") as folder:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a spinning LiDAR's scans say about the sensor itself, from points alone, real or simulated."""
+"""Properties of a spinning LiDAR, estimated from the points of its scans, real or simulated."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from dpm2_core.frame import Array
 
 RANGES = (5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 75.0)
 """Edges of the bins of distance, m."""
-_START = 0.02  # rad, how far off azimuth 0 a ring may begin
+_START = 0.02  # rad, largest azimuth offset from 0 at which a ring may begin
 _CELL = 1.5  # m, of ground that is taken as a plane
-_STEEP = 0.05  # of the ranges of neighbors on one surface
+_STEEP = 0.05  # of the range: largest difference of neighbors on one surface
 
 
 def rings_of(points: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -26,14 +26,14 @@ def rings_of(points: NDArray[np.float32]) -> NDArray[np.intp]:
 
 
 def statistics(scans: Sequence[NDArray[np.float32]]) -> dict[str, Any]:
-    """Figures of the scans (N, 4) of one sensor; lists go by the bins of `RANGES`, None where there is too little.
+    """Figures of the scans (N, 4) of one sensor; lists are by the bins of `RANGES`, None if there are too few points.
 
-    ring_gap_deg: median and deviation of the gaps between rings, upper half and lower half. upper_origin_m: height of
-    where the upper beams come from over the sensor's origin: what comes back from near then lies higher. wobble_deg:
-    deviation of the elevation within an upper ring beside that. ring_range_noise_m: of a single return beside its
-    neighbors of the same ring. plane_rms_m: distance of ground points to the plane of their
-    cell. ring_bias_m: deviation between rings of their mean distance to those planes. lost: fraction of pulses without
-    return between two returns from one surface. intensity: quantiles 10, 50, 90 %, and the fraction of zeros.
+    ring_gap_deg: median and standard deviation of the gaps between rings, upper half and lower half. upper_origin_m:
+    height of the origin of the upper beams above the sensor's origin; close returns then appear higher. wobble_deg:
+    remaining standard deviation of the elevation within an upper ring. ring_range_noise_m: of a single return relative
+    to its neighbors on the same ring. plane_rms_m: distance of ground points from the plane of their cell.
+    ring_bias_m: standard deviation between rings of their mean distance to those planes. lost: fraction of pulses
+    without return between two returns from one surface. intensity: quantiles 10, 50, 90 %, and the fraction of zeros.
     """
     elevations, upper = [], []
     noise: list[list[Array]] = [[] for _ in RANGES[1:]]
@@ -77,7 +77,7 @@ def statistics(scans: Sequence[NDArray[np.float32]]) -> dict[str, Any]:
 
 
 def _origin(upper: Array) -> tuple[float, float]:
-    """Slope of elevation, deg, over 1 / distance within rings, and what it leaves (deviation, deg).
+    """Slope of elevation, deg, over 1 / distance within rings, and the standard deviation of the residuals, deg.
 
     upper: (3, N) ring, 1 / distance, elevation.
     """
@@ -89,7 +89,7 @@ def _origin(upper: Array) -> tuple[float, float]:
 
 
 def _ring_noise(ring: NDArray[np.intp], distance: Array, bins: NDArray[np.intp]) -> list[tuple[int, Array]]:
-    """Second differences of ranges along rings, scaled to one return's deviation, by bins of distance."""
+    """Second differences of ranges along rings, scaled to one return's standard deviation, by bins of distance."""
     a, b, c = distance[:-2], distance[1:-1], distance[2:]
     same = (ring[:-2] == ring[2:]) & (np.abs(a - c) < _STEEP * b) & (np.abs(a + c - 2 * b) < _STEEP * b)
     second = (a + c - 2 * b)[same] / np.sqrt(6)
@@ -98,7 +98,7 @@ def _ring_noise(ring: NDArray[np.intp], distance: Array, bins: NDArray[np.intp])
 
 
 def _lost(scan: NDArray[np.float32], ring: NDArray[np.intp], distance: Array, bins: NDArray[np.intp]) -> Array:
-    """(2, bins) pulses that are missing between neighbors of one surface, and pulses in all there."""
+    """(2, bins) missing pulses between neighbors on one surface, and total number of pulses there."""
     azimuth = np.unwrap(np.arctan2(scan[:, 1], scan[:, 0]).astype(float))
     gap = np.diff(azimuth)
     step = np.median(gap[(ring[1:] == ring[:-1]) & (gap > 0)])
@@ -112,7 +112,7 @@ def _lost(scan: NDArray[np.float32], ring: NDArray[np.intp], distance: Array, bi
 
 
 def _plane_residuals(scan: NDArray[np.float32], ring: NDArray[np.intp]) -> Array:
-    """(M, 3) bin of distance, ring and signed distance, m, to the plane of the cell, of points on even ground."""
+    """(M, 3) bin of distance, ring and signed distance, m, to the plane of the cell, for points on flat ground."""
     low = (scan[:, 2] < -0.8) & (np.hypot(scan[:, 0], scan[:, 1]) < RANGES[-1])
     points, rings = scan[low, :3].astype(float), ring[low]
     _, cell, count = np.unique(np.floor(points[:, :2] / _CELL), axis=0, return_inverse=True, return_counts=True)
@@ -131,7 +131,7 @@ def _plane_residuals(scan: NDArray[np.float32], ring: NDArray[np.intp]) -> Array
 
 
 def _ring_bias(residual: Array) -> float | None:
-    """Deviation between rings of their mean residual, of rings with at least 300 points."""
+    """Standard deviation between rings of their mean residual, for rings with at least 300 points."""
     ring = residual[:, 1].astype(int)
     count = np.bincount(ring)
     mean = np.bincount(ring, residual[:, 2])[count >= 300] / count[count >= 300]
@@ -139,7 +139,7 @@ def _ring_bias(residual: Array) -> float | None:
 
 
 def _deviation(values: Array) -> float | None:
-    """By the median: outliers at edges of things do not count."""
+    """Standard deviation from the median absolute deviation: outliers at edges of objects do not count."""
     return float(1.4826 * np.median(np.abs(values))) if len(values) > 500 else None
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.second_camera`: what a second camera is worth to the descriptors, where geometry says all or
-nothing.
+"""`python -m benchmarks.second_camera`: benefit of a second camera for the descriptors, where the geometry constrains
+the motion fully, or not along the road.
 
-Pairs of scans 1 to 5 m apart in suburbs, highways and tunnels that no training has seen, registered by their
-descriptors without any prior: of the LiDAR, and with the images of cameras like the one that the network was trained
-with.
+Pairs of scans 1 to 5 m apart in suburbs, highways and tunnels that were not used in training, registered with their
+descriptors without any prior: from the LiDAR alone, and with images of cameras like the one that the network was
+trained with.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ WORLDS: dict[PresetName, Sequence[int]] = {
 }  # fmt: skip
 """Seeds: training begins at 1,000, validation at 900,000."""
 FRAMES, STEP = 16, 1.25
-"""In each world, and m between two of them."""
+"""Number of frames in each world, and m between two frames."""
 APART = (1, 2, 3, 4)
-"""Steps between the two of a pair."""
+"""Steps between the two frames of a pair."""
 YAWS = {"front": 0.0, "rear": 180.0, "left": 90.0, "right": -90.0}
-"""Where a camera looks, deg to the left."""
+"""Viewing direction of each camera, deg to the left."""
 WAYS = ((), ("front",), ("rear",), ("front", "rear"), ("left", "right"))
-"""The cameras whose images are described."""
+"""The cameras whose images are used in the descriptors."""
 
 
 def bench() -> int:
@@ -63,7 +63,7 @@ def bench() -> int:
 
 
 def errors(network: DeepPointMap2, kind: PresetName, seed: int) -> Array:
-    """(ways, pairs, 2) m and deg, of one world."""
+    """(variants, pairs, 2) m and deg, for one world."""
     world = build_world("straight", kind, seed, 300.0)
     poses, described = list[Array](), list[list[Descriptors]]()
     for T, frame in tracked(_frames(world, network), f"{kind} {seed}", FRAMES):

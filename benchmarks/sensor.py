@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the simulated LiDAR errs as a real one does: the same figures of both, and of the clean sensor."""
+"""Compares the errors of the simulated LiDAR with a real one: the same figures for both, and for the clean sensor."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def bench_sensor(options: Options) -> Report:
 
 
 def _simulated(config: LidarConfig) -> list[np.ndarray]:
-    """Scans of drives in towns, as the drives of the excerpts are."""
+    """Scans of drives in towns, similar to the drives of the excerpt."""
     lidar, out = Lidar(config), []
     for kind in _KINDS:
         for seed in _SEEDS:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.smooth_tunnels`: how far off a car is along tunnels whose way no scan tells, with an IMU and
-without.
+"""`python -m benchmarks.smooth_tunnels`: position error of a car in tunnels in which no scan shows the motion along
+the road, with an IMU and without.
 
-Simulated, without intensities, at 10 m/s that vary by up to 2 m/s2. For the first 6 s another odometry tells the way.
+Simulated, without intensities, at 10 m/s with changes of up to 2 m/s2. For the first 6 s another odometry gives the
+motion.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable
 
 SEEDS = (3, 4, 5, 7, 8, 9)
-"""Of the tunnels."""
+"""Seeds of the tunnels."""
 KNOWN = 60
-"""Frames for which another odometry tells the way; from then on none."""
+"""Frames for which another odometry gives the motion; after them there is none."""
 AFTER = (40, 70)
-"""Frames without it after which the error is stated, at 10 frames per second."""
+"""Frames without it after which the error is measured, at 10 frames per second."""
 
 
 def bench() -> int:
-    """Errors of each tunnel."""
+    """Errors in each tunnel."""
     heads = [f"{way} IMU, m after {n / 10:g} s" for way in ("with", "without") for n in AFTER]
     table = FigureTable("Smooth tunnels", names=["tunnel"], figures=heads)
     for seed in tracked(SEEDS, "tunnels"):
@@ -45,7 +46,7 @@ def bench() -> int:
 
 
 def drive(seed: int) -> tuple[list[Frame], Array]:
-    """Frames, of which the first `KNOWN` have the way of another odometry, and true poses (N, 4, 4)."""
+    """Frames, of which the first `KNOWN` have a guess from another odometry, and true poses (N, 4, 4)."""
     world = build_world("straight", "tunnel", seed=seed, length=200.0)
     lidar = LidarConfig(beams=16, columns=512)
     car = TurningRobot(world, KNOWN + max(AFTER), Ride(10.0, slows=0.8), lidar, ImuConfig())
@@ -55,7 +56,7 @@ def drive(seed: int) -> tuple[list[Frame], Array]:
 
 
 def errors(frames: Iterable[Frame], truth: Array) -> list[float]:
-    """Error of the position, m, after each of `AFTER`."""
+    """Position error, m, after each of `AFTER`."""
     settings = SlamSettings.model_validate({"registration": "geometric"})
     poses = np.array([t.T_odom_lidar for t in map(make_odometry(settings).process, frames)])
     apart = se3.inverse(se3.inverse(truth[:1]) @ truth) @ se3.inverse(poses[:1]) @ poses

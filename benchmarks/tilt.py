@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LiDAR that is mounted at an angle: pairs of real frames by the network, facing the same way and the other one."""
+"""A LiDAR mounted at an angle: pairs of real frames registered by the network, with the same and opposite headings."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from dpm2_core.network.pyramid import build_pyramid, collate, crop
 from dpm2_core.tables import FigureTable, record_table
 
 TILTS = (0, 15, 30)
-"""Degrees of pitch, the same for all scans: as a LiDAR is mounted that looks down ahead."""
+"""Degrees of pitch, the same for all scans, as for a LiDAR that is mounted looking down ahead."""
 APART = (1, 3, 8)
 AXES = ("level", "sensor")
-"""What the descriptors are made in: level axes where the sensor is tilted, as the SLAM does, or always the sensor's."""
-_RANDOM = 35.0  # degrees: also each scan by up to this, about an axis of its own
+"""Axes of the descriptors: level axes if the sensor is tilted, as in the SLAM, or always the sensor's axes."""
+_RANDOM = 35.0  # degrees: each scan is also tilted by up to this, about its own axis
 
 
 def bench_tilt(options: Options) -> Report:

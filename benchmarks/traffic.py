@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM where a third of the points lie on what moves: as it is, with each filter, and with all that moves taken out."""
+"""SLAM with a third of the points on moving objects: unfiltered, with each filter, and without all moving points."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import record_table
 
 PLACES: dict[PresetName, float] = {"city": 20.0, "suburb": 40.0, "rural": 40.0}
-"""Kinds of places, and how many times the usual traffic they have: 20 to 40 % of the points are on it."""
+"""Environments, and the factor on their usual traffic: 20 to 40 % of the points are on it."""
 FIRST_SEED = 900_001
-"""Of the worlds; training ends well below."""
+"""Seed of the first world; training ends well below."""
 FRAMES = 60
 LIDAR = LidarConfig(columns=1024)
 """64 beams, about 60 thousand points."""
@@ -38,16 +38,16 @@ REGISTRATIONS = ("adaptive", "geometric", "neural", "refined")
 ORACLE = "true dynamic objects left out"
 _ERRORS = ("rpe_trans_m", "rpe_rot_deg", "ape_rmse_m")
 LOST = 0.1
-"""A drive with a larger RPE is one that diverged, m: it held on to the traffic."""
+"""A drive with a larger RPE, m, has diverged: the odometry followed the traffic."""
 
 Scans = list[tuple[Points, NDArray[np.bool_]]]
 """Points (N, 4) and which of them move (N,), frame by frame."""
 
 
 def bench_traffic(options: Options) -> Report:
-    """Every registration in every place, repetitions being worlds of each; `--only` names one registration.
+    """Every registration in every environment, with repetitions in different worlds; `--only` names one registration.
 
-    Goes on where traffic.json ends, if it is of the same settings and weights; it is written after each drive.
+    Continues traffic.json if it has the same settings and weights; the file is written after each drive.
 
     Raises:
         UsageError: no such registration.
@@ -76,7 +76,7 @@ def bench_traffic(options: Options) -> Report:
 
 
 def _methods(registration: str) -> list[str]:
-    """What is compared: `none`, the filters that have weights (with a network `movers` alone), the oracle."""
+    """Methods compared: `none`, the filters with weights (with a network only `movers`), and the oracle."""
     shipped = [kind for kind, name in PERCEPTION_WEIGHTS.items() if (PRETRAINED_DIR / f"{name}.safetensors").is_file()]
     return ["none", *(kind for kind in shipped if registration == "geometric" or kind == "movers"), ORACLE]
 
@@ -116,7 +116,7 @@ def _odometry(odometry: Odometry, clouds: list[Points], truth: NDArray[np.float6
 
 
 def summarized(drives: dict[str, Any]) -> dict[str, Any]:
-    """Of each registration and method, over the drives that have it: mean, spread and median, drives diverged, ratios.
+    """For each registration and method, over its drives: mean, spread and median, drives diverged, ratios.
 
     `ratio`: of means and medians to those of `none` on the same drives.
     """
@@ -141,7 +141,7 @@ def _figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _recipe(options: Options) -> dict[str, Any]:
-    """What the drives stand on: where it has changed, all are measured again."""
+    """The settings on which the drives depend: if they have changed, all are measured again."""
     return {
         "frames": FRAMES,
         "lidar": LIDAR.model_dump(),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network on synthetic worlds that neither training nor the choice of the checkpoint has seen."""
+"""The network on synthetic worlds that were used neither in training nor in the choice of the checkpoint."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _SEEDS = {"mixed": 910_000, "highway": 920_000, "tunnel": 930_000}
 _WORLDS = {"mixed": 8, "highway": 2, "tunnel": 2}
 _FRAMES = 24
 _NO_CAMERA = "not answered: these weights have no camera"
-_SMALLEST = 128  # points that stay of an obstructed scan
+_SMALLEST = 128  # least number of points that remain of an obstructed scan
 
 
 def unseen_drives(network: DeepPointMap2, options: Options, kind: str = "mixed") -> Path:
-    """Folder of packed drives: those that were given, or new ones, which a later run finds again."""
+    """Folder of packed drives: those that were given, or new ones, which later runs reuse."""
     if options.unseen is not None:
         named = options.unseen / kind
         return named if named.is_dir() else options.unseen
@@ -69,7 +69,7 @@ def synthetic(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         found[f"{low} to {high} m, any yaw"] = {"neural": summarized(farther[farther[:, 0] > low, 2:4])}
     return {
         "pairs": found,
-        # Of 6 degrees of freedom: a median of 5.35 would say that the covariance is just right.
+        # With 6 degrees of freedom a median of 5.35 would mean that the covariance is exactly right.
         "median_chi2": float(np.median(rows[good, 4])) if good.any() else None,
     }
 
@@ -88,18 +88,18 @@ class _Changed:
 
 
 def blackened(sample: Sample, index: int) -> Sample:
-    """Its images black: a camera that fails."""
+    """The sample with black images, as from a failed camera."""
     return sample._replace(images=tuple(Image(np.zeros_like(i.pixels), i.camera) for i in sample.images))
 
 
 def obstructed(sample: Sample, index: int) -> Sample:
-    """Without the points behind a box near the sensor, one of per frame's own."""
+    """The sample without the points behind a box near the sensor, different for each frame."""
     hidden = hidden_by(random_box(np.random.default_rng([index, 5])), sample.cloud)
     return sample if (~hidden).sum() < _SMALLEST else sample._replace(cloud=sample.cloud[~hidden])
 
 
 def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Every frame with a black image, or every frame with a box before the LiDAR, over the same pairs unharmed."""
+    """Every frame with a black image, or every frame with a box in front of the LiDAR, on the same pairs as clean."""
     camera = network.encoder.image is not None
     rows = {"clean": _pairs(network, options, "mixed", options.pairs).errors(network)}
     changes = {"LiDAR obstruction 100 %": obstructed, **({"camera failure 100 %": blackened} if camera else {})}
@@ -118,8 +118,8 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Highway and tunnel, whose geometry does not constrain the motion: with the camera, without, and KISS-ICP.
 
-    `descriptors` is the network alone; `neural` and `refined` are what the SLAM runs, the image along the open
-    direction included.
+    `descriptors` is the network alone; `neural` and `refined` are the SLAM's registrations, including the image along
+    the open direction.
     """
     camera = network.encoder.image is not None
     peers = installed({BASELINE: partial(kiss_from_identity, options.threads)})
@@ -154,7 +154,7 @@ def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
 
 
 def _turned(pairs: PairSet, key: tuple[int, int, float], number: int) -> Frame:
-    """The frame of a pair as `PairSet` shows it to the network."""
+    """The frame of a pair as `PairSet` passes it to the network."""
     drive, index, yaw = key
     turn, sample = se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index]
     cloud = se3.transform(turn, sample.cloud)

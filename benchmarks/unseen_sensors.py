@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network on scans of other LiDARs than most of those that it has learned from, in worlds that it has not seen."""
+"""The network on scans of LiDARs that differ from most of those used in training, in unseen worlds."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ SENSORS = {
     "128 beams": LidarConfig(beams=128, columns=1024),
     "rosette": LidarConfig(beams=16, columns=1500, pattern="rosette"),
 }
-"""With a real one's errors; the rosette sees 70 degrees ahead and never repeats."""
+"""With the errors of a real sensor; the rosette sees 70 degrees ahead and never repeats."""
 FIRST_SEED = 960_000
 PLACES: tuple[PresetName, ...] = ("city", "suburb", "rural", "suburb")
 FARTHEST = 12.0
-"""Between the scans of a pair, m."""
+"""Largest distance between the scans of a pair, m."""
 
 
 def other_sensors(network: DeepPointMap2, options: Options) -> dict[str, Any]:
-    """Pairs up to 12 m apart by each sensor, without a prior; those of all-round ones turned at random, too."""
+    """Pairs up to 12 m apart with each sensor, without a prior; for all-round sensors also with random yaw."""
     out: dict[str, Any] = {}
     for name, clean in SENSORS.items():
         folder = sensor_drives(name, network, options)
@@ -49,7 +49,7 @@ def other_sensors(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 
 
 def sensor_drives(name: str, network: DeepPointMap2, options: Options) -> Path:
-    """Folder of packed drives: those that were given, or new ones by this sensor, which a later run finds again."""
+    """Folder of packed drives: those that were given, or new ones with this sensor, which later runs reuse."""
     if options.unseen is not None:
         return options.unseen
     root = options.cache / f"{network.settings.preset}_sensors" / name.replace(" ", "_")
@@ -63,7 +63,7 @@ def sensor_drives(name: str, network: DeepPointMap2, options: Options) -> Path:
 def drive(
     folder: Path, place: PresetName, seed: int, clean: LidarConfig, network: NetworkSettings, scans: int = 24
 ) -> None:
-    """Pack scans of one world; each sensor sees the same places."""
+    """Pack scans of one world; each sensor has the same poses."""
     world, noise = build_world("random", place, seed), np.random.default_rng(seed)
     lidar = Lidar(real_sensor(clean))
     height, sway = lidar.config.height, lidar.config.real.sway

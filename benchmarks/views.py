@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user looks at: the time that the live view takes beside a run, and the page of a map in a browser."""
+"""User interfaces: time that the live view adds to a run, and the page of a map in a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dpm2_core.tables import FigureTable, record_table
 from tools.browser import SOFTWARE, chromium
 
 _VOXEL = 0.3
-"""Of the page, m: the default of `dpm2 map export`."""
+"""Voxel size of the page, m: the default of `dpm2 map export`."""
 _TURNING = """async () => {
   const canvas = document.querySelector("canvas"), at = (type, x) =>
     canvas.dispatchEvent(new PointerEvent(type, {clientX: x, clientY: 400, button: 0, pointerId: 1, bubbles: true}));
@@ -40,7 +40,7 @@ _TURNING = """async () => {
   at("pointerup", 640);
   return rate;
 }"""
-"""The view is turned in each frame for 4 s; the page itself counts frames per second while it moves."""
+"""The view is rotated in each frame for 4 s; the page itself counts frames per second while it moves."""
 
 
 def bench_views(options: Options) -> Report:
@@ -66,7 +66,7 @@ def bench_views(options: Options) -> Report:
 
 
 def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
-    """Seconds of a run, and of these the seconds in which the view was fed; leaves `drive.dpm2map`."""
+    """Seconds of a run, and the part of them that fed the view; writes `drive.dpm2map`."""
     shown = 0.0
     with (
         OfflineRun(source, configuration_of(options), map_file=place / "drive.dpm2map") as drive,
@@ -95,7 +95,7 @@ def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
 
 
 def _looked_at(path: Path) -> dict[str, float]:
-    """Seconds until points and until all of them are drawn, and frames per second while the map is turned."""
+    """Seconds until points and until all of them are drawn, and frames per second while the map is rotated."""
     program = chromium()
     if program is None:
         raise Dpm2Error("no Chromium (Debian: apt install chromium)")
