@@ -30,7 +30,7 @@ from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import record_table
 
 LIDAR = LidarConfig(beams=32, height=3.4, columns=1810)
-"""32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights know 64 from +2 to -24.8 deg, at 1.5 to 2 m."""
+"""32 beams from +10.7 to -30.7 deg on the roof of a bus; the weights are for 64 from +2 to -24.8 deg, at 1.5 to 2 m."""
 DRIVES: tuple[PresetName, ...] = ("city", "suburb", "rural")
 """One drive of each is used for fine-tuning: 12 s long, seeds from 950,000."""
 DRIVE_FRAMES = 120

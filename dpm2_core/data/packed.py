@@ -208,7 +208,7 @@ def open_packed(root: Path) -> list[PackedDrive]:
     """Every packed drive below `root`, by name.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no packed drive.
     """
     folders = (path.parent for path in sorted(root.rglob("about.json")))
     found = [PackedDrive(folder) for folder in folders if not _is_unfinished(folder.relative_to(root))]

@@ -22,7 +22,7 @@ REPEATED = "the same cloud as before: the LiDAR or its driver repeats itself"
 PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
 _STOPS = 1.5  # m/s: slower robots may stop at once and, in simulations without noise, measure the same cloud again
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
-_STILL, _LONG = 0.02, 30  # m, clouds: a robot within that distance stands; if that many clouds differ, there is noise
+_STILL, _LONG = 0.02, 30  # m, clouds: a robot within that distance is at rest; if all clouds differ, there is noise
 # Share of the points that repeat, and share of those that do not; coarse noise leaves at most 0.2 unchanged.
 _PART = 0.3
 _LEAST = 100  # points that are compared

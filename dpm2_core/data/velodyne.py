@@ -40,7 +40,7 @@ class VelodyneDrive(IndexedSource):
         """Find the scans NNNNNN.bin in a folder.
 
         Raises:
-            UsageError: there are none.
+            UsageError: there are no scans.
         """
         self._scans, self._images, self._settings = numbered_scans(scans), images, settings
         if not self._scans:

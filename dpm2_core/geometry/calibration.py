@@ -4,7 +4,8 @@
 Residuals show how well two scans fit each other. They do not show an error of the sensor's axes, which rotates every
 translation by the same angle, nor incomplete de-skewing, which makes every rotation too small. On the KITTI excerpts
 point registration, network and odometry agree over 10 to 20 m within 1 to 5 cm, and are 10 to 30 cm off the truth.
-The two constants below were chosen on those excerpts, whose truth has errors of its own; no other drive tested them.
+The two constants below were chosen on those excerpts, whose truth has errors of its own; they were not tested on other
+drives.
 """
 
 from __future__ import annotations

@@ -29,8 +29,7 @@ _PAIR = 2.0  # points of equal range: fewer count as none, whatever the share in
 _BIN = 0.01  # of ln(range + _SHIFT)
 _BINS = int(log((_NEAR + _SHIFT) / _SHIFT) / _BIN) + 1
 MANY = 0.2
-"""Share of the near points: fewer occlude nothing, and do not hold back an odometry with a map as sparse as on streets.
-"""
+"""Share of the near points: fewer occlude nothing, and do not stop an odometry whose map is as sparse as on streets."""
 _SOME, _LEAST_NEAR = 6000, 100  # points that are sampled to see whether there are many; least number of near ones
 _PATCH = 4  # cells: the sampled points are from square patches of directions with this edge
 

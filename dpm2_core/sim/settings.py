@@ -23,7 +23,7 @@ class Imperfections(Settings):
     emitters: tuple[float, float] = (0.0, 0.0)
     """Height of the origins of the upper and of the lower half of the beams above the sensor's origin, m."""
     uneven: float = Field(default=0.0, ge=0, le=1)
-    """Standard deviation of the beams' elevations from even spacing, deg; the driver knows them."""
+    """Standard deviation of the beams' elevations from even spacing, deg; known to the driver."""
     angle_bias: float = Field(default=0.0, ge=0, le=1)
     """Standard deviation of the beams' elevations and azimuths from those that the driver assumes, deg."""
     range_bias: float = Field(default=0.0, ge=0, le=1)
@@ -181,7 +181,7 @@ class Preset(Settings):
     trees: float = 0.0
     """Per 100 m and side, near the road; the same number again behind."""
     forest: float = 0.0
-    """Of belts of trees and bushes, per 100 m and side."""
+    """Trees and bushes in belts, per 100 m and side."""
     bushes: float = 0.0
     """Per 100 m and side."""
     boundaries: float = 0.0
@@ -193,7 +193,7 @@ class Preset(Settings):
     clutter: float = 0.0
     """Sheds, boxes, benches and cars in yards, per 100 m and side."""
     tufts: float = 0.0
-    """Of grass, per m and side."""
+    """Tufts of grass, per m and side."""
     people: float = 0.0
     """Pedestrians and cyclists, per 100 m."""
     traffic: float = 0.0

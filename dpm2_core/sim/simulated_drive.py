@@ -156,7 +156,7 @@ class TurningRobot(_Simulated):
 
 
 def _moving(time: ArrayLike) -> Array:
-    """0 while the robot stands, 1 after its start, at times s."""
+    """0 while the robot is at rest, 1 after its start, with a ramp in between; at times, s."""
     return np.clip((np.asarray(time) - 1.5) / 1.0, 0, 1)
 
 
