@@ -21,8 +21,8 @@ from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration
 APART = {f"{low}-{low + 10} m": (low, low + 10) for low in (10, 20, 30, 40)}
 """Distances of the far pairs, m, by name."""
 MANY = 10
-"""Factor on the number of pairs if no odometry is run on each: described frames cost little more, and medians of 45
-pairs differ by a third."""
+"""Factor on the number of pairs if no odometry is run for each: pairs of frames that are described anyway cost little,
+and medians of 45 pairs differ by a third."""
 
 PairMethod = Callable[[Frame, Frame], Array | None]
 """T_first_second (4, 4) of two frames; None: no result."""

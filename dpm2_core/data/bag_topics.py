@@ -65,7 +65,7 @@ class TopicChoice:
         depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
         if depth:
             self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
-        compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same as the raw ones
+        compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same images as the raw topics
         found = [topic for topic in found if topic not in depth and (topic == asked or topic not in compressed)]
         usual = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kitti2bag variants
         return self._one_of(found, asked, usual, "image", "images")

@@ -237,7 +237,8 @@ class BagSource:
 
     def _ground(self) -> Points | None:
         """Up direction (3,) in the LiDAR frame, estimated from the ground in the first cloud that shows enough of it.
-        The first clouds of a driver may be empty or part of a sweep. Only outdoor clouds count: ceilings look like ground."""
+        The first clouds of a driver may be empty or part of a sweep. Only outdoor clouds count, as ceilings look like
+        ground."""
         for cloud in islice(self._bag.decoded(self.points_topic), _LOOKED_AT):
             with suppress(MessageError):
                 points, _ = decode_points(cloud)

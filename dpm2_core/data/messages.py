@@ -88,7 +88,7 @@ def cloud_view(msg: Any, names: Collection[str]) -> NDArray[np.void]:
         names: the requested fields. Unknown ones are left out.
 
     Raises:
-        MessageError: the data is shorter than declared, or the layout contradicts itself.
+        MessageError: the data is shorter than declared, or the layout is inconsistent.
     """
     step, width, height = int(msg.point_step), int(msg.width), int(msg.height)
     if step > _LARGEST_POINT:

@@ -33,7 +33,7 @@ class OusterSource:
     """Sweeps in the frame of the sensor's housing, stamped at the time of their first column. See `Source`.
 
     Intensity is the reflectivity, and each column has its time. From a .pcap the sensor's IMU is read, too. A .pcap
-    needs the sensor's metadata next to it: the .json whose name begins the same. There are no images and no ground truth.
+    needs the sensor's metadata next to it: the .json whose name begins the same. There are no images or ground truth.
 
     Raises:
         UsageError: the file cannot be read, or it has several sensors and `input.points_topic` names none of them.

@@ -29,7 +29,7 @@ def write_pcd(path: Path | str, points: Points) -> None:
     """Write (N, 4) [x, y, z in m, intensity 0..1]; N may be 0.
 
     Raises:
-        Dpm2Error: the file could not be written; an older one at `path` survives.
+        Dpm2Error: the file could not be written; an older one at `path` is kept.
     """
     with atomic_write(path, "wb") as file:
         file.write(_HEADER.format(count=len(points)).encode("ascii"))

@@ -31,7 +31,7 @@ def write_ply(path: Path | str, points: Points) -> None:
     """Write (N, 4) [x, y, z in m, intensity 0..1]; N may be 0.
 
     Raises:
-        Dpm2Error: the file could not be written; an older one at `path` survives.
+        Dpm2Error: the file could not be written; an older one at `path` is kept.
     """
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"{path}: points are {points.shape}, want (N, 4)")

@@ -23,7 +23,7 @@ PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds ar
 _STOPS = 1.5  # m/s: slower robots may stop at once and, in simulations without noise, measure the same cloud again
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
 _STILL, _LONG = 0.02, 30  # m, clouds: a robot within that distance is at rest; if all clouds differ, there is noise
-# Share of the points that repeat, and share of those that do not; coarse noise leaves at most 0.2 unchanged.
+# Smallest share of points that repeat, and of points that do not; coarse noise leaves at most 0.2 unchanged.
 _PART = 0.3
 _LEAST = 100  # points that are compared
 _LOOKED_AT = 8192  # points in the checksum: noise changes any sample of them

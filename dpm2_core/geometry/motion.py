@@ -17,7 +17,7 @@ that many rad, towards a direction with all other information. On a road seen fo
 _FREE = 0.05  # m: shorter translations do not show a period
 _HORIZON = 10.0  # s: motion is not extrapolated farther
 _LONGEST = 3600.0  # s: after that time the covariance grows no further
-_STEPS = 10  # of a motion that changes
+_STEPS = 10  # integration steps of a changing motion
 _TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
 _TILT = 0.1  # roll and pitch relative to the heading: slopes
 _ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of an unknown heading

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Points
 from dpm2_core.geometry.compiled import READ_F4, compiled
 
-_NEAR = 8.0  # m: farther away they return too little to be many
+_NEAR = 8.0  # m: farther away too few particles return enough light
 _CELLS = 80  # along each edge of a cube around the sensor: of 0.7 to 1.4 degrees
 _DENSE = 40_000  # points; smaller scans get larger cells
 _ENOUGH, _LEAST = 15, 5  # points of a strip: it is lengthened until it has _ENOUGH; fewer than _LEAST are not used

@@ -20,7 +20,7 @@ from dpm2_core.geometry.deskew import measured_turn
 
 _CENTERED = 0.1  # of a sweep: a stamp this close to the middle counts as the middle
 _WHOLE = 1.2  # a sweep is partial if another one is this many times as long
-_LATELY, _OFTEN = 50, 5  # times are wrong if this many of the last clouds contradict; raw clouds hardly ever do
+_LATELY, _OFTEN = 50, 5  # times are wrong if _OFTEN of _LATELY clouds contradict them; raw ones hardly ever do
 _WRONG = (
     "the times of the points are not used, the motion contradicts them: clouds that are de-skewed already want "
     "slam.preprocess.deskew: false"

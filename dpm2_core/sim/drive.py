@@ -98,8 +98,8 @@ def fitting_length(drive: DriveConfig) -> float:
 
 
 def _recipe(drive: DriveConfig) -> dict[str, Any]:
-    """The drive's settings; a file of poses by name and checksum. Defaults of newer settings are left out: usual
-    traffic, a level, clean and spinning LiDAR, and a dry lens."""
+    """The drive's settings; a file of poses by name and checksum. Some settings are left out if they have their
+    defaults: usual traffic, a level, clean and spinning LiDAR, and a dry lens."""
     recipe = {"generator": "dpm2 sim 1", "vertical_angle_correction_deg": 0, **drive.model_dump(mode="json")}
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
