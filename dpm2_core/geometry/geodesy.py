@@ -2,7 +2,7 @@
 """WGS84: geodetic positions to the Earth's frame (ECEF) and back, and local frames with axes east, north, up.
 
 Source: NIMA TR8350.2, Department of Defense World Geodetic System 1984; the inverse is B. R. Bowring's, "The accuracy
-of geodetic latitude and height equations", Survey Review 28 (1985): below 1 mm for all vehicles and aircraft.
+of geodetic latitude and height equations", Survey Review 28 (1985): error below 1 mm for vehicles and aircraft.
 """
 
 from __future__ import annotations

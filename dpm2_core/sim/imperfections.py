@@ -108,7 +108,7 @@ class SensorErrors:
         return Draws(*rng.random((3, len(self.ring)), np.float32))
 
     def finish(self, returns: Returns, draws: Draws | None) -> Bool:
-        """Apply edges, glare and drops to a whole scan in place; returns which returns (R,) are not of a surface."""
+        """Apply edges, glare and drops to a whole scan in place; the result (R,) marks returns of no surface."""
         stray = np.zeros(len(self.ring), bool)
         if draws is None:
             return stray

@@ -23,8 +23,7 @@ from dpm2_core.sim.terrain import RESOLUTION, Kerbline, Terrain, kerbside_ribbon
 from dpm2_core.sim.vehicles import car, truck
 
 CLEAR_OF_DRIVE = 2.15
-"""Distance from the path of the car's center in which there is nothing as low as a car, m; for parked cars, no center.
-"""
+"""Distance from the path of the car's center without objects as low as a car (parked cars: without their center), m."""
 
 
 class Layout:

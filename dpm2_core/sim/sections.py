@@ -16,7 +16,7 @@ from dpm2_core.sim.road import Path, Road
 from dpm2_core.sim.terrain import Terrain, sheet
 
 WALL = 5.5
-"""Height of the noise barriers, m: within 80 m a beam at +2 deg cannot see over them, but a camera sees trees there."""
+"""Height of the noise barriers, m: within 80 m a beam at +2 deg does not reach above them; a camera sees trees."""
 
 
 def swept(path: Path, terrain: Terrain, profile: ArrayLike, surface: Surface) -> Mesh:

@@ -2,7 +2,7 @@
 """The ground: distance of each position from the streets, height, and mesh.
 
 All static objects are placed with one raster, the distance to the curb of the nearest street. It treats crossings,
-loops and streets that are driven twice alike: nothing can be placed on a road, on whichever pass.
+loops and streets that are driven twice alike: nothing can be placed on a road, whichever pass created it.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
 
 
 def make_traffic(road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> Traffic:
-    """The number of dynamic objects that the preset has on that length."""
+    """Traffic with the number of dynamic objects that the preset has on a road of that length."""
     if preset.columns:
         walking = make_traffic(road, terrain, preset.model_copy(update={"traffic": 0.0, "columns": False}), rng)
         return _with_columns(walking, preset, rng)
