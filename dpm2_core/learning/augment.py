@@ -24,47 +24,47 @@ class AugmentSettings(Settings):
     drop: float = Field(0.5, ge=0, lt=1)
     """Points are dropped at a ratio drawn from 0 to this."""
     occlusion: float = Field(0.1, ge=0, le=1)
-    """Probability of RandomOcclusion: sectors behind near shields are lost."""
+    """Probability of RandomOcclusion: sectors behind near shields are removed."""
     beams: float = Field(0.1, ge=0, le=1)
-    """Probability that only every second or fourth elevation survives."""
+    """Probability that only every second or fourth elevation is kept."""
     jitter: float = Field(0.005, ge=0)
-    """Deviation of point noise, m, cut at 3 deviations."""
+    """Standard deviation of point noise, m, cut at 3 deviations."""
     yaw: float = Field(3.1416, ge=0)
-    """Turn of the sensor about its own axis, rad, up to either side."""
+    """Largest rotation of the sensor about its own axis, rad, to either side."""
     tilt: float = Field(0.03, ge=0)
-    """Deviation of roll and pitch, rad."""
+    """Standard deviation of roll and pitch, rad."""
     shift: tuple[float, float, float] = (0.0, 0.0, 0.2)
-    """Deviation of the origin's translation, m. Sideways shifts take the origin away from the sensor: they suit the
-    networks that work in the sensor's axes only (3, 3, 1.5 there)."""
+    """Standard deviation of the origin's translation, m. Horizontal shifts move the origin away from the sensor: they
+    are only for networks that work in the sensor's axes (3, 3, 1.5 there)."""
     image_drop: float = Field(0.15, ge=0, le=1)
     """Probability that all images of a frame are missing."""
     image_black: float = Field(0.05, ge=0, le=1)
     """Probability that an image is black."""
     exposure: float = Field(0.3, ge=0)
-    """Deviation of the logarithm of exposure."""
+    """Standard deviation of the logarithm of exposure."""
     colour: float = Field(0.08, ge=0)
-    """Deviation of the logarithm of each color's gain."""
+    """Standard deviation of the logarithm of each color's gain."""
     extrinsic_rotation: float = Field(0.002, ge=0)
-    """Deviation of the error of the extrinsics, rad."""
+    """Standard deviation of the rotation error of the extrinsics, rad."""
     extrinsic_translation: float = Field(0.01, ge=0)
-    """The same, m."""
+    """Standard deviation of the translation error of the extrinsics, m."""
 
 
 UNCHANGED = AugmentSettings(
     drop=0, occlusion=0, beams=0, jitter=0, yaw=0, tilt=0, shift=(0, 0, 0), image_drop=0, image_black=0, exposure=0,
     colour=0, extrinsic_rotation=0, extrinsic_translation=0,
 )  # fmt: skip
-"""Samples as they were packed, but for the order of their points."""
+"""Samples as they were packed, except for the order of their points."""
 
 
 def augment(sample: Sample, settings: AugmentSettings, noise: np.random.Generator) -> Sample:
-    """A changed copy; its pose and extrinsics fit the changed cloud."""
+    """An augmented copy; its pose and extrinsics fit the changed cloud."""
     cloud = sample.cloud
     for change in (_beams, _occlude, _drop):
         changed = change(cloud, settings, noise)
         if len(changed) >= 4 * MIN_POINTS:  # never lose the scan altogether
             cloud = changed
-    cloud = noise.permutation(cloud)  # farthest point sampling starts elsewhere
+    cloud = noise.permutation(cloud)  # so that farthest point sampling starts elsewhere
     moved = random_motion(settings, noise)
     jitter = np.clip(noise.standard_normal(cloud.shape, np.float32), -3, 3) * np.float32(settings.jitter)
     cloud = se3.transform(moved, cloud) + jitter

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training in a folder goes on from its checkpoint, unless something else is asked for now: then one of an experiment
-begins anew, and one that a user resumes is an error."""
+"""A training continues from the checkpoint in its folder, unless its settings or inputs have changed. Then the training
+of an experiment starts again, and resuming one as a user is an error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dpm2_core.files import file_digest, json_text, make_folder, write_json
 from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS, held
 
 _ASKED = "begun.json"
-"""What was asked for when the training in this folder began."""
+"""Settings and inputs with which the training in this folder began."""
 _FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
 _CONTENT = "content of "
 
@@ -29,11 +29,11 @@ def begin_training(
     data: dict[str, Any] | None = None,
     start: Path | None = None,
 ) -> None:
-    """Ready a folder for a training: what one that was asked for otherwise has left there is removed.
+    """Prepare a folder for a training: files of a training with other settings or inputs are removed.
 
     Args:
         read, data: as of `begin_or_resume`.
-        start: folder of a training whose checkpoint and log a new one goes on from.
+        start: folder of a training from whose checkpoint and log a new one continues.
 
     Raises:
         UsageError: another training is writing there.
@@ -47,25 +47,25 @@ def begin_training(
         if start is not None:
             for kept in (CHECKPOINT, LOG):
                 shutil.copy(start / kept, folder / kept)
-        write_json(asked, now)  # the last: what is killed before is begun anew
+        write_json(asked, now)  # last: if killed before this, the training starts again
 
 
 def begin_or_resume(
     folder: Path, resume: bool, settings: Settings, read: Sequence[Path] = (), data: dict[str, Any] | None = None
 ) -> None:
-    """Ready a folder for a training that a user asks for; with `resume`, for what was asked for when it began.
+    """Prepare a folder for a user's training; with `resume`, check that settings and inputs are those it began with.
 
-    Settings that do not change what is learned may differ. A folder that does not say what was asked for is gone on
-    with.
+    Settings that do not change what is learned may differ. A folder without a record of settings and inputs is
+    accepted.
 
     Args:
-        read: files that the training begins with, such as weights; their content counts.
-        data: what it learns from, beside the settings.
+        read: files that the training begins with, such as weights; their content is compared.
+        data: what it learns from, in addition to the settings.
 
     Raises:
-        UsageError: another training is writing there, there is one that is not to be resumed, there is none to resume,
-            or it was asked for something else; the message names the first setting that differs, and both values, or
-            one that there is no more.
+        UsageError: another training is writing there, there is a training but no `resume`, there is none to resume, or
+            it began with something else. The message names the first setting that differs, and both values, or a
+            setting that no longer exists.
     """
     _check_free(folder)
     asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
@@ -77,29 +77,29 @@ def begin_or_resume(
     if not resume or not asked.is_file():
         write_json(asked, now)
         return
-    by_default = type(settings).model_construct()  # of the overlap's training, which needs `start`, all the others
-    before = {**_plain(dict(_values(by_default))), **_before(asked)}  # a setting of later was as by default
+    by_default = type(settings).model_construct()  # for the overlap training, which needs `start`: the others
+    before = {**_plain(dict(_values(by_default))), **_before(asked)}  # a setting added later had its default
     for key in [*now, *before]:
         if key in now and before.get(key, now[key]) != now[key]:
             name, old, new = _difference(key, before[key], now[key])
             raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
-        if key not in now and not key.startswith(_CONTENT):  # that of other files is named by the settings
+        if key not in now and not key.startswith(_CONTENT):  # content of other files: the settings name these
             raise UsageError(f"{folder}: began with {key} {before[key]}, a setting of another version of dpm2")
 
 
 def check_one_process(command: str) -> None:
-    """Raise UsageError under torchrun, for a command whose processes would all do the same, in the same folder."""
+    """Raise UsageError under torchrun, for a command whose processes would all do the same work in the same folder."""
     if _processes() > 1:
         raise UsageError(f"dpm2 {command}: works in one process; torchrun is for dpm2 train image, phase1 and phase2")
 
 
 def is_first_process() -> bool:
-    """Whether this one says what is to be said once: the first of those that torchrun started, or the only one."""
+    """Whether this process prints what is printed only once: the first one that torchrun started, or the only one."""
     return os.environ.get("RANK", "0") == "0"
 
 
 def _check_free(folder: Path) -> None:
-    """Raise UsageError where a training is writing in a folder. The processes of one look before any of them writes."""
+    """Raise UsageError if a training is writing in a folder. Its own processes check this before any of them writes."""
     if folder.is_dir():
         with held(folder, looking=True):
             pass
@@ -110,18 +110,18 @@ def _processes() -> int:
 
 
 def _asked(settings: Settings, read: Sequence[Path], data: dict[str, Any] | None) -> dict[str, Any]:
-    """All that changes what is learned, as it is read again."""
+    """Everything that changes what is learned, in the form in which it is read from a file."""
     content = {f"{_CONTENT}{path}": _content(path) for path in read}
     return _plain({**dict(_values(settings)), **content, **(data or {}), "processes": _processes()})
 
 
 def _plain(tree: dict[str, Any]) -> dict[str, Any]:
-    """As it is read from a file."""
+    """The tree in the form in which it is read from a file."""
     return dict(json.loads(json_text(tree)))
 
 
 def _before(asked: Path) -> dict[str, Any]:
-    """What was asked for when the training began.
+    """The settings and inputs with which the training began.
 
     Raises:
         UsageError: the file is damaged.
@@ -137,7 +137,7 @@ def _content(path: Path) -> str:
 
 
 def _values(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values of what changes what is learned."""
+    """Dotted keys and values of the settings that change what is learned."""
     for name, value in settings:
         if isinstance(value, Settings):
             yield from _values(value, f"{prefix}{name}.")

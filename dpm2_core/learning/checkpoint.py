@@ -21,18 +21,18 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write, make_folder
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.jsonl", "weights.safetensors"
-"""What a training leaves in its folder."""
+"""The files that a training writes to its folder."""
 
 
 @contextmanager
 def held(folder: Path, looking: bool = False) -> Iterator[None]:
-    """A folder that no other training writes in until the block ends, also if it is killed; where the file system has
+    """Lock a folder against other trainings until the block ends or the process is killed, if the file system has
     locks.
 
-    `looking`: nothing is written but by a training that holds it then, so that several may look at once.
+    `looking`: a shared lock, only to check that no training is writing, so that several may check at once.
 
     Raises:
-        UsageError: another training holds it.
+        UsageError: another training has locked it.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -40,21 +40,21 @@ def held(folder: Path, looking: bool = False) -> Iterator[None]:
     except BlockingIOError:
         os.close(handle)
         raise UsageError(f"{folder}: another training is writing here; another --out keeps both") from None
-    except OSError:  # without locks, such as some network shares
+    except OSError:  # no locks, as on some network shares
         pass
     try:
         yield
     finally:
         with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_UN)  # also for processes that load data, which have it from this one
+            fcntl.flock(handle, fcntl.LOCK_UN)  # also for data loaders, which inherited it from this process
         os.close(handle)
 
 
 def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer, step: int) -> None:
-    """Weights, averaged weights, optimizer and step. Everything random follows from seed and step.
+    """Write weights, averaged weights, optimizer and step. Everything random follows from seed and step.
 
     Raises:
-        Dpm2Error: not written, as on a full disk; the checkpoint before it stays.
+        Dpm2Error: not written, e.g. on a full disk; the previous checkpoint stays.
     """
     state = {
         "module": module.state_dict(),
@@ -62,7 +62,7 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         "optimiser": optimiser.state_dict(),
         "step": step,
     }
-    whole = BytesIO()  # into a file that cannot grow, torch raises errors of its own
+    whole = BytesIO()  # for a file that cannot grow, torch raises errors of its own
     torch.save(state, whole)
     with atomic_write(path, "wb") as file:
         file.write(whole.getbuffer())
@@ -83,7 +83,7 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         raise UsageError(f"{path}: damaged, or not a checkpoint; remove it to begin anew, without --resume")
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
-    except Exception:  # what torch says is of its own settings, such as how to execute what the file holds
+    except Exception:  # torch's message is about its own settings, such as how to execute code in the file
         raise UsageError(f"{path}: not a checkpoint of this program") from None
     try:
         module.load_state_dict(state["module"])
@@ -96,18 +96,18 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
 
 
 def _is_whole(file: IO[bytes]) -> bool:
-    """Whether it is an archive, as torch writes, and all in it has its checksum, which torch does not look at."""
+    """Whether a file is an archive, as torch writes, and its members match their checksums, which torch ignores."""
     try:
         return ZipFile(file).testzip() is None
-    except Exception:  # anything from BadZipFile to struct.error by the kind of damage
+    except Exception:  # from BadZipFile to struct.error, depending on the damage
         return False
 
 
 class Log:
-    """One JSON object a line, and TensorBoard where its package is installed."""
+    """A log with one JSON object per line, and TensorBoard if its package is installed."""
 
     def __init__(self, folder: Path, start: int = 0) -> None:
-        """Goes on where a run that was stopped left off, before step `start`; what it had logged after that is done
+        """Continue the log of a stopped run before step `start`; later lines are removed, as their steps are done
         again."""
         make_folder(folder)
         path = folder / LOG
@@ -123,7 +123,7 @@ class Log:
             self.board = None
 
     def write(self, step: int, figures: dict[str, float]) -> None:
-        """Log figures of a step; one that is not finite is null, which JSON has a word for."""
+        """Log figures of a step; one that is not finite is written as null."""
         known = {k: round(v, 6) if math.isfinite(v) else None for k, v in figures.items()}
         self.file.write(json.dumps({"step": step, **known}) + "\n")
         if self.board is not None:
@@ -138,12 +138,12 @@ class Log:
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
-    """What a training has logged, by steps."""
+    """What a training has logged, one entry per line."""
     return [json.loads(line) for line in (folder / LOG).read_text(encoding="utf-8").splitlines()]
 
 
 def _lines_before(path: Path, start: int) -> list[str]:
-    """Of a log, those of steps before `start`; a last line that was cut off is none."""
+    """Lines of a log for steps before `start`; an incomplete last line is dropped."""
     if not start or not path.exists():
         return []
     kept = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of near-by frames as batches: drawn by weight, augmented, sampled into pyramids."""
+"""Groups of nearby frames as batches: drawn by weight, augmented, sampled into pyramids."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import Views, collate_views
 from dpm2_core.sim.settings import PRESET_NAMES
 
-_LEAST = 8 * MIN_POINTS  # points of a scan that is learnt from
-_PLACES = 100  # that are tried
+_LEAST = 8 * MIN_POINTS  # fewest points of a training scan
+_PLACES = 100  # places that are tried
 
 
 def _check_place(name: str) -> str:
@@ -67,10 +67,10 @@ class DataSettings(GroupSettings):
     frames: int = Field(4, ge=2)
     """Frames of each place: one, and others within `radius` of it."""
     radius: float = Field(20.0, gt=0)
-    """m."""
+    """Largest distance between the first frame of a place and the others, m."""
     radii: dict[Place, PositiveFloat] = Field({})
-    """The same for drives of a preset of the synthetic city, such as {tunnel: 15}: what looks alike all along shows
-    from afar nothing to learn from."""
+    """The same for drives of a preset of the synthetic city, such as {tunnel: 15}: where everything looks alike, frames
+    far apart show nothing to learn from."""
 
     def draw(self, drive: PackedDrive, noise: np.random.Generator) -> NDArray[np.intp]:
         """See `draw_group`."""
@@ -78,7 +78,7 @@ class DataSettings(GroupSettings):
 
 
 Draw = Callable[[PackedDrive, np.random.Generator], NDArray[np.intp]]
-"""Of a drive: indices (F,) of the frames of a place."""
+"""Draws indices (F,) of the frames of a place in a drive."""
 
 
 class Batch(NamedTuple):
@@ -95,10 +95,10 @@ class Batch(NamedTuple):
 
 
 def draw_group(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
-    """Indices (frames,) of one frame and others up to `radius` m from it, as many up to a quarter of it as
-    beyond: of near pairs a network learns accuracy, of far ones reach.
+    """Indices (frames,) of one frame and others up to `radius` m from it, as many within a quarter of the radius as
+    beyond: from near pairs a network learns accuracy, from far ones reach.
 
-    poses (n, 4, 4); frames repeat where the neighborhood holds too few.
+    poses (n, 4, 4); frames repeat if the neighborhood contains too few.
     """
     frame = np.arange(len(poses))
     first = noise.choice(frame)
@@ -143,11 +143,11 @@ class Mixture:
 
 
 class GroupDataset(Dataset[Batch]):
-    """Batches without an end; batch `n` of a process depends on seed, rank and `n` alone, so a resumed run sees the
-    same.
+    """Endless batches; batch `n` of a process depends only on seed, rank and `n`, so that a resumed run gets the same
+    ones.
 
     Raises:
-        UsageError: no packed drives, images are wanted and none has any, or the network wants more than was packed.
+        UsageError: no packed drives, images are required and none has any, or the network needs more than was packed.
     """
 
     def __init__(self, settings: GroupSettings, network: NetworkSettings, draw: Draw, seed: int) -> None:
@@ -175,10 +175,10 @@ class GroupDataset(Dataset[Batch]):
         return Batch(collate(pyramids), views, shaped)
 
     def _place(self, noise: np.random.Generator) -> list[Sample]:
-        """Frames of a place, changed; another place where one of them shows nothing, as beside a truck.
+        """Augmented frames of a place; another place is drawn if one of them shows too little, as next to a truck.
 
         Raises:
-            Dpm2Error: none is found.
+            Dpm2Error: no such place is found.
         """
         for _ in range(_PLACES):
             drive = self.drives.choose(noise)

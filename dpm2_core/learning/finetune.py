@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fine-tuning on a user's own drives without ground truth: the SLAM's trajectory is the reference.
 
-The network registers the scans of a stretch of road one to the next; the trajectory that follows is held to that of the
-SLAM (eq. 3 of "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks"), and pairs of scans are matched
-as in the registration training. In every batch there are scans of the LiDAR that the weights come from, so that it is
-not forgotten.
+The network registers consecutive scans of a stretch of road. The resulting trajectory is compared with that of the SLAM
+(eq. 3 of "Differentiable SLAM Helps Deep Learning-based LiDAR Perception Tasks"), and pairs of scans are matched as in
+the registration training. Batches also contain scans of the LiDAR that the weights come from, so that it is not
+forgotten.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Finetuned(RegistrationTraining):
         super().__init__(model.settings, settings.loss)
         self.model = model.requires_grad_(True).train()
         self.weights = settings.trajectory, settings.pairs
-        self.image_head = None  # LiDAR alone
+        self.image_head = None  # LiDAR only
         self.loss = settings.loss.model_copy(update={"backbone": 0.0})  # its head is not part of the weights
 
     def forward(  # type: ignore[override]
@@ -72,7 +72,7 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
 
     Args:
         tokens: descriptors of G * F scans, place by place. poses: (G, F, 4, 4) reference, float64; where the network
-            diverged, their motion is taken. See `differentiable_poses` for the gradient.
+            diverged, their motion is used. See `differentiable_poses` for the gradient.
     """
     groups, frames = poses.shape[:2]
     number = torch.arange(groups * frames, device=poses.device).view(groups, frames)
@@ -92,9 +92,9 @@ def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, rad
 
 
 def finetune(settings: FinetuneSettings, out: Path, data: Path | None = None) -> Path:
-    """Train on what `prepare` left below `data`; checkpoint, log and `weights.safetensors` go to `out`.
+    """Train on what `prepare` wrote below `data`; checkpoint, log and `weights.safetensors` go to `out`.
 
-    data: `out`, if None.
+    data: None for `out`.
 
     Raises:
         UsageError: no such weights, or no drives.
@@ -123,7 +123,7 @@ def finetune(settings: FinetuneSettings, out: Path, data: Path | None = None) ->
 
 
 def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 100) -> dict[str, dict[str, float]]:
-    """Errors of registration on the held-out parts and on the rehearsal, where there are any; see `PairSet.measure`."""
+    """Errors of registration on the held-out parts and on the rehearsal, if there are any; see `PairSet.measure`."""
     model = load_model(weights)
     folders = {"held-out parts": out / HELD_OUT, "rehearsal": Path(settings.rehearsal or out / REHEARSAL)}
     return {

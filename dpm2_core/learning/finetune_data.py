@@ -26,14 +26,14 @@ from dpm2_core.slam.graph.graph_data import components
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.system import SlamResult
 
-_APART = 1e4  # m: no two frames of what has nothing to do with each other make a pair
+_APART = 1e4  # m: frames of unconnected parts make no pair
 
 
 class Referenced:
-    """A source with the poses of a SLAM instead of the truth; NaN where it had none."""
+    """A source with the poses of a SLAM instead of ground truth; NaN where the SLAM had none."""
 
     def __init__(self, source: Source, poses: Array, notes: Iterable[str] = (), timed: bool = True) -> None:
-        """`notes`: what the SLAM found out about the drive. `timed`: whether the times of its points are right."""
+        """`notes`: findings of the SLAM about the drive. `timed`: whether the times of its points are right."""
         self.name, self.notes, self.poses, self.truth = source.name, [*notes], poses, "SLAM"
         self.T_cam_lidar = None
         self._source, self._timed = source, timed
@@ -47,11 +47,11 @@ class Referenced:
 
 
 def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = lambda: None) -> Referenced:
-    """The source with the trajectory that the SLAM finds for it, loops closed.
+    """The source with the trajectory that the SLAM estimates for it, loops closed.
 
-    Parts of the drive of which the SLAM does not know where they are to each other, as after a pause during which the
-    robot was carried away, are put far apart: each is a reference for itself. Times of points that the motion has
-    contradicted, as of clouds that were de-skewed already, are taken away.
+    Parts of the drive without a known relative pose, as after a pause during which the robot was carried away, are put
+    far apart: each is a separate reference. Times of points that the motion contradicts, as those of clouds that were
+    already deskewed, are removed.
     """
     times = ""
 
@@ -61,13 +61,13 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
         advance()
 
     result = OfflineRun(source, Config(slam=settings)).run(step)
-    if result.interrupted:  # half a reference is none
+    if result.interrupted:  # an incomplete reference is not used
         raise KeyboardInterrupt
     part, poses = _parts(result), result.poses.copy()
     poses[~np.array(result.registered, bool)] = np.nan
     there = np.flatnonzero(known(poses))
     last = there[:-1][np.diff(part[there]) != 0]
-    poses[last] = np.nan  # the motion during its sweep is that to the next one, and that is not known
+    poses[last] = np.nan  # deskewing uses the motion to the next frame, which is not known
     poses[:, 0, 3] += _APART * part
     notes = []
     if (count := len(np.unique(part[there]))) > 1:
@@ -78,7 +78,7 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
 
 
 def _parts(result: Result) -> NDArray[np.int32]:
-    """(N,) number of the part of a drive that each frame is in: breaks divide it, and loops tie together again."""
+    """(N,) number of the part of a drive that each frame is in: breaks divide a drive, and loops join parts again."""
     stretch = result.recorder.stretches
     of = stretch[np.searchsorted(result.recorder.stamps, [keyframe.stamp for keyframe in result.mapper.keyframes])]
     ties = [(of[loop.from_node], of[loop.to_node]) for loop in result.mapper.loops if loop.ok]
@@ -89,13 +89,13 @@ def prepare(
     sources: Sequence[Source], settings: FinetuneSettings, network: NetworkSettings, slam: SlamSettings, out: Path,
     advance: Callable[[str], None] = lambda what: None,
 ) -> list[str]:  # fmt: skip
-    """Drives with their references, their last parts and the rehearsal, packed below `out`; what is there stays.
+    """Pack drives with their references, their last parts and the rehearsal below `out`; existing ones stay.
 
     Returns:
-        Notes: what the SLAM found out about drives, and of which the part that is held out has nothing to measure.
+        Notes: findings of the SLAM about drives, and drives whose held-out part has nothing to measure.
 
     Raises:
-        UsageError: the SLAM could hardly follow a drive, or one that is there is another one or of other settings.
+        UsageError: the SLAM could hardly track a drive, or an existing one is another drive or of other settings.
     """
     common = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
     slam = slam.model_copy(update={"registration": settings.reference})
@@ -105,7 +105,7 @@ def prepare(
             raise UsageError(f"{kept / left[0]}: of a drive that is not asked for; remove it, or choose another folder")
     for name, source in zip(names, sources, strict=True):
         asked = {**common, "scans": len(source)}
-        if (out / DRIVES / name).exists():  # the last to be written
+        if (out / DRIVES / name).exists():  # written last
             check_same(out / DRIVES / name, asked)
             continue
         referenced = refer(source, slam, partial(advance, f"{name}: reference by SLAM"))
@@ -132,5 +132,5 @@ def _of_many(advance: Callable[[str], None], what: str) -> Advance:
 
 
 def _is_measurable(poses: Array) -> bool:
-    """Whether pairs of every distance that `PairSet` draws are among (N, 4, 4) poses."""
+    """Whether (N, 4, 4) poses contain pairs of every distance that `PairSet` draws."""
     return has_pair(poses, 0.0, NEAR) and has_pair(poses, NEAR, FAR)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packed training drives: from the synthetic city, one a world, and from any source with poses."""
+"""Packed training drives: from the synthetic city, one per world, and from any source with poses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class GenerateSettings(Settings):
     first_seed: int = Field(1000, ge=0)
     """Seed of the first world; the others follow. Validation takes seeds from 900000 on."""
     frames: int = Field(70, gt=1)
-    """Scans of each world, at random places of its road."""
+    """Scans of each world, at random positions on its road."""
     length: float = Field(180.0, ge=60)
     """Road of a world, m."""
     mixture: dict[PresetName, NonNegativeFloat] = Field(
@@ -49,20 +49,20 @@ class GenerateSettings(Settings):
     )
     """Share of each kind of place; the shares need not add up to 1."""
     beams: Literal[16, 32, 64, 128] = 64
-    """Of the LiDAR."""
+    """Beams of the LiDAR."""
     height: float = Field(1.73, gt=0.5, le=10)
-    """Of the LiDAR above the ground, m; each world's own is up to 0.2 m lower or 0.3 m higher."""
+    """Height of the LiDAR above the ground, m; in each world it is up to 0.2 m lower or 0.3 m higher."""
     real: float = Field(0.0, ge=0, le=1)
-    """Fraction of the worlds whose LiDAR has the errors of a real one, each its own."""
+    """Fraction of the worlds whose LiDAR has the errors of a real one, different in each world."""
     others: float = Field(0.0, ge=0, le=1)
-    """Fraction of the worlds with another LiDAR than `beams` and `height` say: 16 to 128 beams or a rosette, on a
-    robot or on a truck, tilted at times."""
+    """Fraction of the worlds with a LiDAR other than that of `beams` and `height`: 16 to 128 beams or a rosette, on a
+    robot or on a truck, sometimes tilted."""
     traffic: float = Field(1.0, ge=0, le=1000)
     """Factor on the preset's traffic; 20 fills every lane."""
     images: bool = False
     """Render an image with each scan."""
     hours: float = Field(0.0, ge=0, le=6)
-    """The images of a world are taken up to so many hours before and after one another: its shadows move."""
+    """Largest time between two images of a world, hours: its shadows move."""
     wet: float = Field(0.0, ge=0, le=1)
     """Fraction of the worlds with drops of water on the lens."""
     preset: str = "small"
@@ -77,7 +77,7 @@ class GenerateSettings(Settings):
 
 
 def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
-    """One world's drive; the same for the same seed and settings."""
+    """Make and pack the drive of one world; it is the same for the same seed and settings."""
     noise = np.random.default_rng([seed, 77])
     kinds = sorted(settings.mixture)
     weights = np.array([settings.mixture[kind] for kind in kinds])
@@ -94,7 +94,7 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
     for _ in range(settings.frames):
         T, time = world.sample_pose(noise, height=height, sway=sway)
         scan = lidar.drive_scan(world, T @ lidar.T_level_lidar, time, noise)
-        points = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)  # what the network is given
+        points = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)  # as the network reads them
         images: tuple[Image, ...] = ()
         if settings.images:
             view = calibration(camera)
@@ -116,15 +116,15 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
 
 
 def _asked(settings: GenerateSettings) -> dict[str, Any]:
-    """What a world is made by, beside its seed."""
+    """The settings that a world is made with, in addition to its seed."""
     return settings.model_dump(mode="json", exclude={"worlds", "first_seed"})
 
 
 def check_same(folder: Path, asked: Mapping[str, Any]) -> None:
-    """A packed drive that is there already was made by the settings that are `asked` for, as far as its file says.
+    """Check that an existing packed drive was made with the settings `asked`, as far as its file records them.
 
     Raises:
-        UsageError: by other ones; it names the first that differs.
+        UsageError: it was made with others; the message names the first that differs.
     """
     made = PackedDrive(folder).about.get("settings")
     for name, now in asked.items():
@@ -133,7 +133,7 @@ def check_same(folder: Path, asked: Mapping[str, Any]) -> None:
 
 
 def _lidar(world: World, settings: GenerateSettings, noise: np.random.Generator) -> Lidar:
-    """A world's own; indoors it fits below what the way leads under."""
+    """The LiDAR of a world; indoors it is lower than the headroom of its route."""
     columns, height = int(noise.choice([1448, 1810, 2170])), settings.height + noise.uniform(-0.2, 0.3)
     config = LidarConfig(beams=settings.beams, columns=columns, height=height)
     if PRESETS[world.preset].indoor == "rooms":  # on a small robot or in the hand
@@ -151,10 +151,10 @@ def training_camera(network: NetworkSettings) -> CameraConfig:
 
 
 def generate(out: Path, settings: GenerateSettings, workers: int, progress: Advance = untold) -> None:
-    """All worlds, several at a time; those that are there already stay, so a killed run continues.
+    """Make all worlds, several at a time; existing ones stay, so that a killed run can be continued.
 
     Raises:
-        UsageError: a world that is there already was made by other settings.
+        UsageError: an existing world was made with other settings.
         Dpm2Error: a world could not be written. No other is begun then, nor after Ctrl-C.
     """
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
@@ -172,7 +172,7 @@ def generate(out: Path, settings: GenerateSettings, workers: int, progress: Adva
             done += 1
             progress(done, settings.worlds)
     finally:
-        pool.shutdown(cancel_futures=True)  # the end of a `with` would make the other worlds first
+        pool.shutdown(cancel_futures=True)  # a `with` block would finish the other worlds first
 
 
 def pack(
@@ -183,13 +183,13 @@ def pack(
     progress: Advance = untold,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
-    """Pack the frames of a source that have a pose, one after the other; returns how many.
+    """Pack the frames of a source that have a pose, one after the other; returns their number.
 
-    Those that cannot be read or show fewer than `MIN_POINTS` points, of which no network makes anything, are left out.
-    Points with time offsets are moved to where they are seen from at the stamp, by the true motion. All is as the
-    network sees it: scans of a tilted sensor in level axes, and a drive that begins in a room enlarged.
+    Frames that cannot be read or show fewer than `MIN_POINTS` points, too few for any network, are left out. Points
+    with time offsets are deskewed to the stamp with the true motion. All data are stored as the network reads them:
+    scans of a tilted sensor in leveled axes, and a drive that begins in a room enlarged.
 
-    `frames`: positions to look at; `progress` is told of each. `settings`: what made the poses, see `check_same`.
+    `frames`: positions to pack; `progress` is called for each. `settings`: what made the poses, see `check_same`.
 
     Raises:
         UsageError: the source has no poses, or some of its frames lack an image that others have.
@@ -198,7 +198,7 @@ def pack(
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
     chosen = frames or range(len(source))
     with packed_writer(folder) as writer:
-        before: tuple[Frame, Array] | None = None  # a motion needs the next pose, so each frame waits for it
+        before: tuple[Frame, Array] | None = None  # packed once the next pose is known, for its motion
         twist, scale, first = np.zeros(6), 0.0, None
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
@@ -232,7 +232,7 @@ def _cameras(frame: Frame) -> list[str]:
 
 
 def _check_cameras(name: str, first: tuple[int, list[str]], now: tuple[int, list[str]]) -> None:
-    """Raise UsageError where two frames, each its number and cameras, do not have as many images."""
+    """Raise UsageError if two frames, each given by number and cameras, differ in their number of images."""
     fewer, more = sorted((first, now), key=lambda seen: len(seen[1]))
     if len(fewer[1]) < len(more[1]):
         lacking = ", ".join(sorted(set(more[1]) - set(fewer[1])) or more[1])
@@ -255,7 +255,7 @@ def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, s
 
 
 def _sample(points: Points, pose: Array, images: tuple[Image, ...], network: NetworkSettings, scale: float) -> Sample:
-    """A frame of a world that is enlarged by `scale`."""
+    """A frame as a sample, with its world enlarged by `scale`."""
     if scale == 1:
         return Sample(crop(points, network.points), pose, images)
     T = pose.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which descriptor sets of a batch are registered to which: pairs of frames, and merged sets as maps are."""
+"""Choice of the descriptor sets of a batch that are registered: pairs of frames, and merged sets, as in maps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SetPairs(NamedTuple):
     """Set pairs of a batch of encoded frames.
 
     Attributes:
-        source, target: (B, S) and (B, R) indices of the frames that each side merges, in the frame of its first.
+        source, target: (B, S) and (B, R) indices of the frames that each side merges, in the frame of its first one.
         T_source, T_target: (B, S, 4, 4) and (B, R, 4, 4), of each member to the first of its side.
         T_target_source: (B, 4, 4) truth between the first ones.
     """
@@ -67,19 +67,19 @@ def sample_set_pairs(
 
 @full_precision
 def _turned(axis: Tensor, T: Tensor) -> Tensor:
-    """Axes (B, N, 2) in the frame to which T (B, 4, 4) leads, not yet of length 1."""
+    """Axes (B, N, 2), rotated by T (B, 4, 4), not yet of length 1."""
     return axis @ T[:, :2, :2].transpose(1, 2)
 
 
 def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -> Tokens:
     """Sets (B, S * N) of frames index (B, S) of a batch of tokens, moved by T (B, S, 4, 4).
 
-    Where the network is not `view_aligned` the offsets are in the axes of the set, and so `axis` stays (1, 0), as
-    `to_tokens` has it in use.
+    If the network is not `view_aligned`, the offsets are in the axes of the set, and `axis` stays (1, 0), as from
+    `to_tokens` at inference.
     """
     batch, size = index.shape
     members = tokens.at(index)
-    if size == 1:  # its own frame
+    if size == 1:  # already in its own frame
         return members
     T = T.flatten(0, 1)
     xyz, axis = transform(T, members.xyz), members.axis

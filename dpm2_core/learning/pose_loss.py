@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error of the pose that the network finds, with a gradient: what losses on descriptors and offsets never see.
+"""Differentiable error of the pose that the network estimates; losses on descriptors and offsets do not measure it.
 
 Beyond the paper, whose registration training stops at the matches. It is eq. 3 of "Differentiable SLAM Helps Deep
 Learning-based LiDAR Perception Tasks" for single pairs.
@@ -18,10 +18,10 @@ from dpm2_core.network.pose_solver import solve_batch
 from dpm2_core.network.tokens import Tokens
 
 DIVERGED = 1.0
-"""A registration that is wrong by more than this has no gradient that leads back, m: what counts then is what pulls
-its pairs away from the truth, and the less the farther."""
+"""A registration that is wrong by more than this, m, has no gradient that leads back. The steps then start at the
+truth: the loss is how far its pairs pull the pose away from there, and it counts less with distance."""
 FINE = 0.05
-"""Errors well above this count as they are, not squared: the tail does not rule the step, m."""
+"""Errors well above this, m, count linearly and not squared, so that the tail does not dominate the step."""
 
 
 def differentiable_poses(
@@ -29,9 +29,9 @@ def differentiable_poses(
 ) -> tuple[Tensor, Tensor]:
     """Poses (B, 4, 4) T_target_source float64 with gradients, and which of them (B,) the network found itself.
 
-    Matches, offsets and their precisions have a gradient; the pose has it through the last steps of its least squares,
-    which start at the solution: as the implicit function theorem gives it, and without that of a decomposition, which
-    is infinite where singular values meet.
+    Matches, offsets and their precisions have a gradient. The pose gets it through the last steps of its least squares,
+    which start at the solution, as by the implicit function theorem. This avoids the gradient of a decomposition, which
+    is infinite where singular values coincide.
 
     Args:
         truth: (B, 4, 4) float64; where the network is `DIVERGED`, the steps start there.

@@ -16,7 +16,7 @@ from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, maha
 from dpm2_core.network.matching import softmax_both, take
 from dpm2_core.network.tokens import Tokens
 
-_OWN_LIMIT = 6.0  # m: of the network's own matches those that are wrong by more have no offset to learn
+_OWN_LIMIT = 6.0  # m: the network's own matches that are wrong by more are not used for the offsets
 
 
 class LossSettings(Settings):
@@ -27,18 +27,18 @@ class LossSettings(Settings):
     coarse: float = 0.1
     """On the encoder's descriptors, through the coarse head."""
     backbone: float = 0.1
-    """On the point backbone's key-points, through a head of its own."""
+    """On the point backbone's key-points, through its own head."""
     image: float = 0.1
-    """On the features of the first image where descriptors project into it, through a head of its own."""
+    """On the features of the first image where descriptors project into it, through its own head."""
     offset: float = 0.2
-    """On predicted offsets. The likelihood's gradient is that of a distance divided by its deviation, some 0.1 m: with
-    weight 1 it drowns the pairing."""
+    """On predicted offsets. The likelihood's gradient is that of a distance divided by its deviation, about 0.1 m: with
+    weight 1 it dominates the pairing."""
     pose: float = Field(0.0, ge=0)
-    """On the error of the pose, 1/m; for weights that register already. See `pose_loss`."""
+    """On the error of the pose, 1/m; for weights that can already register. See `pose_loss`."""
     near: int = Field(128, gt=0)
     """Pairs drawn per set pair among those within `offset_limit` of each other."""
     own: int = Field(128, ge=0)
-    """Pairs per set pair that are the network's own best matches: what it will be asked at inference."""
+    """Pairs per set pair that are the network's own best matches, as at inference."""
 
 
 def registration_loss(
@@ -100,7 +100,7 @@ def offset_pairs(
 def offset_loss(
     decoder: Decoder, source: Tokens, target: Tokens, T: Tensor, correlated: Correlated, pairs: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Loss of the offsets of pairs as `offset_pairs` gives them, and error (2 B, pairs) of each, m, there and back.
+    """Loss of the offsets of pairs from `offset_pairs`, and error (2 B, pairs) of each, m, in both directions.
 
     T: (B, 4, 4) T_target_source.
     """

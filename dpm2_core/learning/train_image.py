@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before the registration training with images: the image branch alone, on points that two images both show.
+"""Training of the image branch alone, before the registration training with images, on points that two images show.
 
-Inside the whole network the image branch learns last: its way into the pose is long. Alone it learns in minutes,
-because every LiDAR point that both cameras see is an exact correspondence, and a step costs no point cloud network.
+Inside the whole network the image branch learns last: its effect on the pose is indirect. Alone it learns in minutes,
+because every LiDAR point that both cameras see is an exact correspondence, and a step runs no point cloud network.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NEUTRAL = 1.5  # m, within which a point's neighbors are neither right nor wrong
 
 
 class ImagePairs(NamedTuple):
-    """Images two by two, first and second of each pair.
+    """Images in pairs: first and second of each pair, one after the other.
 
     Attributes:
         views: of 2 P frames. points: (2 P, n, 3) m, the same points in both LiDAR frames of a pair.
@@ -68,7 +68,7 @@ class ImageTrainingSettings(Settings):
     points: int = Field(256, gt=0)
     """Points drawn for each pair."""
     shift: float = Field(0.3, ge=0)
-    """Deviation of the second image's points from the true ones, m: descriptors never sit at the very same place."""
+    """Standard deviation of the second image's points from the true ones, m: descriptors never coincide exactly."""
     optimiser: OptimizerSettings = OptimizerSettings()
     start: str = ""
     """Weights of the network, a name or a .safetensors file, whose other parts stay as they are; empty: random."""
@@ -84,7 +84,7 @@ class ImageDataset:
             check_images(drive, network)
 
     def pairs(self, points: int, start: int = 0, rank: int = 0) -> Iterator[ImagePairs]:
-        """Pairs of each step from `start` on, without an end, as deterministic as the batches of `GroupDataset`.
+        """Endless pairs, for each step from `start` on, as deterministic as the batches of `GroupDataset`.
 
         Raises:
             UsageError: a drive without images, or whose images show too few points.

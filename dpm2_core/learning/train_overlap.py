@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The overlap training: the heads that judge a pose alone, on the frozen network of the registration training, half of
-the pairs near, half hard or far. Beside the paper's overlap head that is the confidence of a pose."""
+"""The overlap training: only the heads that judge a pose, on the frozen network of the registration training. Half of
+the pairs are near, half hard or far. The heads are the paper's overlap head and the confidence of a pose."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class OverlapTrainingSettings(Settings):
     start: str
     """Weights of the registration training, a name or a .safetensors file."""
     data: GroupSettings = GroupSettings()
-    """Packed drives, of which frames are drawn that overlap and that do not, see `draw_overlap`."""
+    """Packed drives, from which frames with and without overlap are drawn, see `draw_overlap`."""
     validation: str = ""
     """Folder of packed drives of other worlds; empty: none."""
     validation_batches: int = Field(25, gt=0)
@@ -59,7 +59,7 @@ class OverlapTrainingSettings(Settings):
 def draw_overlap(poses: Array, noise: np.random.Generator) -> NDArray[np.intp]:
     """Indices (FRAMES,) of a frame, two within OVERLAP m of it, one within HARD m and one beyond.
 
-    poses (n, 4, 4). A kind that the drive does not have repeats another kind.
+    poses (n, 4, 4). For a kind that the drive does not have, another kind is repeated.
     """
     frames = np.arange(len(poses))
     for _ in range(20):
@@ -88,10 +88,10 @@ class OverlapTraining(nn.Module):
         self.model = DeepPointMap2(network)
         self.model.requires_grad_(False)
         self.model.decoder.overlap.requires_grad_(True)
-        self.model.decoder.confidence.requires_grad_(network.decoder.precision)  # else it is not asked
+        self.model.decoder.confidence.requires_grad_(network.decoder.precision)  # else it is not used
 
     def train(self, mode: bool = True) -> Self:
-        """But for what is frozen, running means included."""
+        """Set the mode; the frozen encoder stays in evaluation mode, with its running means."""
         super().train(mode)
         self.model.encoder.eval()
         return self
@@ -142,8 +142,8 @@ def average_precision(scores: np.ndarray, positive: np.ndarray) -> float:
 
 
 def train_overlap(settings: OverlapTrainingSettings, out: Path) -> Path:
-    """Train; writes checkpoint, log and `weights.safetensors`, the registration training's with the new heads, to
-    `out`."""
+    """Train; writes checkpoint, log and `weights.safetensors`, those of the registration training with the new heads,
+    to `out`."""
     optimizer, weights = settings.optimiser, out / WEIGHTS
     torch.manual_seed(optimizer.seed)
     start = weights_path(settings.start)
@@ -167,8 +167,8 @@ def train_overlap(settings: OverlapTrainingSettings, out: Path) -> Path:
 def validator(
     settings: OverlapTrainingSettings, network: NetworkSettings
 ) -> Callable[[OverlapTraining], dict[str, float]]:
-    """A function that measures the average precision on fixed batches of unseen worlds, by their images if they have
-    any; scans are as they are, and each counts alike, whatever the training makes of its own."""
+    """A function that measures the average precision on fixed batches of unseen worlds, with their images if they have
+    any. Scans are not augmented, and no preset is emphasized, whatever the training does with its own."""
     images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
     measured = {"packed": {settings.validation: 1.0}, "images": images, "augment": UNCHANGED, "emphasis": {}}
     options = settings.data.model_copy(update=measured)

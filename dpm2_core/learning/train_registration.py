@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registration training: registration, of pairs of frames and of merged sets."""
+"""The registration training, with pairs of frames and with merged sets."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from dpm2_core.network.weights import load_fitting, load_weights, save_weights
 
 
 class RegistrationTraining(nn.Module):
-    """The network with its loss, as one module, so that it compiles and distributes whole."""
+    """The network with its loss, as one module, so that it is compiled and distributed as a whole."""
 
     def __init__(self, network: NetworkSettings, loss: LossSettings, encoder: bool = True) -> None:
-        """`encoder` False: it does not learn."""
+        """`encoder`: whether the encoder learns."""
         super().__init__()
         self.loss = loss
         self.model = DeepPointMap2(network)
@@ -52,7 +52,7 @@ class RegistrationTraining(nn.Module):
             self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
 
     def train(self, mode: bool = True) -> Self:
-        """But for an encoder that does not learn, running means included."""
+        """Set the mode; an encoder that does not learn stays in evaluation mode, with its running means."""
         super().train(mode)
         if self._frozen:
             self.model.encoder.eval()
@@ -62,7 +62,7 @@ class RegistrationTraining(nn.Module):
         self, points: PointBatch, views: Views | None, plans: tuple[SetPairs, ...]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss over the plans, and figures of the first."""
-        encoded = self.model.encoder(points, views)  # without a graph where it does not learn
+        encoded = self.model.encoder(points, views)  # without a graph if it does not learn
         total, figures = self.pair_loss(encoded.tokens, plans)
         if self.loss.backbone:
             auxiliary = self._backbone_loss(encoded.scales[self.level], plans[0])
@@ -97,7 +97,7 @@ class RegistrationTraining(nn.Module):
 
     def _image_loss(self, head: nn.Module, encoded: Encoded, views: Views, plan: SetPairs) -> Tensor:
         """InfoNCE of the images' features where the descriptors project: the image branch learns long before the
-        fusion makes use of it."""
+        fusion uses it."""
         xyz = encoded.tokens.xyz
         features, seen = image_features(xyz, views, encoded.maps)
         features, mask = head(features), encoded.tokens.mask & seen
@@ -127,13 +127,13 @@ class RegistrationTrainingSettings(Settings):
     start: str = ""
     """Weights to start from, a name or a .safetensors file; empty: random."""
     encoder: bool = True
-    """Whether the encoder learns; else the decoder alone, for the descriptors that `start` makes."""
+    """Whether the encoder learns; if not, only the decoder does, for the descriptors that `start` produces."""
     partial: bool = False
-    """Take from `start` what fits, where the network is another; the rest is random, and named in the new weights."""
+    """Load from `start` what fits, if the network differs; the rest is random, and is named in the new weights."""
 
 
 def set_pairs_of(poses: Tensor, settings: RegistrationTrainingSettings, step: int) -> tuple[SetPairs, ...]:
-    """What a step registers: frame pairs, and at times one set pair a place."""
+    """The set pairs that a step registers: frame pairs, and in some steps one pair of merged sets per place."""
     noise = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + step)
     radius, frames = settings.data.radius, poses.shape[1]
     plans = [sample_set_pairs(poses, settings.pairs, (1, 1), radius, noise)]

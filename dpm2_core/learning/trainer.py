@@ -28,7 +28,7 @@ from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
 M = TypeVar("M", bound=nn.Module)
-_DIVERGED = 100  # steps in a row without a finite gradient: the weights, which none of them changes, do not recover
+_DIVERGED = 100  # steps in a row without a finite gradient: none of them changes the weights, which do not recover
 
 
 class StepSettings(Settings):
@@ -37,15 +37,15 @@ class StepSettings(Settings):
     kind: Literal["adamw", "adam", "sgd"] = "adamw"
     """AdamW; Adam, whose decay is a part of the gradient; or stochastic gradient descent with momentum."""
     momentum: float = Field(0.9, ge=0, lt=1)
-    """Of sgd; of the others the first beta."""
+    """Momentum of sgd; for the others the first beta."""
     drop_every: int = Field(0, ge=0)
-    """Steps after which the rate is multiplied by `drop`, again and again, instead of the cosine; 0: the cosine."""
+    """Steps after which the rate is multiplied by `drop`, repeatedly, instead of the cosine; 0: the cosine."""
     drop: float = Field(0.8, gt=0, le=1)
     """See `drop_every`."""
     rate: float = Field(1e-3, gt=0)
     """Peak learning rate."""
     final_rate: float = Field(1e-5, ge=0)
-    """At the end of the cosine."""
+    """Learning rate at the end of the cosine."""
     warmup: int = Field(100, ge=0)
     """Steps of linear warm-up."""
     decay: float = Field(1e-4, ge=0)
@@ -53,20 +53,20 @@ class StepSettings(Settings):
     clip: float = Field(1.0, gt=0)
     """Largest norm of the gradient."""
     ema: float = Field(0.998, ge=0, lt=1)
-    """Decay of the averaged weights, which are the ones that are kept."""
+    """Decay of the averaged weights, which are the ones that are saved."""
     seed: int = Field(0, ge=0)
-    """Of weights, data and everything random."""
+    """Seed of weights, data and everything random."""
 
 
 class OptimizerSettings(StepSettings):
     """Optimisation, counted in steps."""
 
     steps: int = Field(3000, gt=0)
-    """Batches."""
+    """Number of steps, one batch each."""
     compile: bool = True
     """torch.compile: slower to start, about twice as fast."""
     bf16: bool = True
-    """bf16 autocast, where the processor multiplies bf16."""
+    """bf16 autocast, if the processor supports products of bf16."""
     save_every: int = Field(200, gt=0)
     """Steps between checkpoints."""
     validate_every: int = Field(400, gt=0)
@@ -74,7 +74,7 @@ class OptimizerSettings(StepSettings):
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed blocks: a step allocates the same gigabytes again, and page faults took half of it."""
+    """Let glibc keep freed blocks: a step allocates the same gigabytes again, and page faults took half of its time."""
     libc = ctypes.util.find_library("c")
     if libc is not None and hasattr(handle := ctypes.CDLL(libc), "mallopt"):
         handle.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
@@ -83,7 +83,7 @@ def keep_memory() -> None:
 
 @contextmanager
 def process_group() -> Iterator[tuple[int, int, torch.device]]:
-    """Rank, world size and device of this process; joins the group when started by torchrun, where the first one alone
+    """Rank, world size and device of this process. Under torchrun it joins the group, in which only the first process
     shows its progress."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     cuda = torch.cuda.is_available()
@@ -123,7 +123,7 @@ def parameter_groups(module: nn.Module, decay: float) -> list[dict[str, Any]]:
 
 
 def make_optimizer(module: nn.Module, settings: OptimizerSettings) -> torch.optim.Optimizer:
-    """What the settings name; AdamW's decay is on matrices only, that of the others on all, as their users have it."""
+    """The optimizer of the settings. AdamW's decay is on matrices only, that of the others on all, as is usual."""
     if settings.kind == "adamw":
         groups = parameter_groups(module, settings.decay)
         return torch.optim.AdamW(groups, settings.rate, betas=(settings.momentum, 0.999))
@@ -135,13 +135,13 @@ def make_optimizer(module: nn.Module, settings: OptimizerSettings) -> torch.opti
 
 @torch.no_grad()
 def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> None:
-    """Averaged weights, with a shorter memory at the start; buffers, such as running means, as they are."""
+    """Update the averaged weights, with a shorter memory at the start; buffers, such as running means, are copied."""
     decay = min(decay, (1 + step) / (10 + step))
     for average, value in zip(ema.buffers(), module.buffers(), strict=True):
         average.copy_(value)
     averaged: list[Tensor] = list(ema.parameters())
     now: list[Tensor] = list(module.parameters())
-    torch._foreach_lerp_(averaged, now, 1 - decay)  # exact for what does not learn
+    torch._foreach_lerp_(averaged, now, 1 - decay)  # exact for weights that do not learn
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Trainer(Generic[M]):
     Attributes:
         module: what is trained. Called with a batch it gives the loss, the mean over the batch, and figures for the
             log, `loss` among them.
-        batches: of (first step, rank of the process): what the module is called with in each step, without an end.
+        batches: function of (first step, rank of the process): endless arguments of the module, for each step.
         settings: optimization.
         out: folder of `checkpoint.pt` and `log.jsonl`.
         save: writes the averaged module at the end.
@@ -169,15 +169,15 @@ class Trainer(Generic[M]):
         """Train, from the checkpoint on if there is one; `until`: stop after this step, with a checkpoint.
 
         Raises:
-            UsageError: a checkpoint of another training, or of more steps than are wanted; or another training is
-                writing in the folder.
+            UsageError: a checkpoint of another training, or of more steps than the settings have; or another training
+                is writing in the folder.
             Dpm2Error: no step had a finite gradient, or none of the last hundred.
         """
         keep_memory()
         make_folder(self.out)
         with process_group() as (rank, world, device), nullcontext() if rank else held(self.out):
-            module = self.module.to(device).train()  # it says itself what of it is frozen
-            ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation leaves running means as they are
+            module = self.module.to(device).train()  # frozen parts stay in evaluation mode
+            ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation changes no running means
             optimizer = make_optimizer(module, self.settings)
             checkpoint = self.out / CHECKPOINT
             start = load_checkpoint(checkpoint, module, ema, optimizer) if checkpoint.exists() else 0
@@ -230,13 +230,13 @@ class Trainer(Generic[M]):
         if norm.isfinite():
             optimizer.step()
             update_ema(ema, module, settings.ema, step)
-        else:  # nothing of such a step stays, running means included
+        else:  # undo all of such a step, running means included
             for value, before in zip(module.buffers(), buffers, strict=True):
                 value.data.copy_(before)
         return {name: float(value) for name, value in figures.items()} | {"norm": float(norm), "rate": rate}
 
     def _keep(self, ema: M, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
-        """Validation, then checkpoint, where they are due after so many steps: what is stopped is repeated."""
+        """Validate, then save a checkpoint, if due after `done` steps: a run stopped in between repeats both."""
         if self.validate is not None and (last or done % self.settings.validate_every == 0):
             log.write(done - 1, self.validate(ema))
         if last or done % self.settings.save_every == 0:
