@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A window of clouds as users have them, checked, downsampled and padded to one tensor."""
+"""A window of a user's clouds, checked, downsampled and padded to one tensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from dpm2_core.errors import UsageError
 
 MIN_POINTS = 50
-"""A scan of fewer is rejected: ten of them make one normal."""
+"""A scan with fewer points is rejected: a normal needs ten."""
 _CELLS = 2**20  # along each axis; a cell index of three axes fits into 63 bits
 
 
@@ -20,11 +20,11 @@ def window(
 ) -> tuple[Tensor, Tensor]:
     """Points (T, N, 3) and weights (T, N) float64 of T clouds, N <= `count`, padded with weight zero.
 
-    A cloud of more than `count` points keeps one point of each occupied voxel and of these a random choice, the same in
-    every call; points of weight zero are not chosen. The gradient of the points and weights kept passes through.
+    A cloud of more than `count` points keeps one point of each occupied voxel, and of these a random choice, the same
+    in every call. Points of weight zero are not chosen. The gradient of the kept points and weights passes through.
 
     Args:
-        clouds: T tensors (N_t, 3), m, or one (T, N, 3). weights: the same without the last axis, 0..1; None is one.
+        clouds: T tensors (N_t, 3), m, or one (T, N, 3). weights: the same without the last axis, 0..1; None: all one.
         voxel: edge, m. name: of the clouds, for messages.
 
     Raises:
@@ -39,7 +39,7 @@ def window(
         weight = cloud.new_ones(cloud.shape[:1]) if weights is None else weights[t]
         _check(cloud, weight, f"{name}, scan {t}")
         keep = _downsampled(cloud.detach(), weight.detach(), count, voxel)
-        # A scan without any weight keeps one point, so that it keeps its place and its weights their (zero) gradient.
+        # A scan without any weight keeps one point, so that it stays in the window, with a (zero) gradient of weights.
         kept = cloud[keep] if len(keep) else cloud[:1].nan_to_num(0.0, 0.0, 0.0)
         pairs.append((kept.double(), (weight[keep] if len(keep) else weight[:1]).double()))
     pad = torch.nn.utils.rnn.pad_sequence
@@ -55,7 +55,7 @@ def _check(cloud: Tensor, weight: Tensor, where: str) -> None:
         raise UsageError(f"{where}: {len(cloud)} points; want at least {MIN_POINTS}")
     if weight.shape != cloud.shape[:1]:
         raise UsageError(f"{where}: weights {tuple(weight.shape)} for {len(cloud)} points")
-    # Padding may hold anything; the common case costs one look at the device.
+    # Padding may contain any values; the common case costs one synchronization with the device.
     bad = ~cloud.detach().isfinite().all(1) & (weight.detach() != 0)
     wrong = ~((weight.detach() >= 0) & (weight.detach() <= 1))
     if bool((bad | wrong).any()):
@@ -69,7 +69,7 @@ def _downsampled(points: Tensor, weight: Tensor, count: int, voxel: float) -> Te
     index = weight.nonzero()[:, 0]
     if len(index) <= count:
         return index
-    # The order is one of all points: with one weight that is zero or not, the others are chosen as before.
+    # The order is drawn for all points: whether a weight is zero does not change the choice among the others.
     generator = torch.Generator().manual_seed(len(points))
     order = torch.randperm(len(points), generator=generator).to(index.device)
     index = order[weight[order] != 0]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point-to-plane ICP for a batch of pairs, differentiable in the points and weights of both clouds.
 
-Which points belong together is found without gradient: it is piecewise constant. Coordinates, normals and weights have
-theirs. Selections reach the pose through weights; a boolean mask would have no gradient.
+The association of points has no gradient: it is piecewise constant. Coordinates, normals and weights have one.
+Selections act on the pose through weights; a boolean mask would have no gradient.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ class IcpSettings(Settings):
     solver: SoftLmSettings = SoftLmSettings()
     """Iterations, damping and gradient."""
     max_distance: float = Field(default=3.0, gt=0)
-    """Matches farther apart are left out, m."""
+    """Matches that are farther apart are left out, m."""
     kernel: Literal["huber", "geman_mcclure", "none"] = "huber"
-    """What a large residual counts for."""
+    """Robust kernel, which reduces the weight of large residuals."""
     kernel_scale: float = Field(default=0.2, gt=0)
-    """Residual at which the kernel begins to bend, m."""
+    """Residual at which the kernel begins to take effect, m."""
 
 
 class Cloud:
-    """A batch of clouds, prepared to be registered to.
+    """A batch of clouds, prepared for registration.
 
     Attributes:
         points: (B, N, 3) float64, m. weights: (B, N) 0..1, zero for padding. normals: (B, N, 3) unit.
     """
 
     def __init__(self, points: Tensor, weights: Tensor | None = None) -> None:
-        """Take points (B, N, 3) and weights (B, N), all one if None; a point of weight zero is not there."""
+        """Take points (B, N, 3) and weights (B, N), all one if None; a point of weight zero is ignored."""
         self.points = points.double()
         self.weights = self.points.new_ones(points.shape[:2]) if weights is None else weights.double()
         self.search = NeighborSearch(self.points, self.weights.detach() > 0)
         self.normals = _normals(self.points, self.weights, self.search)
 
     def select(self, index: Sequence[int]) -> Cloud:
-        """The clouds of the batch at these places, prepared as they are."""
+        """The clouds of the batch at these indices, without preparing them again."""
         out = copy(self)
         rows = torch.tensor(index, device=self.points.device)
         out.points, out.weights, out.normals = self.points[rows], self.weights[rows], self.normals[rows]
@@ -64,7 +64,7 @@ def register(source: Cloud, target: Cloud, T_init: Tensor, settings: IcpSettings
     """T_target_source (B, 4, 4) float64.
 
     Directions that the pair does not determine (a single plane, no matches, weights of zero) keep `T_init` and have no
-    gradient or, nearly undetermined, one that `solver.lambda_min` bounds; the result is finite.
+    gradient. In nearly undetermined directions `solver.lambda_min` bounds the gradient. The result is finite.
 
     Args:
         source, target: B clouds each. T_init: (B, 4, 4), detached.
@@ -74,12 +74,12 @@ def register(source: Cloud, target: Cloud, T_init: Tensor, settings: IcpSettings
 
 @torch.no_grad()
 def matched(source: Cloud, target: Cloud, T: Tensor, settings: IcpSettings) -> Tensor:
-    """(B,) share of the source's weight that has a counterpart at T_target_source (B, 4, 4); without gradient."""
+    """(B,) share of the source's weight with a match at T_target_source (B, 4, 4); without gradient."""
     return Matching(source, target, settings).associate(T[:, None]).total / source.weights.sum(1).clamp(min=1e-9)
 
 
 class Matching:
-    """What `register` solves, a `soft_lm.Problem`: each point of the source is matched to the nearest of the target."""
+    """The `soft_lm.Problem` of `register`: each point of the source is matched to the nearest one of the target."""
 
     def __init__(self, source: Cloud, target: Cloud, settings: IcpSettings) -> None:
         self._source, self._target, self._settings = source, target, settings
@@ -145,8 +145,8 @@ def _irls_weight(r: Tensor, settings: IcpSettings) -> Tensor:
 def _normals(points: Tensor, weights: Tensor, search: NeighborSearch) -> Tensor:
     """Unit normals (B, N, 3) by weighted PCA over the nearest of each point; z where a point has no neighbors.
 
-    With the gradient of the eigenvector to first order: without it the slope by one point is a third off. The gap to
-    the other eigenvalues is kept from zero, where a neighborhood is a line and has no normal.
+    They have the gradient of the eigenvector to first order: without it the derivative by one point is a third off. The
+    gap to the other eigenvalues is bounded away from zero, as for neighborhoods on a line, which have no normal.
     """
     at = points.detach()
     index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), _NEIGHBORS)
@@ -161,5 +161,5 @@ def _normals(points: Tensor, weights: Tensor, search: NeighborSearch) -> Tensor:
         gap = values[..., :1] - values[..., 1:]
         inverse_gap = gap / (gap**2 + (_LEAST_GAP * values.sum(-1, keepdim=True)) ** 2).clamp(min=1e-18)
         normal, others = vectors[..., :1], vectors[..., 1:]
-    turn = inverse_gap[..., None] * (others.mT @ (C - C.detach()) @ normal)  # zero, but for its gradient
+    turn = inverse_gap[..., None] * (others.mT @ (C - C.detach()) @ normal)  # zero, except for its gradient
     return (normal + others @ turn)[..., 0]

@@ -15,10 +15,10 @@ _CHUNK = 2**27  # distances at once, 1 GiB in float64
 
 
 class NeighborSearch:
-    """Finds the points of clouds (B, N, 3) whose `valid` (B, N) is true; the first is used where there is none."""
+    """Search among the points of clouds (B, N, 3) whose `valid` (B, N) is true; the first one is used if none is."""
 
     def __init__(self, points: Tensor, valid: Tensor) -> None:
-        """Index the clouds; their gradient is not followed."""
+        """Index the clouds, without gradient."""
         self._points = torch.where(valid[..., None], points.detach(), points.new_tensor(torch.inf))
         self._trees: list[tuple[cKDTree, np.ndarray]] = []
         if not points.is_cuda:
@@ -27,14 +27,14 @@ class NeighborSearch:
                 self._trees.append((cKDTree(cloud[index], balanced_tree=False), index))
 
     def select(self, index: Sequence[int]) -> NeighborSearch:
-        """Of the clouds of the batch at these places."""
+        """The search in the clouds of the batch at these indices."""
         out = copy(self)
         out._points = self._points[torch.tensor(index, device=self._points.device)]
         out._trees = [self._trees[i] for i in index] if self._trees else []
         return out
 
     def nearest(self, queries: Tensor, k: int = 1) -> Tensor:
-        """(B, M, k) indices of the k points nearest to queries (B, M, 3); a cloud of fewer repeats its nearest."""
+        """(B, M, k) indices of the k points nearest to queries (B, M, 3); a cloud with fewer repeats the nearest."""
         queries = queries.detach()
         return self._by_tree(queries, k) if self._trees else nearest_by_distance(queries, self._points, k)
 
@@ -47,7 +47,7 @@ class NeighborSearch:
 
 
 def nearest_by_distance(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """(B, M, k) indices of the k nearest of points (B, N, 3), those that count finite; for a GPU, where a tree is slow.
+    """(B, M, k) indices of the k nearest of points (B, N, 3), infinite ones excluded; for a GPU, where a tree is slow.
 
     As `NeighborSearch.nearest`.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relaxation of a small pose graph, differentiable in the relative poses that were measured and in their weights."""
+"""Relaxation of a small pose graph, differentiable in the measured relative poses and in their weights."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def relax(
     rotation_weight: float = 25.0,
     settings: SoftLmSettings | None = None,
 ) -> Tensor:
-    """Poses (T, 4, 4) float64 that agree best with all measurements; the first stays where it is.
+    """Poses (T, 4, 4) float64 that agree best with all measurements; the first one is fixed.
 
     The residual of an edge is its translation error, m, and its rotation error, rad, times the root of
     `rotation_weight`. Normal equations are dense, (6T)^2: for windows of up to some hundred scans.
 
     Args:
-        poses: (T, 4, 4) T_map_scan to begin at. edges: (E, 2) pairs (target, source), loops included.
+        poses: (T, 4, 4) T_map_scan to start from. edges: (E, 2) pairs (target, source), loops included.
         measured: (E, 4, 4) T_target_source. weights: (E,) 0..1, all one if None. rotation_weight: m2 / rad2.
 
     Raises:
-        UsageError: an edge names a pose that is not there, or the counts differ.
+        UsageError: an edge names a pose that does not exist, or the counts differ.
     """
     if edges.shape != (len(measured), 2):
         raise UsageError(f"pose graph: edges {tuple(edges.shape)} for {len(measured)} measured poses")
@@ -47,7 +47,7 @@ def relax(
 
 
 class _Graph:
-    """`soft_lm.Problem` and `Residuals` at once: nothing has to be associated. One batch entry, K = T - 1 poses."""
+    """`soft_lm.Problem` and `Residuals` in one: there is no association. One batch entry, K = T - 1 poses."""
 
     def __init__(self, first: Tensor, edges: Tensor, measured: Tensor, weights: Tensor, rotation_weight: float) -> None:
         self._first, self._edges, self._measured = first, edges.to(measured.device), measured
@@ -63,7 +63,7 @@ class _Graph:
         return poses[self._edges[:, 0]], poses[self._edges[:, 1]]
 
     def _residual(self, found: Tensor) -> Tensor:
-        """(E, 6) of the relative poses found (E, 4, 4), scaled."""
+        """(E, 6) scaled residuals of the relative poses found (E, 4, 4)."""
         Z = self._measured
         w = se3_torch.log_rotation(Z[:, :3, :3].mT @ found[:, :3, :3])
         return self._scale * torch.cat([w, found[:, :3, 3] - Z[:, :3, 3]], -1)
@@ -84,7 +84,7 @@ class _Graph:
         by_target = torch.cat(
             [torch.cat([-J_r @ R.mT, zero], -1), torch.cat([se3_torch.hat(found[:, :3, 3]), -eye], -1)], -2
         )
-        # Each edge's blocks, put into its columns; those of the first pose, which does not move, fall away.
+        # Each edge's blocks, put into its columns; those of the first pose, which is fixed, are dropped.
         target_is, source_is = torch.nn.functional.one_hot(self._edges, T.shape[1] + 1)[..., 1:].to(R.dtype).unbind(1)
         J = torch.einsum("eij,ek->eikj", by_target, target_is) + torch.einsum("eij,ek->eikj", by_source, source_is)
         J = (self._scale[:, None] * J.flatten(2)).flatten(0, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the SLAM loss joins the loss of the task: eq. 1 and the schedule of the paper, and a bound."""
+"""Sum of the SLAM loss and the loss of the task: eq. 1 and the schedule of the paper, and a bound."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ class ScheduleSettings(Settings):
 
     gamma: float = Field(default=0.0, ge=0)
     """Weight of the SLAM loss; choose it so that the gradient of gamma L_slam is about half of that of L_model when it
-    first counts. The losses themselves compare only where both are means. 0: it never counts."""
+    is first used. The losses themselves are comparable only if both are means. 0: it is never used."""
     every: int = Field(default=5, ge=1)
     """k: the last of every k epochs has the SLAM loss (the paper: 27 of 150 epochs for GndNet)."""
     begin: int = Field(default=0, ge=0)
-    """Epochs before the first k: an untrained network makes no clouds that a SLAM could run on."""
+    """Epochs before the first k: an untrained network produces no clouds that a SLAM could run on."""
     most: float | None = Field(default=0.5, gt=0)
-    """Largest fraction of |L_model| that gamma L_slam may have in a step. Where a registration is lost, its error would
-    be the whole step, and it is heavy-tailed. None: no bound, eq. 1 as it is in the paper."""
+    """Largest fraction of |L_model| that gamma L_slam may have in a step. If a registration is lost, its error, which
+    is heavy-tailed, would be the whole step. None: no bound, eq. 1 as in the paper."""
 
 
 def is_due(epoch: int, settings: ScheduleSettings) -> bool:
-    """Whether this epoch, the first being 0, is one of those that the SLAM loss counts in, whatever its weight."""
+    """Whether the SLAM loss is used in this epoch, the first being 0, whatever its weight."""
     since = epoch - settings.begin
     return since >= 0 and since % settings.every == settings.every - 1
 
 
 def total_loss(model_loss: Tensor, slam_loss: Callable[[], Tensor], epoch: int, settings: ScheduleSettings) -> Tensor:
-    """Eq. 1, bounded. `slam_loss` is called only where it counts, and never replaces the loss of the task: equal motion
-    alone would be satisfied by any pair of clouds."""
+    """Eq. 1, bounded. `slam_loss` is called only if it is used, and never replaces the loss of the task: any clouds
+    with the same motion would satisfy it alone."""
     if settings.gamma == 0 or not is_due(epoch, settings):
         return model_loss
     weighted = settings.gamma * slam_loss()

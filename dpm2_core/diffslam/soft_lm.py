@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levenberg-Marquardt on SE(3) without its hard decisions, so that a gradient passes through every iteration.
 
-BMVC 2023, section 3: instead of accepting a step or not, its look-ahead error sets the damping of the next step (eq. 4)
-and the part of this step that is taken (eq. 5). Equation 5 is printed with its sign turned round: it takes the more of
-a step the worse it is. The gate here has the sign corrected; the printed one remains for comparison.
+BMVC 2023, section 3: a step is not accepted or rejected. Its look-ahead error sets the damping of the next step (eq. 4)
+and the part of this step that is taken (eq. 5). Equation 5 is printed with the wrong sign: the worse a step, the more
+of it is taken. The gate here has the sign corrected; the printed one remains for comparison.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from torch import Tensor
 from dpm2_core.config import Settings
 from dpm2_core.geometry import se3_torch
 
-_SATURATION = 70.0  # of the exponent: beyond it a sigmoid in float64 has no gradient left
+_SATURATION = 70.0  # limit of the exponent: beyond it a sigmoid in float64 has no gradient
 _FLOOR = 1e-8  # m2: a fit better than 0.1 mm is perfect; keeps the relative change finite there
 _GRADSLAM_NU = 200.0
 
 
 class SoftLmSettings(Settings):
-    """The solver of `icp` and `pose_graph`."""
+    """The solver of `icp` and `relaxation`."""
 
     iterations: int = Field(default=8, ge=1)
     """Steps, each with one association of the points."""
     lambda_min: float = Field(default=1e-5, gt=0)
-    """Least damping, in units of the mean squared Jacobian of a residual: holds directions without evidence."""
+    """Smallest damping, in units of the mean squared Jacobian of a residual: it fixes directions without evidence."""
     lambda_max: float = Field(default=1e-3, gt=0)
-    """Greatest damping, the same units."""
+    """Largest damping, same units."""
     steepness: float = Field(default=1.0, gt=0)
     """Sigma of eq. 4."""
     offset: float = Field(default=1.0, gt=0)
@@ -39,12 +39,12 @@ class SoftLmSettings(Settings):
     gate: Literal["soft", "paper", "gradslam", "none"] = "soft"
     """Part of a step that is taken: eq. 5 with its sign corrected; as printed; as in gradslam (power 1/200); all."""
     sensitivity: float = Field(default=10.0, gt=0)
-    """Gates soft and none: the exponent for an error that doubles. Sums saturate it, means leave it at zero."""
+    """Gates soft and none: the exponent if the error doubles. Sums of squares saturate it, means leave it at zero."""
     lenience: float = 4.0
-    """Gate soft: half of a step is taken where the exponent is this, nearly all of one that changes nothing. At 0, as
-    in eq. 5, the last steps are halves: after 8 iterations poses and gradients are still on their way."""
+    """Gate soft: half of a step is taken if the exponent has this value, nearly all of one that changes nothing. At 0,
+    as in eq. 5, the last steps are halved: after 8 iterations poses and gradients have not converged."""
     gradient: Literal["unrolled", "implicit"] = "unrolled"
-    """Through all iterations, or by the implicit function theorem at the last: less memory, exact once converged."""
+    """Through all iterations, or by the implicit function theorem at the last one: less memory, exact if converged."""
 
 
 class Residuals(Protocol):
@@ -65,7 +65,7 @@ class Problem(Protocol):
     """What `solve` minimizes."""
 
     def associate(self, T: Tensor) -> Residuals:
-        """The residuals around T (B, K, 4, 4); which points belong together is found without gradient."""
+        """The residuals around T (B, K, 4, 4); the association of points has no gradient."""
 
 
 def retract(T: Tensor, step: Tensor) -> Tensor:
@@ -92,10 +92,10 @@ def step_gate(change: Tensor, settings: SoftLmSettings) -> Tensor:
 
 
 def error_change(before: Tensor, after: Tensor, total: Tensor, settings: SoftLmSettings) -> Tensor:
-    """(B,) exponent of both rules, negative where the step helps.
+    """(B,) exponent of both rules, negative if the step reduces the error.
 
-    Relative to the error before, so that it depends neither on the number of points nor on the scale of the scene; the
-    rules as printed take the difference of the sums of squares.
+    It is relative to the error before, so that it depends neither on the number of points nor on the scale of the
+    scene; the rules as printed use the difference of the sums of squares.
     """
     if settings.gate in ("paper", "gradslam"):
         change = total * (after - before)
@@ -105,7 +105,7 @@ def error_change(before: Tensor, after: Tensor, total: Tensor, settings: SoftLmS
 
 
 def iterates(problem: Problem, T: Tensor, settings: SoftLmSettings) -> Iterator[Tensor]:
-    """The estimate (B, K, 4, 4) after each iteration, starting at T; differentiable where the problem is."""
+    """The estimate (B, K, 4, 4) after each iteration, starting at T; differentiable if the problem is."""
     damping = T.new_full((len(T),), settings.lambda_min)
     for _ in range(settings.iterations):
         residuals = problem.associate(T)
@@ -133,7 +133,7 @@ def _attach(residuals: Residuals, T: Tensor, floor: float) -> Tensor:
     """T with the gradient of the minimum: one Newton step, of length zero where T is the minimum.
 
     At the minimum g(T, clouds) = 0, hence dT = -(dg/dT)^-1 dg. The Jacobian is that of g itself and not J^T W J: the
-    iterations, too, converge to its solution, and the two differ by as much as the residuals are not zero.
+    iterations, too, converge to its solution, and the two differ as far as the residuals are not zero.
     """
     step = torch.zeros(len(T), 6 * T.shape[1], dtype=T.dtype, device=T.device, requires_grad=True)
     g = residuals.normal_equations(retract(T, step))[1]

@@ -26,34 +26,34 @@ Weights = Sequence[Tensor] | Tensor | None
 
 
 ROTATION_WEIGHT = 25.0
-"""What the square of an angle counts for beside that of a distance, m2 / rad2: as at a distance of 5 m."""
+"""Weight of a squared angle relative to a squared distance, m2 / rad2: that of its displacement at 5 m."""
 
 
 class SlamLossSettings(Settings):
-    """Odometry over a window of scans, and what its errors cost."""
+    """Odometry over a window of scans, and the cost of its errors."""
 
     icp: IcpSettings = IcpSettings()
     """Registration of two scans."""
     points: int = Field(default=2048, ge=50)
-    """Of a scan, at most."""
+    """Largest number of points of a scan."""
     voxel: float = Field(default=0.5, gt=0)
-    """A scan of more points is downsampled to one in each voxel of this edge first, m."""
+    """A scan with more points is first downsampled to one point per voxel of this edge, m."""
     spans: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(1,), min_length=1)
-    """Scans this far apart are registered. More than the span of 1 makes a pose graph, which is relaxed."""
+    """Scans this many steps apart are registered. Spans above 1 make a pose graph, which is relaxed."""
     graph: SoftLmSettings = SoftLmSettings(iterations=5)
-    """Of that relaxation."""
+    """Solver of that relaxation."""
     rotation_weight: float = Field(default=ROTATION_WEIGHT, ge=0)
-    """Squared meters that a squared radian counts for, m2 / rad2."""
+    """Weight of a squared angle relative to a squared distance, m2 / rad2."""
     warm_start: bool = False
-    """Both trajectories start where that of the target scans has ended, instead of at the guess: for scans so far apart
-    that the iterations do not converge from there. What has not converged has a gradient that says little."""
+    """Both trajectories start at the solution of the target scans instead of the guess: for scans so far apart that the
+    iterations do not converge from the guess. Without convergence a gradient means little."""
     truncate: int = Field(default=0, ge=0)
-    """Gradients do not pass beyond every so many scans of the trajectory: long windows do not explode. 0: they pass.
-    Only with spans of 1: a pose graph has no chain to cut."""
+    """Number of scans of the trajectory after which gradients are cut, so that they do not explode in long windows.
+    0: never. Only with spans of 1: a pose graph has no chain to cut."""
 
     placebo: bool = False
-    """For experiments: a window is compared with the trajectory of the window before; the first, with its own, which
-    costs nothing. The same loss and bound, without what it has to say."""
+    """For experiments: a window is compared with the reference of the window before; the first one with its own
+    trajectory, at no cost. Loss and bound are the same, but the loss has no information."""
 
     @model_validator(mode="after")
     def _check_truncate(self) -> Self:
@@ -70,7 +70,7 @@ def squared_errors(poses: Tensor, reference: Tensor, rotation_weight: float = RO
 
 
 def trajectory_loss(poses: Tensor, reference: Tensor, rotation_weight: float = ROTATION_WEIGHT) -> Tensor:
-    """Eq. 3: mean of `squared_errors` over all poses but the first; a scalar, m2.
+    """Eq. 3: mean of `squared_errors` over all poses except the first; a scalar, m2.
 
     Args:
         poses, reference: (T, 4, 4) T_map_scan of the same scans, both relative to their first. The reference has no
@@ -90,8 +90,8 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
              settings: SlamLossSettings | None = None, name: str = "scans") -> Tensor:  # fmt: skip
     """Trajectory (T, 4, 4) T_first_scan float64 of T contiguous scans, differentiable in points and weights.
 
-    Steps are registered at once, each from the guess; longer spans then, from where the steps have led. A pair without
-    evidence (weights of zero) keeps its start, and counts for nothing where there are longer spans.
+    Steps are registered in one batch, each from the guess; then longer spans, from the poses that the steps give. A
+    pair without evidence (weights of zero) keeps its start, and has no weight if there are longer spans.
 
     Args:
         guess: (4, 4) or (T - 1, 4, 4) motion from a scan to the next, T_scan_next, without gradient; identity if None.
@@ -138,13 +138,14 @@ class SlamLoss(torch.nn.Module):
         guess: Tensor | None = None,
         frames: Sequence[tuple[str, int]] | None = None,
     ) -> Tensor:
-        """Scalar float64, m2; zero, with zero gradient, where prediction and target are the same.
+        """Scalar float64, m2; zero, with zero gradient, if prediction and target are the same.
 
         Args:
-            pred_clouds: a window of T scans. target_clouds: of the same; the counts of points may differ.
-            weights: of the predicted points, with gradient: how a selection reaches the loss. target_weights: without.
-            guess: see `odometry`, for both. frames: (sequence, number) of each scan: checks that the window is
-                contiguous, and the reference is computed once and kept. Only where the targets are always the same.
+            pred_clouds: a window of T scans. target_clouds: of the same scans; the counts of points may differ.
+            weights: of the predicted points, with gradient: a selection acts on the loss through them. target_weights:
+                without gradient.
+            guess: see `odometry`, for both. frames: (sequence, number) of each scan. With them the window is checked to
+                be contiguous, and the reference is computed once and cached: only if the targets are always the same.
 
         Raises:
             UsageError: see `clouds.window`; the windows differ in length; or they are not contiguous.
@@ -160,13 +161,13 @@ class SlamLoss(torch.nn.Module):
         return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
 
     def restart(self) -> None:
-        """The next window has none before it: at the start of an epoch, so that a resumed training goes on alike."""
+        """Drop the window before; for the start of an epoch, so that a resumed training continues in the same way."""
         self._before = None
 
     @torch.no_grad()
     def _reference(self, clouds: Clouds, weights: Weights, guess: Tensor | None,
                    frames: Sequence[tuple[str, int]] | None) -> tuple[Tensor, Tensor | None]:  # fmt: skip
-        """The trajectory of the target scans, and where both start from."""
+        """The trajectory of the target scans, and the guess from which both trajectories start."""
         key = tuple(frames) if frames is not None else ()
         if key and key in self._references:
             return self._references[key]
@@ -180,7 +181,7 @@ class SlamLoss(torch.nn.Module):
 
 
 def check_contiguous(frames: Sequence[tuple[str, int]], length: int) -> None:
-    """Raise UsageError unless the scans belong to one sequence, equally far apart and in their order."""
+    """Raise UsageError unless the scans are of one sequence, equally far apart and in their order."""
     if len(frames) != length:
         raise UsageError(f"window: {len(frames)} frames are named for {length} scans")
     names, numbers = zip(*frames, strict=True)
@@ -192,12 +193,12 @@ def check_contiguous(frames: Sequence[tuple[str, int]], length: int) -> None:
 
 
 def _edges(spans: Sequence[int], scans: int) -> Tensor:
-    """(E, 2) pairs (target, source) of scans so far apart."""
+    """(E, 2) pairs (target, source) of scans that are these spans apart."""
     return torch.tensor([(i, i + span) for span in spans for i in range(scans - span)], dtype=torch.int64).view(-1, 2)
 
 
 def _register(scans: Cloud, edges: Tensor, T_init: Tensor, settings: IcpSettings) -> tuple[Tensor, Tensor]:
-    """T_target_source (E, 4, 4) of pairs of scans, and (E,) how much of each source was matched, 0..1."""
+    """T_target_source (E, 4, 4) of pairs of scans, and (E,) the matched share of each source, 0..1."""
     target, source = scans.select(edges[:, 0].tolist()), scans.select(edges[:, 1].tolist())
     found = register(source, target, T_init, settings)
     return found, matched(source, target, found.detach(), settings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches of contiguous scans for a torch DataLoader: what a trajectory can be estimated from."""
+"""Batches of contiguous scans for a torch DataLoader, from which a trajectory can be estimated."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from dpm2_core.errors import UsageError
 
 
 class ContiguousWindows(Sampler[list[int]]):
-    """Windows of consecutive scans, none across the border of a sequence, in an order shuffled anew each epoch.
+    """Windows of consecutive scans, none across the border of a sequence, in an order that is shuffled each epoch.
 
     Use: `DataLoader(scans, batch_sampler=ContiguousWindows(lengths, 8))`. Scans are numbered through all sequences.
     """
 
     def __init__(self, lengths: Sequence[int], window: int, every: int = 1, seed: int | None = None) -> None:
-        """Cut sequences of these lengths into windows that do not overlap; what is left at an end is not used.
+        """Cut sequences of these lengths into windows that do not overlap; scans left at an end are not used.
 
         Args:
             window: scans of a window. every: distance of its scans (the paper: 2). seed: of the order; None: in order.
@@ -37,13 +37,13 @@ class ContiguousWindows(Sampler[list[int]]):
         self._seed, self._epoch, self.windows = seed, 0, list[list[int]]()
         begin = 0
         for length in lengths:
-            for block in range(0, length, window * every):  # of each block every-th scans, from each of its first ones
+            for block in range(0, length, window * every):  # every-th scans of a block, from each of its first ones
                 for start in range(block, min(block + every, length - reach + 1)):
                     self.windows.append([begin + start + i * every for i in range(window)])
             begin += length
 
     def set_epoch(self, epoch: int) -> None:
-        """Another order, the same for the same number."""
+        """Choose the order of an epoch, which is the same for the same number."""
         self._epoch = epoch
 
     def __len__(self) -> int:
