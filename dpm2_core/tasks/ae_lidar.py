@@ -19,15 +19,15 @@ class AeLidarSettings(Settings):
     image: RangeImageSettings = RangeImageSettings(scale=50)
     """Geometry of the scans. The paper cuts KITTI at percentiles that lie 50 m from the sensor at most."""
     channels: int = Field(default=64, ge=4)
-    """Of the first layer; the innermost has eight times as many."""
+    """Channels of the first layer; the innermost has eight times as many."""
     latent: int = Field(default=512, ge=8)
     """Length of the code of a scan."""
     variational: bool = False
-    """A VAE: codes are drawn from a normal distribution that the encoder gives."""
+    """A VAE: codes are drawn from a normal distribution that the encoder predicts."""
 
 
 class LidarAutoencoder(nn.Module):
-    """Images (B, 2, rows, columns) in units of their scale to images, through a code (B, latent)."""
+    """Autoencoder of images (B, 2, rows, columns), in units of their scale, through a code (B, latent)."""
 
     def __init__(self, settings: AeLidarSettings | None = None) -> None:
         """Default settings if None: 21.2 million parameters.
@@ -41,7 +41,7 @@ class LidarAutoencoder(nn.Module):
         if rows < 16 or rows % 8:
             raise UsageError(f"AE_lidar: images of {rows} rows; want a multiple of 8, at least 16")
         c = settings.channels
-        kernel = (3 if rows // 8 % 2 else 2, 4)  # halves an even number of rows, and an odd one less one
+        kernel = (3 if rows // 8 % 2 else 2, 4)  # halves an even number of rows, or an odd one minus one
         whole = ((rows // 8 - kernel[0]) // 2 + 1, columns // 16)
         self.encoder = nn.Sequential(
             nn.Conv2d(CHANNELS, c, 4, 2, 1, bias=False),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AE_lidar as a task: a scan through the bottleneck and back, with SLAM on what comes out."""
+"""AE_lidar as a task: a scan through the bottleneck and back, with SLAM on the reconstruction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
 from dpm2_core.tasks.training import mean_figures
 
 _LEAST_DIVERGENCE = 5.0
-"""Below this the divergence of a VAE costs no less, nats: the codes keep something to say."""
+"""Below this a smaller divergence of a VAE does not reduce the loss, nats: the codes keep some information."""
 
 
 class AeLidarTraining(SlamTaskTraining):
@@ -37,7 +37,7 @@ class AeLidarTraining(SlamTaskTraining):
 
 
 class AeLidarTask(Task):
-    """Scans to themselves."""
+    """Reconstruction of scans."""
 
     name = "ae_lidar"
     training_type = AeLidarTraining
@@ -47,15 +47,15 @@ class AeLidarTask(Task):
         super().__init__(settings)
         self.network = LidarAutoencoder(settings.network)
         self.slam_loss = SlamLoss(settings.slam_loss)
-        self._ratio = 0.0  # of the divergence that counts
+        self._ratio = 0.0  # share of the divergence that counts
         self._reader = RangeReader(settings.network.image)
 
     def start_epoch(self, epoch: int) -> None:
-        """The divergence counts for more with every epoch."""
+        """Increase the weight of the divergence with every epoch."""
         self._ratio = min(1.0, (epoch + 1) / self.settings.divergence_warmup)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
-        """Sum of absolute errors, and divergence; SLAM on what was made against SLAM on the scans."""
+        """Sum of absolute errors, and divergence; SLAM on the reconstructions against SLAM on the scans."""
         scans = self._reader.read(window, keep=True)
         made, divergence = self.network(scans.images)
         loss = image_error(made, scans.images)
@@ -65,8 +65,8 @@ class AeLidarTask(Task):
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans: `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) to the scan, and
-        `d_error_m`, the mean error of the distance over ground. And the `variety` of what is made and of the scans,
-        `varies_m` and `target_varies_m`."""
+        `d_error_m`, the mean error of the distance over ground. And the `variety` of the reconstructions and of the
+        scans, `varies_m` and `target_varies_m`."""
         rows, seen = [], list[tuple[RangeScans, RangeScans]]()
         for index in range(len(scans)):
             true = self._reader.read([scans[index].to(self.device)])
@@ -89,5 +89,5 @@ class AeLidarTask(Task):
         range_png(path, rows, f"AE_lidar: {scan.sequence}, scan {scan.number}")
 
     def _made(self, scans: RangeScans) -> RangeScans:
-        """What the network makes of them; a slot has a point where the scan had one."""
+        """The reconstructions of scans; a slot has a point if the scan had one there."""
         return scans.with_images(self.network(scans.images)[0])

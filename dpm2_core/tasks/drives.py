@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic drives for the tasks: classes, twins without dynamic objects and poses are exact."""
+"""Synthetic drives for the tasks, with exact classes, poses and twins without dynamic objects."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ class TaskDriveSettings(Settings):
     val_frames: int = Field(default=40, ge=2)
     """Scans of each."""
     first_seed: int = Field(default=7000, ge=0)
-    """Of the training worlds, counting up; those of validation begin 100,000 later."""
+    """Seed of the first training world, counting up; those of validation begin 100,000 later."""
     presets: tuple[PresetName, ...] = Field(default=("city", "suburb", "rural"), min_length=1)
     """Kinds of places, in turn."""
     traffic: float = Field(default=1.0, ge=0)
-    """Times the traffic of the preset; above 1 in columns, of 20 on about a third of the points lie on what moves."""
+    """Factor on the traffic of the preset; above 1 in columns. From 20 on about a third of the points are on moving
+    objects."""
     lidar: LidarConfig = LidarConfig(columns=512)
     """512 columns: the width of DSLR's range images."""
 
@@ -40,13 +41,13 @@ def make_task_drives(
     workers: int,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> None:
-    """Write out/train/NN and out/val/NN, each in the layout of `dpm2 sim`; those that are there already stay.
+    """Write out/train/NN and out/val/NN, each in the layout of `dpm2 sim`; existing ones stay.
 
     Args:
         progress: called with the name of a drive, its frames done and its frames in all.
 
     Raises:
-        UsageError: a folder holds another drive. Dpm2Error: it could not be written.
+        UsageError: a folder contains another drive. Dpm2Error: a drive could not be written.
     """
     from dpm2_core.sim.drive import simulate  # embree is slow to import
 

@@ -23,7 +23,7 @@ from dpm2_core.tasks.training import mean_figures
 
 _BATCH = 16
 _MOVED = 0.5
-"""A slot whose distance differs by more from that of the static twin has something moving in it, m."""
+"""A slot whose distance differs from that of the static twin by more than this, m, shows a moving object."""
 
 
 class DslrTraining(SlamTaskTraining):
@@ -36,15 +36,15 @@ class DslrTraining(SlamTaskTraining):
     discriminator_epochs: int = Field(default=4, ge=0)
     """Epochs after these, in which the discriminator learns with them (the original: 50)."""
     epochs: int = Field(default=60, ge=1)
-    """All, those of the third stage included; only there does the SLAM loss count."""
+    """All epochs, including those of the third stage; only there the SLAM loss is used."""
     adversarial: float = Field(default=10.0, ge=0)
-    """What the discriminator's cross entropy counts for, beside the sum of absolute errors of an image."""
+    """Weight of the discriminator's cross entropy relative to the sum of absolute errors of an image."""
     adversarial_shared: bool = False
-    """Divide that by the scans of a step, as the authors do in the third stage: theirs is 10 over 128."""
+    """Divide that weight by the number of scans of a step, as the authors do in the third stage: theirs is 10 / 128."""
     static_only: bool = True
-    """The autoencoder learns from static scans alone. False: from the others, too, as the authors'."""
+    """The autoencoder learns from static scans only. False: from the dynamic ones, too, as the authors' does."""
     batch: int = Field(default=4, ge=1)
-    """Windows of a step: pairs of codes are of different places, and means are over more than one place."""
+    """Windows of a step, so that pairs of codes are of different places, and means are over more than one place."""
     optimiser: TaskOptimizer = TaskOptimizer(clip=1000)  # the loss is a sum over 20 thousand values
 
     @property
@@ -53,12 +53,12 @@ class DslrTraining(SlamTaskTraining):
         return self.autoencoder_epochs + self.discriminator_epochs
 
     def has_windows(self, epoch: int) -> bool:
-        """In the third stage only."""
+        """As `TaskTraining`; in the third stage only."""
         return epoch >= self.third and super().has_windows(epoch)
 
 
 class DslrTask(Task):
-    """Dynamic scans to static ones."""
+    """Translation of dynamic scans to static ones."""
 
     name = "dslr"
     training_type = DslrTraining
@@ -115,9 +115,9 @@ class DslrTask(Task):
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans.
 
-        `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) of the translated scans to the static twins, and
-        where something moves, `moved_m`, the mean error of the distance; `input_...` the same without translation.
-        And the `variety` of the translated scans and of the twins, `varies_m` and `target_varies_m`.
+        `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) of the translated scans to the static twins.
+        `moved_m`: the mean error of the distance where something moves. `input_...`: the same without translation.
+        `varies_m` and `target_varies_m`: the `variety` of the translated scans and of the twins.
         """
         rows, seen = [], list[tuple[RangeScans, RangeScans]]()
         for begin in range(0, len(scans), _BATCH):
@@ -134,8 +134,8 @@ class DslrTask(Task):
         return mean_figures(rows) | {"varies_m": variety(found), "target_varies_m": variety(target)}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
-        """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, those of the scan that
-        stay by `Dslr.in_front`, `input`, the scan, and `target`, its static twin."""
+        """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, points of the scan that
+        `Dslr.in_front` keeps, `input`, the scan, and `target`, its static twin."""
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
         made = self._made(dynamic)
         moving = self.network.in_front(dynamic.images[:, 0], made.images[:, 0])
@@ -150,7 +150,7 @@ class DslrTask(Task):
         range_png(path, rows, f"DSLR: {scan.sequence}, scan {scan.number}")
 
     def _made(self, dynamic: RangeScans) -> RangeScans:
-        """The translated scans; a slot has a point where the scan had one."""
+        """The translated scans; a slot has a point if the scan had one there."""
         return dynamic.with_images(self.network(dynamic.images))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves or could move, learned from labeled scans; of the other tasks it uses the trainer, not the SLAM loss."""
+"""Objects that move or could move, learned from labeled scans, with the trainer of the tasks but not the SLAM loss."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from dpm2_core.tasks.task import Task, TaskOptimizer, TaskTraining
 MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
 FIRST_MOVING = 252
-"""The same while they move have this number and higher ones."""
+"""Classes of the same objects while they move have this number and higher ones."""
 _STRETCH = 0.2
 _SLOPE = 0.07  # standard deviation along and across
-_SHADOWS, _MISSING = 8, 0.15  # most of them in a scan; most of its voxels that have no points
-_SETTLED = 400  # scans that the statistics are of
+_SHADOWS, _MISSING = 8, 0.15  # most shadows in a scan; largest share of its voxels that are left out
+_SETTLED = 400  # scans for the statistics
 
 Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
-"""(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and how many
-there are."""
+"""(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and their
+number of points."""
 
 
 class DynamicObjectTraining(TaskTraining):
@@ -49,14 +49,14 @@ class DynamicObjectTraining(TaskTraining):
     every: int = Field(default=5, ge=1)
     optimiser: TaskOptimizer = TaskOptimizer(rate=3e-3, ema=0.998)
     thin: float = Field(default=0.7, ge=0, lt=1)
-    """At most this fraction of a scan's points is left out, another one each time: sparser sensors."""
+    """At most this fraction of a scan's points is left out, drawn each time, as with sparser sensors."""
     paste: float = Field(default=0.5, ge=0, le=1)
-    """Chance that the dynamic objects of another scan are put into a scan, turned about the sensor: to where the
-    simulator has none, before a hedge or in a yard."""
+    """Probability that the dynamic objects of another scan are put into a scan, rotated about the sensor: they are then
+    also where the simulator has none, in front of a hedge or in a yard."""
 
 
 class DynamicObjectTask(Task):
-    """Points of dynamic objects, by the voxels that they are in."""
+    """Detection of points of dynamic objects, by their voxels."""
 
     name = "movers"
     training_type = DynamicObjectTraining
@@ -68,7 +68,7 @@ class DynamicObjectTask(Task):
         self.net = DynamicObjectNet(settings.network)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
-        """Cross-entropy over the occupied voxels, each by the root of how many points it has."""
+        """Cross-entropy over the occupied voxels, each weighted with the root of its number of points."""
         network, scans = self.settings.network, [self._voxels(scan) for scan in window]
         drawn = [
             _pasted(own, others) if torch.rand(()) < self.settings.paste else own
@@ -83,8 +83,8 @@ class DynamicObjectTask(Task):
         return loss / weight.sum().clamp(min=1), None
 
     def _voxels(self, scan: TaskScan) -> Voxels:
-        """Of some of the points of a scan, varied at random; in half of them others hide some, as what stands before a
-        thing does."""
+        """Voxels of some of the points of a scan, varied at random; in half of the scans some points are hidden, as by
+        objects in front of them."""
         points, movable, counted = _arrays(scan)
         keep = counted & (torch.rand(len(points)).numpy() >= self.settings.thin * float(torch.rand(())))
         if torch.rand(()) < 0.5:
@@ -98,8 +98,8 @@ class DynamicObjectTask(Task):
         return where, fraction, count
 
     def settle(self, scans: TaskScans) -> None:
-        """The means and variances of the layers are made those of whole scans: the training has seen thinned and mixed
-        ones alone, and off its own kind of scan that costs as much as anything else."""
+        """Set the means and variances of the layers to those of whole scans. Training has seen only thinned and mixed
+        scans, and on kinds of scans not trained on this costs as much as anything else."""
         network, generator = self.settings.network, torch.Generator().manual_seed(self.settings.optimiser.seed)
         chosen = torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist()
         scanned = (voxels(_arrays(scans[i])[0], network) for i in chosen)
@@ -108,7 +108,7 @@ class DynamicObjectTask(Task):
             update_bn(grids, self.net)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
-        """Over all points of all scans: IoU, precision and recall of what can move, and recall of what does."""
+        """Over all points of all scans: IoU, precision and recall of points that can move, recall of those that do."""
         counts = np.zeros(5)  # right, false, missed, of those that move: right, all
         for i in range(len(scans)):
             scan = scans[i]
@@ -127,7 +127,7 @@ class DynamicObjectTask(Task):
         }
 
     def figure(self, scan: TaskScan, path: Path) -> None:
-        """The scan from above, what was found, missed and wrongly found in colors."""
+        """Draw the scan from above, with points found, missed and wrongly found in colors."""
         points, movable, counted = _arrays(scan)
         dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > DYNAMIC, movable[counted])
 
@@ -158,8 +158,8 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
 
 
 def _shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which of the points (N, 4) lie in the shadows of things that are not there: sectors of up to 0.24 rad, each from
-    some distance on."""
+    """Which of the points (N, 4) lie in the shadows of random objects that do not exist: sectors of up to 0.24 rad,
+    each from some distance on."""
     azimuth, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     out = np.zeros(len(points), np.bool_)
     for start, width, beyond in torch.rand(int(float(torch.rand(())) * _SHADOWS), 3).tolist():
@@ -168,9 +168,9 @@ def _shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The points (N, 4) turned about z by a random angle, half of the times mirrored, stretched by up to 20 % and
-    tilted: on a slope cars stand higher above the lowest point around them, and a network that has never seen that
-    finds none there."""
+    """The points (N, 4) rotated about z by a random angle, mirrored in half of the cases, stretched by up to 20 % and
+    tilted. On a slope cars are higher above the lowest point around them, and a network trained without slopes finds
+    none there."""
     angle, side = float(torch.rand(())) * 2 * math.pi, 1 if torch.rand(()) < 0.5 else -1
     stretch = 1 + _STRETCH * (2 * torch.rand(3).numpy() - 1)
     slope = _SLOPE * torch.randn(2).numpy()

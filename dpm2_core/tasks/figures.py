@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tasks' networks make of a scan, as images."""
+"""Images of the results of the tasks' networks."""
 
 from __future__ import annotations
 

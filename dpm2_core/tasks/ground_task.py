@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GndNet as a task: the height of the ground from labeled scans, and from a SLAM on what stands above it."""
+"""GndNet as a task: the height of the ground, from labeled scans and from a SLAM on the points above it."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class GroundTraining(SlamTaskTraining):
     network: GroundSettings = GroundSettings()
     """Grid, network and loss."""
     slam_loss: SlamLossSettings = SlamLossSettings(warm_start=True)
-    """Odometry of the SLAM loss, on what is above the ground: slow to converge from the identity."""
+    """Odometry of the SLAM loss, on the points above the ground: slow to converge from the identity."""
     tilt: float = Field(default=3.0, ge=0, lt=45)
     """Each window is rolled and pitched by up to this, deg (the original: 10)."""
     gaps: float = Field(default=0.0, ge=0, le=1)
-    """What a cell without ground points counts for in the loss; its label is that of the nearest cell with some."""
+    """Weight in the loss of a cell without ground points; its label is that of the nearest cell with some."""
     lift: float = Field(default=0.0, ge=0)
     """Each window is moved up or down by up to this, m: LiDARs on other cars are higher or lower."""
 
@@ -70,8 +70,8 @@ class GroundTask(Task):
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor]]:
         """Loss of the elevation; SLAM on all points, weighted by how far they are above the predicted ground.
 
-        The reference sees the same points by their height above the true ground; of a scan without labels, which has no
-        loss of its own but the curvature, it sees all.
+        The reference weights the same points by their height above the true ground. In a scan without labels, whose own
+        loss is only the curvature, it weights all points with 1.
 
         Raises:
             UsageError: a scan without labels in a training that has no SLAM loss to learn from it.
@@ -105,7 +105,7 @@ class GroundTask(Task):
         return ground_of(scan)[0]
 
     def _moved(self) -> tuple[Tensor, Tensor]:
-        """A random roll, pitch and lift: (4, 4) and (4,) that points (N, 4) are turned and moved by."""
+        """A random roll, pitch and lift: (4, 4) and (4,) that rotate and move points (N, 4)."""
         turn = torch.eye(4)
         turn[:3, :3] = random_tilt(math.radians(self.settings.tilt))
         up = torch.tensor([0.0, 0.0, (2 * float(torch.rand(1)) - 1) * self.settings.lift, 0.0])
@@ -122,7 +122,7 @@ class GroundTask(Task):
         return mean_figures(rows)
 
     def figure(self, scan: TaskScan, path: Path) -> None:
-        """Predicted elevation beside the true one, both with what stands on it, seen from above."""
+        """Draw the predicted elevation, with the points above it, next to the true one, seen from above."""
         labels, known = elevation_labels(scan.points, ground_of(scan)[0], self.settings.network)
         truth = torch.where(known, labels, torch.nan)
         ground_png(path, self.net([scan.points])[0], truth, scan.points, self.settings.network)
@@ -141,7 +141,7 @@ def ground_of(scan: TaskScan) -> tuple[Tensor, Tensor]:
 
 
 def filled(elevation: Tensor, known: Tensor) -> Tensor:
-    """The elevation (cells, cells), where it is not known that of the nearest cell where it is; zero if none is."""
+    """The elevation (cells, cells), where unknown that of the nearest known cell; zero if no cell is known."""
     if not bool(known.any()):
         return torch.zeros_like(elevation)
     nearest = distance_transform_edt(~known.cpu().numpy(), return_distances=False, return_indices=True)

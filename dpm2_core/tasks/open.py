@@ -15,10 +15,10 @@ from dpm2_core.tasks.semantic_kitti import kitti_runs, sequence_folders
 def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: Sequence[str] = ()) -> TaskScans:
     """The scans below a folder: a sequence, a data set of sequences/NN, or a folder of such; or pairs as DSLR has them.
 
-    A gap in the numbers of the scans ends a sequence: what lies across it is no motion from one scan to the next.
+    A gap in the numbers of the scans ends a sequence: across it the motion is not that of consecutive scans.
 
     Args:
-        sequences: names of their folders, such as 05, or of folders above; or numbers of pairs; empty: all there are.
+        sequences: names of their folders, such as 05, or of folders above; or numbers of pairs; empty: all.
 
     Raises:
         UsageError: no scans, something needed is missing, or a file of the wrong length; it names file and reason.
@@ -37,15 +37,15 @@ def open_scans(path: Path | str, needs: Sequence[RequiredData] = (), sequences: 
 
 
 def pairs_of(path: Path, sequences: Sequence[str]) -> list[ArrayPair]:
-    """The pairs of arrays in a folder that have one of these numbers; all if none is named."""
+    """The pairs of arrays in a folder that have one of these numbers; all if none is given."""
     numbers = {int(name) for name in sequences if name.isdecimal()}
     return [pair for pair in open_pairs(path) if not sequences or pair.number in numbers]
 
 
 def folders_of(path: Path, sequences: Sequence[str]) -> list[Path]:
-    """The sequence folders below `path` that have one of these names, or are below one; all if none is named.
+    """The sequence folders below `path` that have one of these names, or are below such a folder; all if none is given.
 
-    A name is that of the outermost folders that have it: of train/00/sequences/00 and train/01/sequences/00, 00 is the
+    A name refers to the outermost folders that have it: of train/00/sequences/00 and train/01/sequences/00, 00 is the
     first.
     """
     names = {folder: names_of(folder, path) for folder in sequence_folders(path)}
@@ -57,12 +57,12 @@ def folders_of(path: Path, sequences: Sequence[str]) -> list[Path]:
 
 
 def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
-    """What the sequences and pairs that `open_scans` takes are called, however they were named."""
+    """Names of the sequences and pairs that `open_scans` opens, however they were given."""
     return [name for _, name in _named(path, sequences)]
 
 
 def sequence_places(path: Path, sequences: Sequence[str]) -> dict[Path, str]:
-    """Name of each of these by its folder, or the file of its pair, however that was reached."""
+    """Name of each of these by its resolved folder, or the resolved file of its pair."""
     return {place.resolve(): name for place, name in _named(path, sequences)}
 
 
@@ -72,7 +72,7 @@ def _named(path: Path, sequences: Sequence[str]) -> Iterator[tuple[Path, str]]:
 
 
 def names_of(folder: Path, path: Path) -> list[str]:
-    """The names that a sequence folder below `path` can be chosen by: those of the folders on the way, its own last."""
+    """The names by which a sequence folder below `path` can be chosen: those of the folders above it, its own last."""
     return [name for name in folder.relative_to(path).parts if name != "sequences"] or [folder.resolve().name]
 
 

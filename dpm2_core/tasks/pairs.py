@@ -3,12 +3,12 @@
 
 A pair is s3.npy and d3.npy in one folder (a prefix, as in tests3.npy and testd3.npy, is allowed), or files of the same
 number in two: s/ and d/, static/ and dynamic/, or static_out_npy/ and dynamic_out_npy/. An array is (N, 2, rows,
-columns) of d and z in units of 120 m, filled; or, before that, (N, rows, columns, 3 or 4) of x, y, z in m with zeros
-where there is no point; of these the authors leave out points whose x, y or z is among the least or the greatest
-hundredth of the array. x is ahead and y to the left; the columns of x, y, z may begin in any direction and run either
-way. Those of d and z, which do not show it, begin straight ahead and run to the left.
+columns) of d and z in units of 120 m, filled. Or, not preprocessed, it is (N, rows, columns, 3 or 4) of x, y, z in m
+with zeros where there is no point. Of these the authors leave out points whose x, y or z is among the smallest or the
+largest hundredth of the array. x is ahead and y to the left; the columns of x, y, z may begin in any direction and run
+in either direction. Those of d and z, which do not show it, begin straight ahead and run to the left.
 
-True poses, where they are known, are in poses3.txt beside the pair of that number: a line of 12 numbers for each scan,
+True poses, if known, are in poses3.txt next to the pair of that number: a line of 12 numbers for each scan,
 T_world_lidar row by row.
 """
 
@@ -31,22 +31,22 @@ from dpm2_core.network.perception.range_image import CHANNELS, RangeImageSetting
 from dpm2_core.tasks.scan import TaskScan
 
 SCALE = 120.0
-"""What a value of one stands for in the preprocessed arrays, m."""
+"""Length that a value of one has in the preprocessed arrays, m."""
 _FOLDERS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
 _LOOKED_AT = 64
-"""Scans of an array whose percentiles and azimuths are taken: those of all would read gigabytes."""
+"""Scans of an array that are used for percentiles and azimuths: with all scans, gigabytes would be read."""
 _EVEN = 0.99
-"""Length of the mean of unit vectors that point to where columns are off: 8 degrees, root mean square."""
+"""Least length of the mean of unit vectors that represent the columns' errors: 8 degrees, root mean square."""
 _NAMED = re.compile(r"(.*?)([sd])(\d+)")
 
 
 @dataclass(frozen=True, eq=False)
 class ImageScan(TaskScan):
-    """A scan that is a range image from the start.
+    """A scan that is stored as a range image.
 
     Attributes:
         image, static_image: (2, rows, columns) float32, filled, in units of `SCALE`. mask, static_mask: (rows, columns)
-            bool, where there was a point; true everywhere if the data do not say.
+            bool, where there was a point; true everywhere if the data do not show it.
     """
 
     image: Tensor
@@ -56,17 +56,17 @@ class ImageScan(TaskScan):
 
 
 def open_pairs(path: Path) -> list[ArrayPair]:
-    """A sequence for each pair of arrays in a folder, by number; none if it holds no arrays of these names.
+    """A sequence for each pair of arrays in a folder, by number; none if it contains no arrays of these names.
 
     Raises:
-        UsageError: an array without its twin, of another shape than it, no array of numbers, or columns of x, y, z that
-            do not go around in even steps.
+        UsageError: an array without its twin, or of another shape than its twin; a file that is no array of numbers; or
+            columns of x, y, z that do not go around in even steps.
     """
     return [ArrayPair.open(static, dynamic, number, path) for number, static, dynamic in _pairs(path)]
 
 
 def _pairs(path: Path) -> Iterator[tuple[int, Path, Path]]:
-    """Number, static and dynamic file of those that belong together."""
+    """Number, static and dynamic file of each pair."""
     groups: list[tuple[dict[tuple[str, int], Path], dict[tuple[str, int], Path]]] = [
         (_numbered(path / s), _numbered(path / d)) for s, d in _FOLDERS
     ]
@@ -82,7 +82,7 @@ def _pairs(path: Path) -> Iterator[tuple[int, Path, Path]]:
 
 
 def _numbered(folder: Path) -> dict[tuple[str, int], Path]:
-    """Its arrays by the number that their names end with."""
+    """The arrays of a folder by the number at the end of their names."""
     found = {file: re.search(r"(\d+)$", file.stem) for file in folder.glob("*.npy")}
     return {("", int(match[1])): file for file, match in found.items() if match}
 
@@ -92,7 +92,8 @@ class ArrayPair:
     """One pair of arrays as a sequence of scans; the files stay on the disk.
 
     Attributes:
-        number: of the pair. limits: (2, 3) least and greatest x, y, z of points that count, m; None for filled arrays.
+        number: of the pair. limits: (2, 3) smallest and largest x, y, z of points that are used, m; None for filled
+            arrays.
         root: folder of the pairs. columns: (columns,) of the arrays by azimuth; None: as they are.
     """
 
@@ -121,15 +122,15 @@ class ArrayPair:
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """The name in reports."""
         return f"{self.path.parent.name}/{self.path.stem}"
 
     @property
     def poses(self) -> Array | None:
-        """(N, 4, 4) T_world_lidar; None where there is no file of them.
+        """(N, 4, 4) T_world_lidar; None if there is no file of them.
 
         Raises:
-            UsageError: it does not have a pose for each scan.
+            UsageError: the file does not have a pose for each scan.
         """
         path = self.root / f"poses{self.number}.txt"
         if not path.is_file():
@@ -149,7 +150,7 @@ class ArrayPair:
         return ImageScan(points, None, static, self.name, index, image, static_image, mask, static_mask)
 
     def _image(self, array: np.ndarray, limits: Array | None, index: int) -> tuple[Tensor, Tensor]:
-        """Filled image and where it had points."""
+        """Filled image, and the mask of the slots that had points."""
         values = torch.from_numpy(np.array(array[index], np.float32))
         if not bool(values.isfinite().all()):
             raise UsageError(f"{self.path}: scan {index} of the pair has values that are not finite")
@@ -170,19 +171,19 @@ def _preprocessed(array: np.ndarray) -> bool:
 
 
 def _limits(array: np.ndarray) -> Array | None:
-    """(2, 3) between which 98 % of all x, of all y and of all z lie, empty slots included, as the authors have it."""
+    """(2, 3) limits of 98 % of all x, of all y and of all z, empty slots included, as the authors do it."""
     if _preprocessed(array):
         return None
     return np.asarray(np.nanpercentile(_some(array).reshape(-1, 3), [1, 99], axis=0))
 
 
 def _some(array: np.ndarray) -> Array:
-    """(n, rows, columns, 3) x, y, z of some of its scans."""
+    """(n, rows, columns, 3) x, y, z of some scans of an array."""
     return np.asarray(array[:: max(1, len(array) // _LOOKED_AT), ..., :3], np.float64)
 
 
 def _columns(xyz: Array, path: Path) -> NDArray[np.intp] | None:
-    """(columns,) which of the columns of x, y, z lies at each of `azimuths`; None if no slot has a point."""
+    """(columns,) index of the column of x, y, z at each of `azimuths`; None if no slot has a point."""
     x, y = xyz[..., 0], xyz[..., 1]
     there = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0)
     if not there.any():

@@ -16,7 +16,7 @@ from dpm2_core.tasks.pairs import SCALE, ImageScan
 from dpm2_core.tasks.scan import TaskScan
 
 _KEPT = 2000
-"""Scans whose images are kept: about 180 kB each, and projecting one takes as long as half a step of training."""
+"""Scans whose images are cached: about 180 kB each, and projecting one takes as long as half a step of training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,16 +34,16 @@ class RangeScans:
     scale: float
 
     def part(self, begin: int, end: int) -> RangeScans:
-        """Some of them."""
+        """A range of these scans."""
         chosen = slice(begin, end)
         return replace(self, images=self.images[chosen], masks=self.masks[chosen], frames=self.frames[chosen])
 
     def with_images(self, images: Tensor) -> RangeScans:
-        """Others, such as what a network makes of these, in the same slots."""
+        """Other images in the same slots, such as a network's output for these."""
         return replace(self, images=images)
 
     def off(self, true: RangeScans) -> Tensor:
-        """How far the distances over ground are from the true ones, m: (B, rows, columns)."""
+        """Absolute errors of the distances over ground, m: (B, rows, columns)."""
         return (self.images - true.images)[:, 0].abs() * self.scale
 
     def clouds(self) -> list[Tensor]:
@@ -53,7 +53,7 @@ class RangeScans:
 
 
 class RangeReader:
-    """Makes range images of scans, and keeps the latest of those that it is asked to keep."""
+    """Makes range images of scans, and caches the latest ones if requested."""
 
     def __init__(self, settings: RangeImageSettings) -> None:
         """Images of that geometry."""
@@ -61,15 +61,15 @@ class RangeReader:
         self._kept: dict[tuple[str, int, bool], tuple[Tensor, Tensor]] = {}
 
     def read(self, scans: Sequence[TaskScan], static: bool = False, keep: bool = False) -> RangeScans:
-        """The scans, or their twins without what moves.
+        """The scans, or their twins without moving objects.
 
         Args:
-            keep: the images, for the next time. Scans are identified by sequence and number, so only those of one data
-                set may be kept.
+            keep: cache the images. Scans are identified by sequence and number, so only those of one data set may be
+                cached.
 
         Raises:
-            UsageError: a scan has no twin, or is an image of other rows and columns. One without any point in the image
-                is none: it happens beside a truck, and all its slots are empty.
+            UsageError: a scan has no twin, or is an image of other rows and columns. A scan without any point in the
+                image is no error: this happens next to a truck, and all its slots are empty.
         """
         pairs = [self._kept_or_made(scan, static) if keep else self._made(scan, static) for scan in scans]
         frames = [(scan.sequence, scan.number) for scan in scans]
@@ -96,7 +96,7 @@ class RangeReader:
         return fill(image, mask), mask
 
     def _cut(self, image: Tensor, mask: Tensor, where: str) -> tuple[Tensor, Tensor]:
-        """The rows from `first` on, and as many of the columns as the settings say, evenly."""
+        """The rows from `first` on, and the number of columns in the settings, evenly spaced."""
         s, (rows, columns) = self._settings, mask.shape
         if rows < s.first + s.rows or columns % s.columns:
             raise UsageError(
@@ -106,7 +106,7 @@ class RangeReader:
         every = columns // s.columns
         image, mask = image[:, s.first :, ::every][:, : s.rows], mask[s.first :, ::every][: s.rows]
         image = image * (SCALE / s.scale)
-        near = image[0] < 1  # as in `project`: what lies beyond the scale could not be reached by a network
+        near = image[0] < 1  # as in `project`: a network cannot output distances beyond the scale
         return fill(image * near, near), mask & near
 
 
@@ -131,6 +131,6 @@ def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, windows: Sequen
 
 def variety(scans: Sequence[RangeScans]) -> float:
     """How much the distances differ from scan to scan: their standard deviation in a slot, m, the mean over the slots.
-    Zero if a network makes one image of everything."""
+    Zero if a network makes the same image of every scan."""
     distances = torch.cat([part.images[:, 0] for part in scans])
     return float(distances.std(0, correction=0).mean()) * scans[0].scale

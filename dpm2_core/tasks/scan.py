@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan with what a task learns from: classes, and its twin without anything that moves."""
+"""One scan with the data that a task learns from: classes, and its twin without moving objects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 RequiredData = Literal["labels", "static"]
-"""What a task cannot do without."""
+"""Data that a task requires."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +22,8 @@ class TaskScan:
 
     Attributes:
         points: (N, 4) float32 [x, y, z m, intensity 0..1] in the frame of the LiDAR.
-        labels: (N,) int64 class as in SemanticKITTI, without the number of the object; None where there are none.
-        static: (M, 4) float32, the same view without what moves; None where there is none.
+        labels: (N,) int64 class as in SemanticKITTI, without the number of the object; None if there are none.
+        static: (M, 4) float32, the same view without moving objects; None if there is none.
         sequence, number: which scan it is.
     """
 
@@ -55,7 +55,7 @@ class TaskScans(Dataset[TaskScan]):
     """
 
     def __init__(self, sequences: Sequence[ScanSequence]) -> None:
-        """Join them."""
+        """Join sequences."""
         self._places = [(sequence, i) for sequence in sequences for i in range(len(sequence))]
         self.lengths = [len(sequence) for sequence in sequences]
 
@@ -73,7 +73,7 @@ class TaskScans(Dataset[TaskScan]):
         return sequence[i]
 
     def digest(self) -> str:
-        """Which scans these are, in 16 characters, by the first of each sequence and how many follow."""
+        """Identifier of these scans, 16 characters, from the first scan and the length of each sequence."""
         digest, first = hashlib.sha256(), 0
         for length in self.lengths:
             scan = self[first]

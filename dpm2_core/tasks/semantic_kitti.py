@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans in SemanticKITTI's layout (Behley et al., ICCV 2019): sequences/NN/{velodyne,labels};
-`dpm2 sim` writes static/ beside them.
+`dpm2 sim` writes static/ next to them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dpm2_core.frame import Points
 from dpm2_core.tasks.scan import RequiredData, TaskScan
 
 _BYTES = {"velodyne": 16, "static": 16, "labels": 4}
-"""Of a point in a file of that folder."""
+"""Bytes of a point in a file of that folder."""
 
 
 def sequence_folders(path: Path) -> list[Path]:
-    """Folders that hold velodyne/, themselves not searched further."""
+    """Folders that contain velodyne/; these are not searched further."""
     found = []
     for folder, inner, _ in os.walk(path, followlinks=True):
         if "velodyne" in inner:
@@ -34,7 +34,7 @@ def sequence_folders(path: Path) -> list[Path]:
 
 
 def kitti_runs(folder: Path, root: Path, needs: Sequence[RequiredData]) -> list[_KittiRun]:
-    """Its scans, cut where numbers are missing; the files are there and have the right length."""
+    """The scans of a folder, split where numbers are missing. Their files are checked: present, of the right length."""
     numbers = sorted(int(p.stem) for p in (folder / "velodyne").glob("*.bin") if p.stem.isdecimal())
     if not numbers:
         raise UsageError(f"{folder}: no scans (velodyne/NNNNNN.bin)")
@@ -76,7 +76,7 @@ class _KittiRun:
         return TaskScan(torch.from_numpy(points), labels, static, self.name, number)
 
     def _points(self, kind: str, number: int) -> tuple[Points, NDArray[np.bool_]]:
-        """(N, 4) with finite coordinates, 0 for an intensity that is not known, and which of the file's they are."""
+        """(N, 4) with finite coordinates, 0 for an unknown intensity, and which points of the file they are."""
         points = self._values(kind, number, "<f4").reshape(-1, 4)
         valid = np.isfinite(points[:, :3]).all(1)
         if not valid.any():
@@ -84,7 +84,7 @@ class _KittiRun:
         return np.nan_to_num(points[valid], nan=0, posinf=0, neginf=0), valid
 
     def check(self, number: int) -> None:
-        """Raise UsageError unless the files of a scan are there and of the right length."""
+        """Raise UsageError unless the files of a scan exist and have the right length."""
         points = self._count("velodyne", number)
         if self.paired:
             self._count("static", number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a task's clouds are worth to a SLAM: the geometric odometry of this project on them, against the true poses."""
+"""Evaluation of a task's clouds by SLAM: the geometric odometry of this project on them, against the true poses."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from dpm2_core.tasks.training import mean_figures
 
 @dataclass(frozen=True, eq=False)
 class TaskRun:
-    """Odometry on each kind of cloud of one sequence: (N, 4, 4) poses by kind, the true ones, and the stamps, ns, which
-    follow from the numbers of the scans: where some are missing there is a pause."""
+    """Odometry on each kind of cloud of one sequence: (N, 4, 4) poses by kind, the true ones, and the stamps, ns. These
+    follow from the numbers of the scans: missing numbers are a pause."""
 
     sequence: str
     truth: Array
@@ -35,7 +35,7 @@ class TaskRun:
 
 
 def slam_figures(task: Task, path: Path, sequences: Sequence[str] = ()) -> dict[str, float]:
-    """Of each kind of cloud that the task has: `KIND_ate_m`, `KIND_rpe_m` and `KIND_rpe_deg`, means over the sequences.
+    """`KIND_ate_m`, `KIND_rpe_m` and `KIND_rpe_deg` of each kind of cloud of the task, means over the sequences.
 
     ATE is the root mean square position error after alignment (Umeyama, without scale), RPE the mean error from one
     scan to the next. Loops are not closed. `still_...` are those of a pose that never moves.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a task is: a network, its losses on a window of scans, and how it is evaluated."""
+"""Definition of a task: a network, its losses on a window of scans, and its evaluation."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ TASKS = {
     "ae_lidar": "dpm2_core.tasks.ae_lidar_task:AeLidarTask",
     "movers": "dpm2_core.tasks.dynamic_objects_task:DynamicObjectTask",
 }
-"""Where the task of each name is; imported when it is asked for."""
+"""Module and class of the task of each name; imported when it is needed."""
 
 
 class TaskOptimizer(StepSettings):
     """Optimisation."""
 
     drop_every: int = Field(0, ge=0)
-    """Epochs after which the rate is multiplied by `drop`, again and again, instead of the cosine; 0: the cosine."""
+    """Epochs after which the rate is multiplied by `drop`, repeatedly, instead of the cosine; 0: the cosine."""
     warmup: int = Field(20, ge=0)
     """Steps of linear warm-up."""
     ema: float = Field(0, ge=0, lt=1)
-    """Decay of the averaged weights, which are the ones that are kept; 0: the last ones."""
+    """Decay of the averaged weights, which are the ones that are saved; 0: the last ones."""
 
 
 class TaskTraining(Settings):
-    """A training of a task; each task adds what is its own."""
+    """A training of a task; each task adds its own settings."""
 
     network: Settings = Settings()
-    """Of the network."""
+    """Settings of the network."""
     epochs: int = Field(default=20, ge=1)
     """Passes over the scans."""
     window: int = Field(default=5, ge=2)
@@ -58,8 +58,8 @@ class TaskTraining(Settings):
     """Epochs between validations."""
 
     def has_windows(self, epoch: int) -> bool:
-        """Whether the scans of a step are contiguous in this epoch, for the SLAM loss. In the other epochs, which are
-        all for a task without it, they are of all places, shuffled."""
+        """Whether the scans of a step are contiguous in this epoch, for the SLAM loss. In the other epochs (all epochs
+        of a task without it) they are of all places, shuffled."""
         return False
 
 
@@ -67,13 +67,13 @@ class SlamTaskTraining(TaskTraining):
     """A training of a task that the SLAM loss can be added to."""
 
     slam: ScheduleSettings = ScheduleSettings()
-    """When and how much the SLAM loss counts; gamma 0: never."""
+    """Schedule and weight of the SLAM loss; gamma 0: never used."""
     slam_loss: SlamLossSettings = SlamLossSettings()
     """Odometry of the SLAM loss."""
 
     def has_windows(self, epoch: int) -> bool:
-        """In the epochs of the SLAM loss, also where its weight is zero: trainings that differ in it alone see the same
-        scans."""
+        """True in the epochs of the SLAM loss, also if its weight is zero: trainings that differ only in the weight see
+        the same scans."""
         return is_due(epoch, self.slam)
 
 
@@ -85,7 +85,7 @@ class Task(nn.Module, ABC):
     training_type: ClassVar[type[TaskTraining]]
     """Its settings."""
     needs: ClassVar[Sequence[RequiredData]] = ()
-    """What its scans must have."""
+    """Data that its scans must have."""
 
     def __init__(self, settings: TaskTraining) -> None:
         super().__init__()
@@ -93,20 +93,20 @@ class Task(nn.Module, ABC):
 
     @classmethod
     def learns_from(cls, settings: TaskTraining) -> Sequence[RequiredData]:
-        """What scans must have to be learned from; to be measured on, always `needs`."""
+        """Data that scans must have for training; for evaluation, always `needs`."""
         return cls.needs
 
     @abstractmethod
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
-        """Loss of the task, a scalar, and a function that gives the SLAM loss, m2; None where it has no meaning.
+        """Loss of the task, a scalar, and a function that returns the SLAM loss, m2; None if it has no meaning.
 
-        `window` holds the scans of `settings.batch` windows one after the other, see `windows`; they are contiguous in
-        the epochs that `TaskTraining.has_windows` gives, and the SLAM loss has a meaning only there. What is random
-        here is drawn from torch's generator, so that a resumed training draws the same.
+        `window` contains the scans of `settings.batch` windows one after the other, see `windows`. They are contiguous
+        in the epochs of `TaskTraining.has_windows`, and only there the SLAM loss has a meaning. Random numbers are
+        drawn from torch's generator, so that a resumed training draws the same.
         """
 
     def forward(self, window: list[TaskScan], epoch: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Eq. 1 and its parts, `task_loss` and, in the epochs where it counts, `slam_loss` (without gamma)."""
+        """Eq. 1 and its parts, `task_loss` and, in the epochs where it is used, `slam_loss` (without gamma)."""
         model_loss, slam_loss = self.losses(window)
         parts = {"task_loss": model_loss}
 
@@ -127,7 +127,7 @@ class Task(nn.Module, ABC):
 
     @abstractmethod
     def figure(self, scan: TaskScan, path: Path) -> None:
-        """Draw what the network makes of a scan beside what it should; called as `evaluate`."""
+        """Draw the network's result for a scan next to the expected one; called as `evaluate`."""
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """Clouds (N, 3), m, that SLAM can be run on, by name: `output`, `input`, `target`; called as `evaluate`.
@@ -137,18 +137,18 @@ class Task(nn.Module, ABC):
         return {}
 
     def start_epoch(self, epoch: int) -> None:
-        """Get ready for an epoch, the first being 0: a task of several stages freezes what does not learn in this."""
+        """Prepare an epoch, the first being 0: a task with several stages freezes the parts that do not learn in it."""
 
     def settle(self, scans: TaskScans) -> None:
-        """What is left to do after the last step, before the weights are stored; `scans` are those learned from."""
+        """Finish a training after the last step, before the weights are stored; `scans` are those learned from."""
 
     def windows(self, scans: int) -> list[slice]:
-        """Where each window is among so many scans."""
+        """Slice of each window among this number of scans."""
         return [slice(i, i + self.settings.window) for i in range(0, scans, self.settings.window)]
 
     @property
     def device(self) -> torch.device:
-        """Where the network is."""
+        """Device of the network."""
         return next(self.parameters()).device
 
 

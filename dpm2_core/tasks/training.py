@@ -38,8 +38,8 @@ def train_task(
     on one thread to the last bit.
 
     Args:
-        val: scans to measure on as the training goes on.
-        until: stop after this epoch, with a checkpoint; the next call goes on from there as if nothing had been.
+        val: scans to measure on during the training.
+        until: stop after this epoch, with a checkpoint; the next call continues from there as if without a stop.
 
     Raises:
         UsageError: no window fits into the scans, or a checkpoint of another training.
@@ -68,7 +68,7 @@ def train_task(
 
 @torch.no_grad()
 def measure(task: Task, scans: TaskScans) -> dict[str, float]:
-    """`Task.evaluate` in eval mode; the mode is put back.
+    """`Task.evaluate` in eval mode; the mode is restored.
 
     Raises:
         UsageError: there are no scans, or they lack what the task needs.
@@ -94,12 +94,12 @@ def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
 
 
 def save_task(task: Task, path: Path, about: dict[str, str], half: bool = False) -> None:
-    """Parameters with the task's name and the settings of its network; `half` stores fp16."""
+    """Write parameters with the task's name and the settings of its network; `half` stores fp16."""
     write_weights(path, task.name, task.settings.network, task.state_dict(), about, half)
 
 
 def load_task(name: str, path: Path) -> Task:
-    """A trained task on the CPU, ready to be measured.
+    """A trained task on the CPU, ready for evaluation.
 
     Raises:
         UsageError: no such file, a pickle, weights of another task, other settings or shapes.
@@ -115,8 +115,8 @@ def load_task(name: str, path: Path) -> Task:
 def _batches(
     task: Task, scans: TaskScans, windows: ContiguousWindows, start: int
 ) -> Iterator[tuple[list[TaskScan], int]]:
-    """The scans of `settings.batch` windows a step, if contiguous one window after the other, and the epoch; from step
-    `start` on, for ever; what is left of an epoch is not used."""
+    """Endless steps from `start` on: the scans of `settings.batch` windows, if contiguous one window after the other,
+    and the epoch. Scans left at the end of an epoch are not used."""
     settings = task.settings
     steps = max(1, len(windows) // settings.batch)
     epoch, skip = divmod(start, steps)
@@ -129,7 +129,7 @@ def _batches(
         if settings.has_windows(epoch):
             windows.set_epoch(epoch)
             order = [i for window in windows for i in window]
-        else:  # neighbors in a step would be nearly one scan: batch statistics and gradients want many places
+        else:  # neighboring scans are nearly the same: batch statistics and gradients need many places
             generator = torch.Generator().manual_seed(settings.optimiser.seed * 1_000_003 + epoch)
             order = torch.randperm(len(scans), generator=generator).tolist()
         size = settings.batch * settings.window
@@ -139,7 +139,7 @@ def _batches(
 
 
 def mean_figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each figure over the scans that have it; NaN where none has."""
+    """Mean of each figure over the scans that have it; NaN if none has."""
     out = {}
     for name in rows[0] if rows else ():
         values = [row[name] for row in rows if not math.isnan(row[name])]
