@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained alike with several seeds
-and measured on the same unseen pairs."""
+"""The paper's tables 3 and 4: alternatives of the fusion and of its reference points, trained in the same way with
+several seeds, and measured on the same unseen pairs."""
 
 from __future__ import annotations
 
@@ -49,27 +49,27 @@ class AblationSettings(Settings):
     """A comparison of networks that differ in one thing."""
 
     training: RegistrationTrainingSettings = RegistrationTrainingSettings()
-    """Of every variant; each changes its network."""
+    """Training of every variant; each variant changes its network."""
     variants: dict[str, dict[str, Any]] = Field({**TABLE_4, **MIXTURES}, min_length=1)
     """Name and change to the network of each; the others are compared with the first."""
     seeds: int = Field(1, gt=0)
-    """Trainings of each, with `training.optimiser.seed` and those after it."""
+    """Trainings of each variant, with `training.optimiser.seed` and the seeds after it."""
     measure: dict[str, str] = Field({})
-    """Name and folder of the packed drives that all are measured on."""
+    """Name and folder of the packed drives on which all variants are measured."""
     pairs: int = Field(300, gt=0)
-    """Frame pairs of each."""
+    """Frame pairs of each of these."""
 
 
 COMPARED = ("near_m", "near_success", "far_success", "turned_success")
 """Figures of which the gain is stated."""
 Table = dict[str, dict[str, dict[str, list[float]]]]
-"""Figures of `PairSet.measure` by variant and drives: one of each seed."""
+"""Figures of `PairSet.measure` by variant and drives: one value per seed."""
 
 
 def ablation(settings: AblationSettings, out: Path) -> Table:
-    """Train and measure every variant; what was trained or measured alike before, in `out`, is not done again.
+    """Train and measure every variant; trainings and measurements with the same settings in `out` are not repeated.
 
-    All variants of a seed are trained before the next seed, so that what is stopped has compared something.
+    All variants of a seed are trained before the next seed, so that a stopped ablation already has a comparison.
     """
     table: Table = {name: {drives: {} for drives in settings.measure} for name in settings.variants}
     for seed in range(settings.seeds):
@@ -94,7 +94,7 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
     if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
         return dict(stored["figures"])
     if not weights.exists():
-        known.unlink(missing_ok=True)  # of weights before: what is stopped while it measures is measured again
+        known.unlink(missing_ok=True)  # figures of earlier weights: a stopped measurement is repeated
         train_registration(training, folder)
     model = load_model(weights)
     images = training.data.images and model.encoder.image is not None
@@ -108,12 +108,12 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
 
 
 def _content(folders: Iterable[str]) -> list[str]:
-    """What folders of packed drives hold, so that others in their place are noticed."""
+    """Digests of folders of packed drives, so that other drives in their place are detected."""
     return [f"{folder}: {packed_digest(open_packed(Path(folder)))}" for folder in folders]
 
 
 def gains(table: Table) -> dict[str, dict[str, dict[str, Any]]]:
-    """What each variant gains over the first one, paired by seed: `Gain` by variant, drives and figure."""
+    """The gain of each variant over the first one, paired by seed: `Gain` by variant, drives and figure."""
     first, *others = table
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for name in others:
@@ -126,7 +126,7 @@ def gains(table: Table) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def ablation_tables(table: Table) -> Iterator[FigureTable]:
-    """A table for people of each set of drives: means over the seeds, and the gain over the first variant."""
+    """A table to print for each set of drives: means over the seeds, and the gain over the first variant."""
     first, *_ = table
     found = gains(table)
     for drives in table[first]:

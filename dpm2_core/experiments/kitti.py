@@ -31,10 +31,10 @@ from dpm2_core.frame import Array
 
 USES = frozenset({"weights", "registrations", "peers", "lengths", "frames"})
 TESTED = ("06", "07", "08", "09", "10")
-"""Sequences that the paper is tested on; it learns from 00 to 05."""
+"""Test sequences of the paper; it learns from 00 to 05."""
 TESTED_360 = ("0007", "0009")
 ORIGINAL_POSES = ["input.kitti_poses=kitti"]
-"""The paper is tested with KITTI's own poses; those of SemanticKITTI are of another SLAM."""
+"""The paper is tested with KITTI's own poses; those of SemanticKITTI are from another SLAM."""
 _T = (0.47, 0.39, 0.77, 0.62, 0.75)
 _R = (0.20, 0.25, 0.22, 0.23, 0.40)
 PAPER: Cells = {
@@ -94,7 +94,7 @@ def _kitti360_findings(request: Request, figures: Mapping[str, Figures]) -> Find
 
 
 def trajectory_pictures(runs: Mapping[str, Mapping[str, Path]], out: Path, notes: list[str]) -> None:
-    """The paper's figure 5: the trajectories of all methods and the truth, a picture a sequence.
+    """The paper's figure 5: the trajectories of all methods and the truth, one image per sequence.
 
     Args:
         runs: folders by sequence and method.
@@ -103,7 +103,7 @@ def trajectory_pictures(runs: Mapping[str, Mapping[str, Path]], out: Path, notes
         ways, truth = aligned_ways(folders)
         draw = partial(trajectories_png, ways=ways, truth=truth, title=sequence)
         if not drawn(out / f"trajectories_{sequence}.png", notes, draw):
-            break  # the others would say the same
+            break  # the others would give the same note
 
 
 def aligned_ways(folders: Mapping[str, Path]) -> tuple[dict[str, Array], Array | None]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two arms that share all but one thing, seed by seed: what that thing gains, and how sure that is."""
+"""Two arms that differ in one thing, compared seed by seed: the gain by that thing, and its confidence interval."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from scipy.special import stdtrit
 
 @dataclass(frozen=True)
 class Gain:
-    """Relative improvement, positive where the second arm is better.
+    """Relative improvement, positive if the second arm is better.
 
     Attributes:
-        mean: over the seeds. low, high: its 95 % interval by Student's t of the paired differences; None of one seed.
+        mean: over the seeds. low, high: its 95 % interval by Student's t of the paired differences; None for one seed.
         better: seeds in which the second arm is better. seeds: their number.
     """
 
@@ -33,7 +33,7 @@ class Gain:
 
 
 def paired_gain(without: Sequence[float], with_: Sequence[float], lower_is_better: bool) -> Gain | None:
-    """The gain of the second arm over the mean of the first; None where that is zero or there are no seeds.
+    """The gain of the second arm over the mean of the first; None if that mean is zero or there are no seeds.
 
     Args:
         without, with_: a figure of each seed, in the same order; a seed in which either is not finite is left out.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other programs on the same frames: each takes one frame after the other, and in the end gives all poses."""
+"""Other programs on the same frames: each takes one frame after the other, and returns all poses at the end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Peer(Protocol):
     at_end: bool
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame in."""
+        """Process the next frame."""
         ...
 
     def poses(self) -> Array:
@@ -38,7 +38,7 @@ class KissIcp:
     """I. Vizzo et al., "KISS-ICP", RA-L 2023, as its pipeline runs it with its defaults."""
 
     def __init__(self, threads: int, deskew: bool) -> None:
-        """`deskew`: the points carry their time.
+        """`deskew`: whether the points have times.
 
         Raises:
             UsageError: it is not installed.
@@ -46,7 +46,7 @@ class KissIcp:
         with needs("bench", "the peer kiss-icp"):
             from kiss_icp.kiss_icp import KissICP
 
-        self.at_end = deskew  # it moves all points to where the last one was seen from
+        self.at_end = deskew  # it deskews all points to the time of the last one
         self._odometry, self._poses = KissICP(kiss_icp_config(threads, deskew)), list[Array]()
 
     def add(self, frame: Frame) -> None:
@@ -60,7 +60,7 @@ class KissIcp:
 
 
 def kiss_icp_config(threads: int, deskew: bool) -> Any:
-    """KISS-ICP's configuration, as by default for sweeps of 100 m.
+    """KISS-ICP's configuration, with its defaults for sweeps of 100 m.
 
     Raises:
         MissingPackageError: it is not installed.
@@ -109,7 +109,7 @@ class SmallGicp:
     at_end = False
 
     def __init__(self, threads: int, deskew: bool) -> None:
-        """As `KissIcp`; it has no means to deskew."""
+        """As `KissIcp`; it cannot deskew."""
         with needs("bench", "the peer small_gicp"):
             import small_gicp
 
@@ -148,7 +148,7 @@ def make_peer(name: str, threads: int, deskew: bool) -> Peer:
 
 
 def cloud_and_times(frame: Frame) -> tuple[Array, Array]:
-    """(M, 3) float64 points without those that are no measurement, and (M,) their times within the sweep, 0..1; ()."""
+    """(M, 3) float64 points without invalid ones, and (M,) their times within the sweep, 0..1; (0,) without times."""
     sound = np.isfinite(frame.points[:, :3]).all(1)
     cloud = frame.points[sound, :3].astype(np.float64)
     if frame.time_offset is None:
@@ -159,7 +159,7 @@ def cloud_and_times(frame: Frame) -> tuple[Array, Array]:
 
 
 def end_of(frame: Frame) -> int:
-    """When the last point of a sweep was seen, ns; the stamp where points have no times."""
+    """Time of the last point of a sweep, ns; the stamp if points have no times."""
     if frame.time_offset is None:
         return frame.stamp
     times = frame.time_offset[np.isfinite(frame.points[:, :3]).all(1)]
@@ -167,13 +167,13 @@ def end_of(frame: Frame) -> int:
 
 
 def at_stamps(poses: Array, ends: Sequence[int], stamps: Sequence[int]) -> Array:
-    """Poses (N, 4, 4) at the `ends` (N,) of sweeps, ns, as those at their `stamps` (N,): on the way from the end of the
-    sweep before; the first on the way to the second, prolonged."""
+    """Convert poses (N, 4, 4) at the `ends` (N,) of sweeps, ns, to those at their `stamps` (N,): interpolated from the
+    end of the sweep before; the first one extrapolated from the motion to the second."""
     if len(poses) < 2:
         return poses
     end, stamp = np.asarray(ends, np.float64), np.asarray(stamps, np.float64)
     number = np.arange(len(poses))
     before, after = np.maximum(number - 1, 0), np.maximum(number, 1)
     span, own = end[after] - end[before], np.minimum(number, 1.0)
-    part = np.divide(stamp - end[before], span, out=own, where=span > 0)  # its own where a clock went back
+    part = np.divide(stamp - end[before], span, out=own, where=span > 0)  # its own pose where a clock went back
     return se3.interpolated(poses[before], poses[after], np.clip(part, -1, 1))

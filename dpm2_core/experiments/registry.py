@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiments of both papers by name, and how one is carried out."""
+"""The experiments of both papers by name, and the function that carries them out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 
 @dataclass(frozen=True)
 class Listed:
-    """An experiment in the list: where in which paper, what it measures, and where it is."""
+    """An experiment in the list: its place in a paper, what it measures, and its MODULE:NAME."""
 
     paper: str
     summary: str
@@ -80,14 +80,14 @@ def load(name: str) -> Experiment:
 
 
 def tables_in(folder: Path) -> list[FigureTable]:
-    """The tables of the experiments whose results are in a folder or below it, these with the folder in their titles.
+    """The tables of the experiments with results in a folder or below it; those below have the folder in their titles.
 
     Raises:
         UsageError: one is damaged.
     """
     tables = []
     for name in EXPERIMENTS:
-        below = (page.with_suffix(".json") for page in sorted(folder.rglob(f"{name}.html")))  # `carry_out` leaves both
+        below = (page.with_suffix(".json") for page in sorted(folder.rglob(f"{name}.html")))  # `carry_out` writes both
         for path in dict.fromkeys([folder / f"{name}.json", *below]):
             where = "" if path.parent == folder else f"{path.parent.relative_to(folder)}: "
             tables += _tables_of(path, where)
@@ -95,7 +95,7 @@ def tables_in(folder: Path) -> list[FigureTable]:
 
 
 def _tables_of(path: Path, where: str) -> list[FigureTable]:
-    """Those of an experiment's JSON, `where` before their titles; none where there is no such file."""
+    """The tables in an experiment's JSON file, with `where` before their titles; none if there is no such file."""
     if not path.is_file():
         return []
     try:
@@ -108,7 +108,7 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Finding
     """Do all parts that are not done yet, and write OUT/NAME.json and OUT/NAME.html.
 
     Raises:
-        UsageError: an option that the experiment has no use for, or data that it cannot use. Dpm2Error: a part failed.
+        UsageError: an option that the experiment does not use, or data that it cannot use. Dpm2Error: a part failed.
     """
     experiment = load(name)
     _check_options(name, request, experiment)
@@ -140,7 +140,7 @@ def _check_options(name: str, request: Request, experiment: Experiment) -> None:
 
 
 def _check_names(name: str, parts: Sequence[Part]) -> None:
-    """Of two parts in one folder the second would overwrite the first, and both rows show its figures."""
+    """Reject two parts in one folder: the second would overwrite the first, and both rows would show its figures."""
     folders = Counter(part.name for part in parts)
     twice = [folder for folder, count in folders.items() if count > 1]
     if twice:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `dpm2 experiment` was asked for, what an experiment is, and what comes out of it."""
+"""The options of `dpm2 experiment`, the definition of an experiment, and its findings."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dpm2_core.fleet.part import Figures, Part
 
 @dataclass(frozen=True)
 class Request:
-    """Options of `dpm2 experiment`; None or empty where they were not given.
+    """Options of `dpm2 experiment`; None or empty if they were not given.
 
     Attributes:
         data: root of the data set. out: folder of the results.
-        sequences: to be tested on; by default those of the paper that the data set has.
-        learn: to be learned from, likewise.
-        weights: a name or a file. registrations: of the SLAM, a row each.
-        peers: other programs, or NAME=FILE with trajectories of theirs.
+        sequences: to test on; by default those of the paper that the data set has.
+        learn: to learn from, likewise.
+        weights: a name or a file. registrations: of the SLAM, one row each.
+        peers: other programs, or NAME=FILE with their trajectories.
         lengths: segment lengths of the KITTI metric, m. frames: of each sequence.
         seeds: trainings of each arm. config: YAML of the training. overrides: KEY=VALUE.
     """
@@ -50,10 +50,10 @@ class Request:
 
 @dataclass
 class Findings:
-    """What an experiment found.
+    """The results of an experiment.
 
     Attributes:
-        tables: the paper's, with ours beside. notes: what a reader must know, in words.
+        tables: those of the paper, with our rows. notes: what a reader must know, in words.
         runs: folders of runs by sequence and name, for the report.
     """
 
@@ -64,7 +64,7 @@ class Findings:
 
 
 def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> bool:
-    """Draw a picture; False, and a note, where what draws is not installed."""
+    """Draw an image; False, and a note, if a package for it is not installed."""
     try:
         draw(path)
     except MissingPackageError as error:
@@ -75,12 +75,12 @@ def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> bool:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure of a paper, as parts and what is made of them.
+    """A table or figure of a paper, as parts and a function that makes the findings from them.
 
     Attributes:
-        uses: the options of `Request` beside data, out, sequences, workers and overrides that have a meaning for it;
-            any other one that is given is an error.
-        parts: stages; the parts of one may read what those before have written.
+        uses: the options of `Request` that it uses in addition to data, out, sequences, workers and overrides; any
+            other given option is an error.
+        parts: stages; the parts of a stage may read what earlier stages have written.
         findings: the tables, from the figures of all parts by their names.
     """
 

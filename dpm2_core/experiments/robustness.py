@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DeepPointMap2's table 2 and figure 6: a camera that sees nothing, and a box that stands before the LiDAR."""
+"""DeepPointMap2's table 2 and figure 6: a camera with black images, and a box in front of the LiDAR."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import Config
 
 SHARES = (0.05, 0.3, 0.5, 1.0)
-"""Fractions of the frames that are hit."""
+"""Fractions of the frames that are corrupted."""
 KINDS = {"camera": "camera black", "obstruction": "box before the LiDAR"}
 _PAPER_MEAN = {"camera": (0.62, 0.61, 0.69, 1.04), "obstruction": (0.62, 0.66, 0.71, 0.74)}
 """Mean t_err of 06 to 10, percent, of the paper's table 2."""
@@ -52,7 +52,7 @@ def _variants(request: Request) -> list[tuple[str, list[str], str | None]]:
 
 
 def _sees(request: Request, settings: Sequence[str]) -> bool:
-    """Whether there are images, and a camera would be used: where not, black images change nothing."""
+    """Whether there are images, and a camera would be used: if not, black images change nothing."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     config = load_settings(Config, None, [*settings, *weights, *request.overrides])
     return make_odometry(config.slam).uses_images and _has_images(request)
@@ -112,7 +112,7 @@ def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
 
 
 def _picture(request: Request, sequence: str, notes: list[str]) -> None:
-    """The paper's figure 6: a frame as it is, and with both sensors hit."""
+    """The paper's figure 6: a frame as it is, and with both sensors corrupted."""
     source = _opened(request, sequence)
     at = min(_PICTURED, len(source) - 1)
     hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts that experiments with the SLAM have in common: our rows, other programs' rows, on every sequence."""
+"""Common parts of the experiments with the SLAM: our rows and other programs' rows, on every sequence."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from dpm2_core.fleet.part import Figures, Part
 SHOWN = {"t_err_percent": ".3f", "r_err_deg_per_100m": ".3f"}
 """Figures of the KITTI metric, and how they are printed."""
 FAILED = "Failed: frames that were only predicted, or have no pose and so no part in the figures."
-"""What `add_runs` says beside a row."""
+"""Explanation of the note that `add_runs` adds to a row."""
 
 
 def reading(request: Request, sequence: str, settings: Sequence[str] = ()) -> list[str]:
-    """The settings by which a sequence is read; `settings` count for less than the user's, of which those of the SLAM
-    and of trainings are left out."""
+    """The settings for reading a sequence. The user's settings override `settings`; those of the SLAM and of trainings
+    are left out."""
     return [f"input.sequence='{sequence}'", *settings, *(s for s in request.overrides if s.startswith("input."))]
 
 
 def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) -> list[str]:
-    """The sequences to be tested on: those asked for, or those of the paper that the data set has.
+    """The sequences to test on: the requested ones, or those of the paper that the data set has.
 
     Raises:
-        UsageError: one that was asked for is not there, or none of the paper's.
+        UsageError: a requested sequence is missing, or all of the paper's are.
     """
     if request.sequences:
         for sequence in request.sequences:
@@ -47,7 +47,7 @@ def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) ->
 
 
 def paper_notes(request: Request, found: Sequence[str], paper: Sequence[str]) -> list[str]:
-    """What is to be said where other sequences, frames or segments are measured than the paper's, or not all."""
+    """Notes if other sequences, frames or segments than the paper's are measured, or not all of them."""
     missing = [sequence for sequence in paper if sequence not in found]
     notes = [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
     if not set(found) <= set(paper) or request.frames or request.lengths:
@@ -56,12 +56,12 @@ def paper_notes(request: Request, found: Sequence[str], paper: Sequence[str]) ->
 
 
 def segments(request: Request) -> str:
-    """What the KITTI metric of a table is the mean over, for its caption."""
+    """The segments over which the KITTI metric of a table is averaged, for its caption."""
     return "all segments" if request.lengths is None else f"all segments of {in_words(request.lengths)}"
 
 
 def learned_note(learned: Sequence[str], tested: Sequence[str]) -> list[str]:
-    """What is to be said where sequences that were learned from are tested on."""
+    """A note if sequences that were learned from are tested on."""
     both = [sequence for sequence in tested if sequence in learned]
     return [f"tested on what was learned from: {', '.join(both)}"] if both else []
 
@@ -73,7 +73,7 @@ def registrations(request: Request) -> list[tuple[str, list[str]]]:
 
 
 def own_part(name: str, sequence: str, request: Request, settings: Sequence[str], **more: Any) -> Part:
-    """Our SLAM on a sequence; `settings` count for less than the user's."""
+    """The part of our SLAM on a sequence; the user's settings override `settings`."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     asked = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
     named = [setting.partition("=")[2] for setting in asked if setting.endswith(".safetensors")]
@@ -83,10 +83,10 @@ def own_part(name: str, sequence: str, request: Request, settings: Sequence[str]
 
 
 def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[str]) -> list[Part]:
-    """What `--peer` names, on every sequence.
+    """The parts of what `--peer` names, on every sequence.
 
     Raises:
-        UsageError: a file's name does not say which sequence it is of.
+        UsageError: a file's name does not contain the sequence.
     """
     parts = []
     for text in request.peers:
@@ -105,7 +105,7 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
 
 
 def peer_names(request: Request) -> list[str]:
-    """Of the rows of other programs."""
+    """Names of the rows of other programs."""
     return [text.partition("=")[0] for text in request.peers]
 
 
@@ -117,10 +117,10 @@ def add_runs(
     label: str = "",
     about: str = "",
 ) -> None:
-    """The row of what ran on the sequences, and beside it how many frames have no pose of their own, see `FAILED`.
+    """Add the row of a method on the sequences, with a note on how many frames have no pose of their own, see `FAILED`.
 
     Args:
-        label: of the row; `name` without. about: what else is to be said beside it.
+        label: of the row; `name` by default. about: further note on the row.
     """
     of = {sequence: figures[f"{_folder(name)}/{sequence}"] for sequence in sequences}
     failed = [f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in of.items() if f["failed_frames"]]

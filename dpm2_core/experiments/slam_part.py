@@ -45,7 +45,7 @@ GIVEN = "dpm2_core.experiments.slam_part:given"
 
 
 class Drive(TypedDict):
-    """What is driven: root of the data set, settings KEY=VALUE of `Config`, positions of the first frame and of the one
+    """A drive to run: root of the data set, settings KEY=VALUE of `Config`, positions of the first frame and of the one
     after the last, and the segment lengths of the KITTI metric, m."""
 
     data: Path
@@ -55,10 +55,10 @@ class Drive(TypedDict):
 
 
 def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None) -> Figures:
-    """Our SLAM; leaves the files of `dpm2 run` but for the map's points.
+    """Run our SLAM; writes the files of `dpm2 run` except the map's points.
 
     Raises:
-        UsageError: no such sequence, no ground truth, or settings that there are not. Dpm2Error: files not written.
+        UsageError: no such sequence, no ground truth, or unknown settings. Dpm2Error: files not written.
     """
     config = load_settings(Config, None, drive["settings"])
     source: Source | Path = drive["data"]
@@ -81,10 +81,10 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
 
 
 def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
-    """Another program on the same frames, read one at a time, on all processors; its poses are those at the stamps.
+    """Run another program on the same frames, read one at a time, on all processors; its poses are those at the stamps.
 
     Raises:
-        UsageError: it is not installed, or as `own`. Dpm2Error: it gave another number of poses than frames.
+        UsageError: it is not installed, or as `own`. Dpm2Error: it returned another number of poses than frames.
     """
     source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
@@ -103,7 +103,7 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     poses = program.poses()
     if len(poses) != len(stamps):
         raise Dpm2Error(f"{name}: {len(poses)} poses for {len(stamps)} frames")
-    if program.at_end:  # the truth is that at the stamps
+    if program.at_end:  # ground truth is at the stamps
         poses = at_stamps(poses, ends, stamps)
     write_tum(folder / TRAJECTORY, stamps, poses)
     write_frames(folder / FRAMES, [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
@@ -116,15 +116,15 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
 
 
 def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
-    """A trajectory from a file: TUM, of the LiDAR by stamp, or KITTI's, of the left camera.
+    """Measure a trajectory from a file: TUM, of the LiDAR by stamp, or KITTI's, of the left camera.
 
     Raises:
-        UsageError: no such file, or nothing in it belongs to the sequence.
+        UsageError: no such file, or no pose in it is of the sequence.
     """
     source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
     truth = _truth(source, start, stop)
-    # Only names and stamps are wanted, but a source gives them with its frames alone.
+    # Only names and stamps are needed, but a source provides them only with its frames.
     keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
     index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
     poses = _poses_of(file, source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
@@ -138,10 +138,10 @@ def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
 
 
 def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, Keys]) -> Array:
-    """Poses (N, 4, 4) of the LiDAR in the frames of a span, of the true poses `truth`, with those `keys`; NaN: none.
+    """Poses (N, 4, 4) of the LiDAR for the frames of a span, with true poses `truth` and `keys`; NaN for none.
 
     Raises:
-        UsageError: no such file, or one of other frames.
+        UsageError: no such file, or it is of other frames.
     """
     found = read_trajectory(file)
     if found.kind == "kitti" and len(found) != len(truth):  # of the whole recording, or of one that it is a part of
@@ -149,7 +149,7 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
         assert isinstance(whole, np.ndarray)
         return whole
     own_keys = keys.get(found.kind, np.arange(len(truth), dtype=np.int64))
-    if found.kind == "tum":  # may be of some frames alone, such as keyframes: what is between these is not known
+    if found.kind == "tum":  # may be of some frames only, such as keyframes: between these nothing is known
         same = same_stamps(own_keys, found.keys)
         return placed(found, own_keys) if same else interpolate(found.keys, found.poses, own_keys)
     try:
@@ -170,8 +170,8 @@ def _truth(source: Source, start: int, stop: int) -> Array:
 def _measured(
     folder: Path, source: Source, poses: tuple[Sequence[int] | Keys, Array, Array], drive: Drive, fps: float | None
 ) -> Figures:
-    """Figures of stamps (N,) ns, true and estimated poses (N, 4, 4) of the LiDAR; of KITTI's left camera where its
-    place is known."""
+    """Figures of stamps (N,) ns, true and estimated poses (N, 4, 4) of the LiDAR; they are those of KITTI's left camera
+    if its extrinsics are known."""
     stamps, *both = poses
     truth, est = (camera_poses(each, source.T_cam_lidar) for each in both)
     metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), stamps=np.asarray(stamps, np.int64))
@@ -181,17 +181,17 @@ def _measured(
 
 
 def open_drive(data: Path, settings: Sequence[str], images: bool = True) -> Source:
-    """A drive as the settings KEY=VALUE of `Config` have it read; see `open_recording`."""
+    """A drive, read with the settings KEY=VALUE of `Config`; see `open_recording`."""
     return open_recording(data, load_settings(Config, None, settings), images)
 
 
 def drive_content(data: Path, settings: Sequence[str]) -> str:
-    """What a drive holds, see `digest_of`."""
+    """Digest of the content of a drive, see `digest_of`."""
     return digest_of(open_drive(data, settings))
 
 
 def has_sequence(data: Path, settings: Sequence[str]) -> str:
-    """Why a sequence cannot be opened; empty where it can."""
+    """Why a sequence cannot be opened; empty if it can."""
     config = load_settings(Config, None, settings)
     try:
         open_recording(data, config, images=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A table of a paper: our rows beside its own."""
+"""A table of a paper: our rows next to its own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from dpm2_core.tables import FigureTable, cells_of
 
 MEAN = "mean"
-"""Name of the last column: the arithmetic mean of the others, as the papers take it."""
+"""Name of the last column: the arithmetic mean of the others, as in the papers."""
 
 Cells = dict[str, dict[str, float | None]]
 """Figures by column."""
@@ -18,7 +18,7 @@ Cells = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True)
 class Row:
-    """One method: what it is called, where its figures come from ("this run", or the paper), and the figures."""
+    """One method: its name, the origin of its figures ("this run", or the paper), and the figures."""
 
     name: str
     origin: str
@@ -42,8 +42,8 @@ class ResultTable:
     rows: list[Row] = field(default_factory=list)
 
     def add(self, name: str, cells: Cells, origin: str = "this run", note: str = "") -> None:
-        """A row, of the table's columns; a mean is added where every column has a figure and there are several, and the
-        row brings none."""
+        """Add a row, with the table's columns. If the table has a column `MEAN` and the row does not, the mean of each
+        figure is added that every column has."""
         cells = {column: cells[column] for column in self.columns if column in cells}
         given = [column for column in self.columns if column != MEAN]
         if MEAN in self.columns and MEAN not in cells:
@@ -51,12 +51,12 @@ class ResultTable:
         self.rows.append(Row(name, origin, cells, note))
 
     def record(self) -> dict[str, Any]:
-        """For JSON, the cells of each row also as text; see `shown`."""
+        """The table for JSON, with the cells of each row also as text; see `shown`."""
         rows = [{**asdict(row), "texts": [self._text(row, column) for column in self.columns]} for row in self.rows]
         return {"title": self.title, "columns": list(self.columns), "caption": self.caption, "rows": rows}
 
     def _text(self, row: Row, column: str) -> str:
-        """The figures of a column with slashes between, "-" for what is not there."""
+        """The figures of a column with slashes between, "-" for missing ones."""
         cells = cells_of(row.cells.get(column, {}), (f"{{{name}:{form}}}" for name, form in self.figures.items()))
         return "-" if set(cells) == {"-"} else " / ".join(cells)
 
@@ -68,10 +68,10 @@ def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:
 
 
 def shown(record: Mapping[str, Any], where: str = "") -> FigureTable:
-    """A table that `ResultTable.record` has written, for people; `where`: before its title.
+    """A table that `ResultTable.record` has written, to print; `where`: put before its title.
 
     Raises:
-        KeyError, TypeError, ValueError: it is none.
+        KeyError, TypeError, ValueError: the record is not of a table.
     """
     notes = ["note"] if any(row["note"] for row in record["rows"]) else []
     title, caption = f"{where}{record['title']}", str(record["caption"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One training of a task, one measuring of it: the parts of the experiments of the differentiable SLAM paper."""
+"""One training of a task, and one measurement of it: the parts of the experiments of the differentiable SLAM paper."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ Scans = tuple[Path, Sequence[str]]
 
 
 class Training(TypedDict):
-    """What an arm is trained by: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, and its
-    seed, counted from that of the settings."""
+    """The training of an arm: its task, root of the data set, sequences, YAML file, settings KEY=VALUE, and its seed,
+    counted from that of the settings."""
 
     task: str
     data: Path
@@ -59,24 +59,24 @@ def settings_of(training: Training) -> SlamTaskTraining:
 
 
 def first_slam_epoch(settings: SlamTaskTraining) -> int:
-    """Epochs before the SLAM loss counts for the first time, which the arms of a seed have in common."""
+    """Number of epochs before the SLAM loss is used for the first time; the arms of a seed share them."""
     return next((epoch for epoch in range(settings.epochs) if settings.has_windows(epoch)), 0)
 
 
 def train(
     folder: Path, advance: Advance, training: Training, until: int | None = None, start: Path | None = None
 ) -> Figures:
-    """Train an arm; weights, log and checkpoint stay in the folder, and one that was stopped goes on.
+    """Train an arm; weights, log and checkpoint stay in the folder, and a stopped training continues.
 
     Args:
-        until: only so many epochs. start: folder of a training that stopped at such an epoch, to go on from.
+        until: train only this number of epochs. start: folder of a training that stopped there, to continue from.
 
     Raises:
         UsageError: no such scans, or too few.
     """
     settings = settings_of(training)
     kind = task_type(training["task"])
-    # All arms are to see the same scans, so the one that needs most decides for all: it has no SLAM loss to learn from.
+    # All arms must see the same scans, so the one that needs most decides: the one without the SLAM loss.
     needs = kind.learns_from(settings_of({**training, "arm": "without"}))
     scans = open_scans(training["data"], needs, training["learn"])
     asked = {"training": training, "until": until, "content": scans.digest()}
@@ -101,7 +101,7 @@ def measure_on(folder: Path, advance: Advance, task: str, weights: Path, drive: 
 
 
 def slam_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Scans) -> Figures:
-    """Odometry on what a training makes of a data set's sequences; leaves the trajectories.
+    """Odometry on the clouds that a trained task makes of a data set's sequences; writes the trajectories.
 
     Raises:
         UsageError: as `slam_runs`.
@@ -119,14 +119,15 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Sca
 
 
 def folder_name(sequence: str) -> str:
-    """Of the trajectories of a sequence."""
+    """Name of the folder for the trajectories of a sequence."""
     return sequence.replace("/", "_")
 
 
 def _logged(folder: Path, epochs: int, gamma: float) -> Figures:
-    """The losses of the last epoch of so many, and what the SLAM loss was beside the task's when it first counted."""
+    """The loss of the last of these epochs, the ratio of the SLAM loss to the task's when first used, and the skipped
+    steps."""
     rows = [row for row in read_log(folder) if "norm" in row]
-    epoch = max(1, len(rows) // epochs)  # steps of one
+    epoch = max(1, len(rows) // epochs)  # steps of an epoch
     first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch]
     share = [gamma * row["slam_loss"] / row["task_loss"] for row in first]
     last = [row["task_loss"] for row in rows[-epoch:] if row["task_loss"] is not None]  # None: it was not finite

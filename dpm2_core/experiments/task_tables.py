@@ -36,7 +36,8 @@ ARMS: tuple[Arm, ...] = ("without", "with", "placebo")
 COMPARED: Mapping[str, tuple[Arm, Arm]] = {
     "with": ("without", "with"), "placebo": ("without", "placebo"), "with_over_placebo": ("placebo", "with"),
 }  # fmt: skip
-"""Arms by what their gain is called. Only the last is what the loss itself gains: two intervals say nothing of it."""
+"""Compared arms by the name of their gain. Only the last is the gain of the loss itself; the intervals of the other two
+do not show it."""
 ROWS = {"without": "without SLAM loss", "with": "with SLAM loss", "placebo": "with that of another window"}
 
 
@@ -46,10 +47,10 @@ class TaskTable:
 
     Attributes:
         task: in `tasks.task.TASKS`. measured: `MEASURE` or `SLAM`.
-        figures: of the task, and how they are printed; those in `higher` are better when greater.
+        figures: of the task, and how they are printed; for those in `higher`, higher is better.
         paper: rows of the paper by name.
         learn, test: sequences or pairs of the paper. defaults: settings of the training, which the user's replace.
-        notes: what is not as in the paper.
+        notes: differences from the paper.
     """
 
     title: str
@@ -64,14 +65,14 @@ class TaskTable:
     notes: Sequence[str] = ()
 
     def experiment(self) -> Experiment:
-        """As the registry wants it."""
+        """The experiment for the registry."""
         return Experiment(frozenset({"learn", "seeds", "config"}), self.parts, self.findings)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
-        """First epochs that the arms of a seed share, the arms, and their measuring.
+        """First epochs that the arms of a seed share, the arms, and their measurement.
 
         Raises:
-            UsageError: the SLAM loss would never count, or there are no such scans.
+            UsageError: the SLAM loss would never be used, or there are no such scans.
         """
         self._check_slam_loss(request)
         learned, tested_on = (open_scans(request.data, (), words).digest() for words in self._sequences(request))
@@ -100,7 +101,7 @@ class TaskTable:
         return [stage for stage in (shared, arms, measured) if stage]
 
     def _check_slam_loss(self, request: Request) -> None:
-        """Without it all arms would be the same, and the gain an exact zero."""
+        """Require that the SLAM loss is used: otherwise all arms would be the same, and the gain exactly zero."""
         settings = settings_of(self._training(request, 0, "with"))
         if settings.slam.gamma == 0 or not any(map(settings.has_windows, range(settings.epochs))):
             slam = settings.slam
@@ -111,7 +112,7 @@ class TaskTable:
             )
 
     def findings(self, request: Request, figures: Mapping[str, Figures]) -> Findings:
-        """The table, a row an arm, and what the SLAM loss gains."""
+        """The table, with a row per arm, and the gain by the SLAM loss."""
         seeds = range(request.seeds or SEEDS)
         table = ResultTable(self.title, list(self.figures), {"mean": ".4g"}, "Means over the seeds and the test scans.")
         of: dict[str, dict[str, list[float]]] = {
@@ -154,7 +155,7 @@ class TaskTable:
         return notes
 
     def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
-        """The paper's figure 3: trajectories on the output of both arms of the first seed, a picture a sequence."""
+        """The paper's figure 3: trajectories on the output of both arms of the first seed, one image per sequence."""
         names = map(folder_name, figures[self._measured(0, "with")]["sequences"])
         folders = {ROWS[arm]: request.out / self._measured(0, arm) for arm in ("without", "with")}
         runs = {name: {row: folder / name / "output" for row, folder in folders.items()} for name in names}
@@ -168,7 +169,7 @@ class TaskTable:
         )  # fmt: skip
 
     def _sequences(self, request: Request) -> tuple[Sequence[str], Sequence[str]]:
-        """Those to learn from, and those to be tested on."""
+        """The sequences to learn from, and those to test on."""
         return request.learn or self.learn, request.sequences or self.test
 
     def _name(self, seed: int, arm: str) -> str:

@@ -23,11 +23,11 @@ from dpm2_core.network.weights import network_settings, read_metadata
 PACK = "dpm2_core.experiments.variant_part:pack"
 TRAIN = "dpm2_core.experiments.variant_part:train"
 DRIVE = "drive"
-"""In the folder of a part that packs."""
+"""The packed drive in the folder of a part that packs."""
 
 
 def pack(folder: Path, advance: Advance, data: Path, settings: Sequence[str], weights: str) -> Figures:
-    """The frames of a sequence that have a pose, packed below the folder for the network of these weights.
+    """Pack the frames of a sequence that have a pose below the folder, for the network of these weights.
 
     Raises:
         UsageError: no such sequence, no poses, or images of some frames only.
@@ -40,12 +40,12 @@ def pack(folder: Path, advance: Advance, data: Path, settings: Sequence[str], we
 def training_of(
     config: Path | None, settings: Sequence[str], start: str, network: dict[str, Any], packed: Sequence[Path]
 ) -> RegistrationTrainingSettings:
-    """The training of a variant on packed drives, each as often as it has frames.
+    """The training of a variant on packed drives, each weighted by its number of frames.
 
     `network`: its changes to the network of the weights that it starts from.
 
     Raises:
-        UsageError: settings that there are not, or that ask for other weights or another network than `start` is.
+        UsageError: unknown settings, or settings with other weights or another network than those of `start`.
     """
     chosen = load_settings(RegistrationTrainingSettings, config, settings)
     path = weights_path(start)
@@ -60,7 +60,7 @@ def training_of(
         images = any((drive / "pixels.npy").is_file() for drive in packed)
         frames = {str(drive): float(len(PackedDrive(drive))) for drive in packed}
         data = data.model_copy(update={"packed": frames, "images": images})
-    # The changes say all there is to the network, its name included, so it does not matter to which preset.
+    # The changes define the whole network, its name included, so it does not matter which preset they change.
     changes = {"preset": "small", "network": tree, "start": str(path), "partial": True, "data": data}
     return chosen.model_copy(update=changes)
 
@@ -68,7 +68,7 @@ def training_of(
 def train(
     folder: Path, advance: Advance, training: dict[str, Any], packed: Sequence[Path], network: dict[str, Any]
 ) -> Figures:
-    """Fine-tune a variant of a network from weights, as far as they fit; one that was stopped goes on.
+    """Fine-tune a variant of a network from weights, as far as they fit; a stopped training continues.
 
     Raises:
         UsageError: no such weights, or no packed drive.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DeepPointMap2's tables 3 and 4 and figure 7: networks that differ in one thing, fine-tuned alike, judged by SLAM."""
+"""DeepPointMap2's tables 3 and 4 and figure 7: networks that differ in one thing, fine-tuned alike, tested by SLAM."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ LEARNED = ("00", "01", "02", "03", "04", "05")
 AS_PAPER: dict[str, Any] = {
     "fusion": {"reference": "fps", "reference_features": False, "relative": False, "pixel": False}
 }
-"""What all variants have in common but for what one changes: nothing but the fusion tells where a reference point is,
-and what is there."""
+"""What all variants have in common, except for what a variant changes: only the fusion determines where a reference
+point is, and what is there."""
 _POINTS = 256
-"""Reference points where a variant does not say: the paper's Table 4 has the figures of so many in its Table 3."""
+"""Reference points of a variant without a number: Table 4 of the paper has the figures of this number in Table 3."""
 TABLE_3: dict[str, dict[str, Any]] = {
     "FPS 128": {"fusion": {"points": 128}},
     "FPS 256": {},
@@ -65,12 +65,12 @@ _PAPER_4 = {
 }  # fmt: skip
 TABLE_4 = {name: TRAINED_ALIKE[name] for name in _PAPER_4}
 _FOR_SLAM = ("slam.", "input.")  # settings of the user that are not of the training
-_ALONE = ("slam.registration=neural", "slam.visual.enabled=false")  # the network, as in the paper
+_ALONE = ("slam.registration=neural", "slam.visual.enabled=false")  # the network alone, as in the paper
 
 
 @dataclass(frozen=True)
 class VariantTable:
-    """Variants of a network by name; `paper`: t_err of 06 to 10 of each, percent. `judged` False: only pictures."""
+    """Variants of a network by name; `paper`: t_err of 06 to 10 of each, percent. `judged` False: only images."""
 
     title: str
     variants: Mapping[str, Mapping[str, Any]]
@@ -78,15 +78,15 @@ class VariantTable:
     judged: bool = True
 
     def experiment(self) -> Experiment:
-        """As the registry wants it."""
+        """The experiment for the registry."""
         uses = {"learn", "weights", "config", *(("lengths", "frames") if self.judged else ())}
         return Experiment(frozenset(uses), self.parts, self.findings)
 
     def parts(self, request: Request) -> Sequence[Sequence[Part]]:
-        """Packed drives, a training of each variant, and each on every sequence.
+        """Packed drives, a training of each variant, and a run of each on every sequence.
 
         Raises:
-            UsageError: no such sequences or weights, or settings of the training that cannot be; before all is packed.
+            UsageError: no such sequences or weights, or invalid settings of the training; raised before packing.
         """
         sequences = present(request, TESTED, ORIGINAL_POSES)
         start = request.weights or "small"
@@ -144,7 +144,7 @@ class VariantTable:
         return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *_ALONE])
 
     def _panel(self, request: Request, sequence: str, notes: list[str]) -> None:
-        """The paper's figure 7: what one reference point reads from the image, by every variant that attends."""
+        """The paper's figure 7: attention of one reference point to the image, for every variant with attention."""
         frame = frame_at(open_drive(request.data, reading(request, sequence)), 0)
         if not frame.images:
             notes.append("no attention maps: the data set has no images")
@@ -154,7 +154,7 @@ class VariantTable:
             model = load_model(request.out / self._training(variant) / WEIGHTS)
             try:
                 looked[variant] = image_attention(model, frame)
-            except UsageError as error:  # what pools or paints has no attention
+            except UsageError as error:  # pooling and painting have no attention
                 notes.append(f"no attention map of {variant}: {error}")
         title = f"{sequence}, frame {frame.index}: attention of one reference point"
         path = request.out / f"attention_{sequence}.png"
@@ -172,10 +172,10 @@ def _for_slam(request: Request) -> tuple[str, ...]:
 
 
 def _check_drive(request: Request) -> None:
-    """Else every row would be of the same weights, or of none.
+    """Check that each variant is run with its own weights: else every row would be of the same weights, or of none.
 
     Raises:
-        UsageError: the user's settings put others in the place of a variant's.
+        UsageError: the user's settings replace those of a variant.
     """
     own = "those of the variant"
     slam = load_settings(Config, None, [*_ALONE, f"slam.neural.weights={own}", *_for_slam(request)]).slam
@@ -191,7 +191,7 @@ def _joined(change: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _learned(request: Request) -> list[str]:
-    """The sequences to learn from: those asked for, or those of the paper that the data set has."""
+    """The sequences to learn from: the requested ones, or those of the paper that the data set has."""
     return present(replace(request, sequences=request.learn), LEARNED)
 
 
