@@ -123,9 +123,9 @@ class ActiveMap:
     def _check_places(self) -> None:
         """Raises UsageError unless the robot can be localized in the growing map."""
         if not isinstance(self._store, MapStore):
-            raise UsageError("no map to find oneself in: ros.map_file is empty, or could not be written")
+            raise UsageError("no map to localize in: ros.map_file is empty, or could not be written")
         if not self.mapper.keyframes:
-            raise UsageError("no map to find oneself in: there is no keyframe yet")
+            raise UsageError("no map to localize in: there is no keyframe yet")
         check_for_localization(self._store, self._config.slam)
 
     def _exchange(self, store: MapStore | TiledMap) -> None:
@@ -154,10 +154,10 @@ class ActiveMap:
         if located is None or not localizer.state.located:
             raise UsageError(f"not extended: the robot is {localizer.state} in {self._path}")
         if not isinstance(self._store, MapStore):
-            raise UsageError(f"not extended: {self._path} is a folder of tiles, which does not grow")
+            raise UsageError(f"not extended: {self._path} is a folder of tiles, which cannot be extended")
         self._exchange(open_session(self._store.path, self._config.slam, dump_settings(self._config), resume=True))
         self.mapper.start_session(localizer.T_map_odom, located.covariance + _FOUND)
-        return f"{self._path} grows by a new session"
+        return f"{self._path} is extended by a new session"
 
     def restart(self, robot: str) -> None:
         """A robot's odometry has restarted: a loop closure or a relocalization must find its pose."""
@@ -237,7 +237,7 @@ class ActiveMap:
         if self.file_problem:
             file = f", but there is no map file: {self.file_problem}"
         untied = int((~self.mapper.placed).sum())
-        without = f"; map.ply and trajectory.tum without {untied} that no loop ties to the first" if untied else ""
+        without = f"; map.ply and trajectory.tum lack {untied} that no loop connects to the first" if untied else ""
         return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}{without}"
 
     def finish(self) -> None:
@@ -263,14 +263,16 @@ class ActiveMap:
         """
         self.finish()
         if self.mapper.store_problem:
-            raise Dpm2Error(f"the map goes on: {self.mapper.store_problem}")
+            raise Dpm2Error(f"map file incomplete, the map continues: {self.mapper.store_problem}")
 
     def _first_file(self) -> MapStore | None:
         """A new map file; warns if the requested one exists already, as after a crash: it is not continued."""
         store, name = self._new_file(), self._config.ros.map_file
         if store is not None and name != AUTO and self._path != (asked := self._maps.of_robot(Path(name))):
             there = asked if asked.exists() else left_log(asked) or asked
-            self._log.warning(f"{there} is there already and stays as it is: {self._path} begins without its drives")
+            self._log.warning(
+                f"{there} exists already and is not changed: {self._path} is a new map without its drives"
+            )
         return store
 
     def _new_file(self) -> MapStore | None:
@@ -302,7 +304,7 @@ class ActiveMap:
     def _opened(self) -> MapStore | TiledMap:
         """The map file or folder of tiles, opened read-only."""
         if self._path is None:
-            raise UsageError("no map to find oneself in: ros.map_file does not name one" + self._maps.hint())
+            raise UsageError("no map to localize in: ros.map_file does not name one" + self._maps.hint())
         return open_for_localization(self._path, self._config.slam)
 
     def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
@@ -318,6 +320,6 @@ class ActiveMap:
         if located.state is State.RELOCALIZED:
             x, y, z = located.T_map_kf[:3, 3].tolist()
             kind = "kidnapped; found again" if before.located else "found"
-            self._log.info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m of {self._config.ros.map_frame}")
+            self._log.info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m in {self._config.ros.map_frame}")
         elif located.state in (State.LOST, State.DEGRADED):
             self._log.warning(f"{located.state}: {located.registration.reason}")

@@ -58,9 +58,9 @@ class Options:
     subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1
     listener: Annotated[str, typer.Option("--for", help="only nodes of this name count, such as slam_node")] = ""
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True
-    log: Annotated[Path | None, typer.Option(help="CSV file for the moment at which each message went out")] = None
+    log: Annotated[Path | None, typer.Option(help="CSV file with the time at which each message was published")] = None
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="no timing: each cloud after the dpm2/odom of the one before")
+        bool, typer.Option("--lockstep", help="no timing: each cloud follows the dpm2/odom of the one before")
     ] = False
 
 
@@ -130,7 +130,7 @@ class BagPlayer:
         publishers = {}
         for topic in sorted(requested, key=lambda topic: topic not in self._latched):
             if self._options.lockstep and topic == self._node.resolve_topic_name(ODOMETRY):
-                self._node.get_logger().warning(f"{topic} is left out: it comes from the node now")
+                self._node.get_logger().warning(f"{topic} is left out: the node publishes it now")
                 continue
             kind = self._bag.types[topic]
             if (known := message_type(kind)) is None:
@@ -272,7 +272,7 @@ class BagPlayer:
             STOP.wait(min(left, CLOCK_PERIOD))
         if left >= -HELD_UP:
             return origin, began
-        text = f"{-left:.1f} s behind, as after a stop: goes on from there, at its pace"
+        text = f"{-left:.1f} s behind (process stopped or disk slow): playing continues from there"
         self._node.get_logger().warning(text, throttle_duration_sec=5)
         return log_time, time.monotonic()
 
@@ -318,7 +318,7 @@ def main(arguments: Sequence[str]) -> int:
         if not isinstance(options, Options):  # --help
             return int(options or 0)
         if options.lockstep and options.rate != 1.0:
-            raise UsageError("--lockstep goes as fast as the node: without --rate")
+            raise UsageError("--lockstep plays as fast as the node: it cannot be combined with --rate")
         nodes.append(rclpy.create_node("bag_player"))
         BagPlayer(nodes[0], options).play()
         return 0

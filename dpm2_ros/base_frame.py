@@ -42,7 +42,7 @@ class BaseFrame:
         """Why the frame must not be a child on /tf, in words; empty if it may."""
         if self.above == self._wanted:
             return ""
-        return f"{self._wanted} has a parent in /tf_static, and no frame has two: name {self.above} as ros.base_frame"
+        return f"{self._wanted} has a parent in /tf_static, and can have only one: set ros.base_frame to {self.above}"
 
     @property
     def optional(self) -> bool:
@@ -75,11 +75,11 @@ class BaseFrame:
             self._T_base_lidar = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)
         except UsageError as error:
             if not self.name:
-                self.problem = f"ros.base_frame: {error}; neither dpm2/odom nor /tf before /tf_static has it"
+                self.problem = f"ros.base_frame: {error}; no dpm2/odom and no /tf until /tf_static has it"
             return False
         if name == self.name:
             moved = not np.allclose(self._T_base_lidar, self.T_base_start @ self.T_start_lidar, atol=_SAME)
-            self.problem = f"/tf_static has moved the LiDAR in {name}: ~/reset takes its new place" if moved else ""
+            self.problem = f"/tf_static has moved the LiDAR in {name}: ~/reset applies its new pose" if moved else ""
             return False
         if self.name:
             self.T_base_start = self._T_base_lidar @ se3.inverse(self.T_start_lidar)

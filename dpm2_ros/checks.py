@@ -26,7 +26,7 @@ _SAME = 1e-3  # m, and of a rotation's matrix: two publishers of the same pose m
 def check_header(header: Any) -> None:
     """Raises RejectedError unless stamp and frame are valid."""
     if header.stamp.sec < 0 or header.stamp.nanosec >= 10**9:
-        raise RejectedError("stamp", f"a stamp of {header.stamp.sec} s and {header.stamp.nanosec} ns")
+        raise RejectedError("stamp", f"invalid stamp of {header.stamp.sec} s and {header.stamp.nanosec} ns")
     if header.frame_id:
         check_frame(header.frame_id)
 
@@ -34,7 +34,7 @@ def check_header(header: Any) -> None:
 def check_size(message: Any, points: int = 0) -> None:
     """Raises RejectedError for a message that is larger than that of any sensor."""
     if len(message.data) > _MOST_BYTES or points > MAX_POINTS:
-        raise RejectedError("size", f"{len(message.data)} bytes, {points} points")
+        raise RejectedError("size", f"too large: {len(message.data)} bytes, {points} points")
 
 
 def checked_cloud(message: Any) -> tuple[Any, str]:
@@ -103,8 +103,8 @@ def replaced(before: TransformTree, after: TransformTree) -> str:
         if old is None or new is None or old is new:
             continue
         if old[0] != new[0]:
-            said.append(f"{frame} is below {new[0]}, no longer below {old[0]}")
+            said.append(f"{frame} has the parent {new[0]}, no longer {old[0]}")
         elif not np.allclose(old[1], new[1], atol=_SAME):
             meters, degrees = se3.apart(old[1], new[1])
-            said.append(f"{frame} is {meters:.2f} m and {degrees:.1f} deg from where it was in {old[0]}")
+            said.append(f"{frame} has moved by {meters:.2f} m and {degrees:.1f} deg in {old[0]}")
     return "; ".join(said)

@@ -53,7 +53,7 @@ def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
     if problem := mapper.tf.problem():
         problems.append(problem)
     if missing := list(mapper.missing.values()):
-        problems.append(f"{len(missing)} keyframes could not be taken in: {missing[-1]}")
+        problems.append(f"{len(missing)} keyframes could not be added to the map: {missing[-1]}")
     text = "; ".join([f"{mapper.keyframes} keyframes, {sum(loops)} loops", *problems])
     return status(node, "mapper", WARN if problems else OK, text, figures | {"waiting": mapper.waiting})
 

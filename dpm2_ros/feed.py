@@ -101,7 +101,9 @@ class Feed:
         self._acks = 0
         for stream in list(self._streams.values())[-_ACKS:]:
             if (id := stream.give_up(now)) is not None:
-                self._node.reject(self._pose_topic, "keyframe given up", f"keyframe {id} of {self._robot or '/'}")
+                self._node.reject(
+                    self._pose_topic, "keyframe given up", f"keyframe {id} of {self._robot or '/'} was never valid"
+                )
             self._hand_on(stream, now)
             if now - stream.heard < 2 * SILENT and (stream.robot is not None or stream.holds):
                 self._acknowledge(stream, now)
@@ -176,7 +178,7 @@ class Feed:
                 raise RejectedError("descriptors of other weights", text)
             check_descriptors(descriptors, channels)
         except RejectedError as error:
-            text = f"keyframe {id}: {error}; it is used, described anew by its cloud"
+            text = f"keyframe {id}: {error}; it is used with new descriptors of its cloud"
             self._node.reject(self._seen_topic, error.reason, text)
             return None
         return descriptors
@@ -227,7 +229,7 @@ class Feed:
             return False
         if main is None or not main.live or now - main.heard > SILENT:
             if main is not None:
-                self._node.get_logger().warning(f"robot {name} has started again: a new session of its own")
+                self._node.get_logger().warning(f"robot {name} has restarted: it gets a new session in the map")
                 main.replaced()
                 self._mapper.restart(self._robot)
             stream.robot = self._robot
@@ -235,7 +237,7 @@ class Feed:
         if main.heard < stream.since + BESIDE:
             return False
         if len(self.beside) >= _APART:
-            raise RejectedError("too many robots", f"more than {_APART} robots beside {name} in its namespace")
+            raise RejectedError("too many robots", f"more than {_APART} further robots in the namespace of {name}")
         stream.robot = f"{self._robot}.{stream.session or 'none'}"
         self._node.get_logger().error(f"two robots in namespace {name}: the second one is {stream.robot} in the map")
         return True

@@ -106,7 +106,7 @@ class KeyframeSender:
                 first, before = drive is self._drives[0], drive.file.problem
                 drive.append(parts, time.monotonic() if first else None)
                 if drive.file.problem and not before:
-                    self._log.error(f"{drive.file.path}: {drive.file.problem}; what follows is in memory only")
+                    self._log.error(f"{drive.file.path}: {drive.file.problem}; further keyframes are in memory only")
             if not first:
                 return
         self._publish(parts)
@@ -144,7 +144,7 @@ class KeyframeSender:
             try:
                 return KeyframeFile(path)
             except (sqlite3.Error, OSError) as error:
-                self._log.error(f"{path}: {error}; keyframes that are not delivered end with this process")
+                self._log.error(f"{path}: {error}; undelivered keyframes are lost when this process ends")
                 file = KeyframeFile()
                 file.problem = str(error)
                 return file

@@ -80,7 +80,9 @@ class Lockstep:
                     self._check_alone(takers)
                     return
             if time.monotonic() >= end:
-                raise Dpm2Error(f"lockstep: no node turns {' or '.join(clouds) or 'clouds'} into {topic}")
+                raise Dpm2Error(
+                    f"lockstep: no node subscribes to {' or '.join(clouds) or 'clouds'} and publishes {topic}"
+                )
 
     def _check_alone(self, takers: Mapping[str, set[tuple[str, str]]]) -> None:
         """Raises Dpm2Error unless each node computes its odometry from one of the cloud topics."""

@@ -70,7 +70,7 @@ class MapFolder:
     def hint(self) -> str:
         """The newest map in the folder, in words; empty if there is none."""
         found = sorted(self.folder.glob(f"*{SUFFIX}"), key=_age) if self.folder is not None else []
-        return f"; the youngest in {self.folder} is {found[-1]}" if found else ""
+        return f"; the newest in {self.folder} is {found[-1]}" if found else ""
 
     def _of_robot(self, stem: str) -> str:
         return f"{stem}_{self._robot.replace('/', '_')}" if self._robot else stem

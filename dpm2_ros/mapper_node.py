@@ -33,7 +33,7 @@ class MapperNode(ManagedNode):
     def __init__(self, managed: bool = False) -> None:
         super().__init__("mapper_node")
         if self._config.ros.localization_mode:
-            raise UsageError("ros.localization_mode: is for slam_node")
+            raise UsageError("ros.localization_mode: only slam_node can localize")
         self._own = self.get_namespace().rstrip("/")
         self.start(managed)
 
@@ -75,7 +75,7 @@ class MapperNode(ManagedNode):
             if namespace in self._feeds or not f"{namespace}/".startswith(f"{self._own}/"):
                 continue
             if len(self._feeds) >= _MOST_ROBOTS and not self._make_room():
-                self.reject(ODOM, "too many robots", f"{namespace}: not listened to, {_MOST_ROBOTS} others are")
+                self.reject(ODOM, "too many robots", f"{namespace}: not subscribed, {_MOST_ROBOTS} others are")
                 return
             feed = self._feeds[namespace] = Feed(self, self._map, namespace, self._weights)
             feed.open()
@@ -115,13 +115,13 @@ class MapperNode(ManagedNode):
         beside = [name for feed in self._feeds.values() for name in feed.beside]
         for feed in self._feeds.values():
             for robot, stream in feed.robots.items():
-                figures[robot or "/"] = f"{stream.taken} keyframes, heard {now - stream.heard:.0f} s ago"
+                figures[robot or "/"] = f"{stream.taken} keyframes, last message {now - stream.heard:.0f} s ago"
         text = f"{len(figures)} robots"
         if beside:
-            text += f"; two in one namespace: {', '.join(beside)} kept apart"
+            text += f"; several in one namespace: {', '.join(beside)} kept separate"
         if shared := self._shared_frames():
-            text += f"; one odom_frame of two robots: {', '.join(shared)}; give each its own"
-            problem = f"map -> {shared[0]} jumps between two robots: give each its ros.odom_frame"
+            text += f"; robots share an odom_frame: {', '.join(shared)}; set another for each"
+            problem = f"map -> {shared[0]} jumps between two robots: set another ros.odom_frame for each"
             self.get_logger().error(problem, once=True)
         robots = status(self, "robots", WARN if beside or shared else OK, text, figures)
         return [mapper_status(self, self._map), robots, message_status(self)]

@@ -130,7 +130,7 @@ class MapperThread:
         """Set a prior for the robot's pose (4, 4), as from RViz; returns why it cannot be used, or an empty text."""
         localizer = self.active.localizer
         if localizer is None:
-            return "a map is being made: a pose is of use only with localization_mode"
+            return "a map is being built: a pose is used only in localization_mode"
         self._submit(lambda: localizer.hint(T_map_base))
         return ""
 
@@ -177,7 +177,7 @@ class MapperThread:
         """
         if self.waiting > BEHIND:
             self._node.get_logger().warning(
-                f"{self.waiting} keyframes are still to be taken into the map: this takes a while"
+                f"{self.waiting} keyframes are still to be added to the map: this takes a while"
             )
         self._submit(self.active.finish)
         saved = self._thread.submit(self.active.save) if self.active.saves else None

@@ -60,7 +60,7 @@ class MatchedSubscription:
         self.problem = ""
         kind = self._kind_of({info.topic_type for info in offered})
         if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
-            self.problem = f"{self.topic} is best effort, ros.reliability asks for reliable"
+            self.problem = f"{self.topic} is best effort, but ros.reliability is reliable: set it to auto"
         now, self._suits = self._suits, (requested, durability, kind)
         if self._subscription is not None and self._suits == now:
             return

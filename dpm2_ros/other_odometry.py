@@ -57,7 +57,7 @@ class OtherOdometry:
         self._history, self._changed = TransformHistory(), threading.Condition()
         self._child = ""  # the frame whose pose the topic has
         self.source = node.resolve_topic_name(TF if ros.odom_source == "tf" else ros.odom_topic)
-        self.problem, self.missed, self.found, self.outweighed = f"nothing of use on {self.source} yet", 0, 0, 0
+        self.problem, self.missed, self.found, self.outweighed = f"no usable message on {self.source} yet", 0, 0, 0
         self._in_a_row = 0  # consecutive clouds without it
         self._unmet: tuple[int, str, float] | None = None  # the last of these: stamp, base, end of the longest wait
         self._comparison: Comparison | None = None
@@ -108,7 +108,7 @@ class OtherOdometry:
             return ""
         self.outweighed += 1
         meters, degrees = se3.apart(comparison.T_other, comparison.T_scans)
-        text = f"outweighed: {meters:.2f} m, {degrees:.1f} deg from what the scans show"
+        text = f"outweighed: {meters:.2f} m, {degrees:.1f} deg from the motion of the scans"
         self._struck = time.monotonic(), text
         return text
 
@@ -127,11 +127,11 @@ class OtherOdometry:
         if self._struck is not None and (ago := time.monotonic() - self._struck[0]) < _RECENT:
             said.append(f"{self._struck[1]}, {ago:.0f} s ago")
         if self._comparison is not None and self._comparison.doubt > _DOUBTFUL:
-            said.append(f"{self._comparison.doubt:.1f} times as far off as assumed")
+            said.append(f"its error is {self._comparison.doubt:.1f} times the assumed one")
         if self._comparison is not None and self._comparison.unsure:
-            said.append("left out: by its own covariance it knows less than the motion before")
+            said.append("left out: its own covariance is larger than that of the predicted motion")
         if abs(self.slip) > _SLIPS:
-            said.append(f"its ways are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
+            said.append(f"its distances are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
         return "; ".join(said)
 
     def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:

@@ -21,4 +21,6 @@ def share_directory() -> Path:
     for folder in candidates:
         if (folder / "config" / "fastdds.xml").is_file():
             return folder
-    raise Dpm2Error(f"config/fastdds.xml is neither beside nor under {Path(sys.prefix) / 'share' / 'dpm2_ros'}")
+    raise Dpm2Error(
+        f"config/fastdds.xml is neither in the source tree nor in {Path(sys.prefix) / 'share' / 'dpm2_ros'}"
+    )

@@ -156,7 +156,7 @@ class Diagnostics:
         if clock:
             log.warning(clock, once=True)
         found = (
-            (OK, f"the way across {last.breaks} pause(s) or lift(s) is not known" if last.breaks else ""),
+            (OK, f"the motion across {last.breaks} pause(s) or lift(s) is not known" if last.breaks else ""),
             (ERROR, self._base.problem),
             (WARN, self.tf_problem),
             (WARN, self.tf.problem() if self.tf is not None else ""),
@@ -181,7 +181,7 @@ class Diagnostics:
             return ""
         if not self._node.get_parameter("use_sim_time").value:
             text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
-            return f"{text}: a sensor's clock has to be set, a recording wants use_sim_time and /clock"
+            return f"{text}: set the sensor's clock, or for a recording use_sim_time and /clock"
         return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
 
     def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
@@ -190,7 +190,7 @@ class Diagnostics:
             return self._status("localisation", WARN, f"{State.RELOCALIZING}: no keyframe yet", figures)
         result, last, state = located.registration, self._health.last, located.state
         if last is not None and last.state is State.LOST and state is not State.LOST:
-            return self._status("localisation", ERROR, f"{State.LOST}: the odometry is", figures)
+            return self._status("localisation", ERROR, f"{State.LOST}: the odometry is lost", figures)
         text = str(state)
         if result.ok:
             figures |= {"confidence": f"{result.confidence:.2f}", "worst sigma (m)": f"{result.worst_sigma:.3f}"}
@@ -210,7 +210,7 @@ class Diagnostics:
             "outweighed": other.outweighed,
         }
         if not np.isnan(other.slip):
-            figures |= {"its ways too long by (%)": f"{100 * other.slip:.1f}"}
+            figures |= {"its distances too long by (%)": f"{100 * other.slip:.1f}"}
         return self._status("other odometry", WARN if verdict else OK, text, figures)
 
     def _imu(self) -> DiagnosticStatus | None:
@@ -220,7 +220,7 @@ class Diagnostics:
         if not problem and not inputs.imu_received:
             if inputs.imu is None or not self._node.get_parameter("input.imu_topic").value:
                 return None
-            problem = f"nothing of use on {topic} yet"
+            problem = f"no usable message on {topic} yet"
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)

@@ -60,7 +60,7 @@ class SlamNode(ManagedNode):
         if ros.localization_mode and not ros.embed_mapper:
             raise UsageError("ros.localization_mode: needs ros.embed_mapper")
         if self._beside and ros.invert_odom_tf and not ros.embed_mapper:
-            raise UsageError("ros.invert_odom_tf: needs ros.embed_mapper where ros.odom_source is another's")
+            raise UsageError("ros.invert_odom_tf: needs ros.embed_mapper if ros.odom_source is not own")
         self.start(managed)
 
     def configure(self, back: ExitStack) -> None:
@@ -172,9 +172,7 @@ class SlamNode(ManagedNode):
         """Begin another drive in the same map, if one has begun already."""
         if self._before is None and not self._held:
             return
-        self.get_logger().warning(
-            f"{why}: the odometry starts again, its place in the map is unknown before a loop is found"
-        )
+        self.get_logger().warning(f"{why}: the odometry restarts, its pose in the map is unknown until a loop is found")
         self._end_drive(lambda mapper: mapper.restart(self._robot))
 
     def _process(self, bundle: Bundle) -> None:
@@ -242,7 +240,7 @@ class SlamNode(ManagedNode):
         before = base.name
         if base.look(known.transforms, lidar_frame) and before:
             self.get_logger().warning(
-                f"/tf_static has put {base.name} above {before}: the pose is that of {base.name} from now on, in the "
+                f"/tf_static now has {base.name} above {before}: from now on its pose is published, in the "
                 f"same odom; set ros.base_frame to wait for it"
             )
         if base.problem:

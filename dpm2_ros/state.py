@@ -34,7 +34,7 @@ class StatePublisher:
         self._last = time.monotonic()
         reason = excerpt(tracked.registration.reason)
         if tracked.breaks > self._breaks:
-            self._log.warning(f"the odometry broke, how far it has come meanwhile is not known: {reason}")
+            self._log.warning(f"the odometry broke, its motion meanwhile is not known: {reason}")
         elif tracked.state is State.LOST and self._said != str(State.LOST):
             self._log.warning(f"lost: {reason}", throttle_duration_sec=_QUIET)
         self._breaks = tracked.breaks

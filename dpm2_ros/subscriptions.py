@@ -273,7 +273,7 @@ class Inputs:
         before = self.calibration.transforms
         tree, problem = extended(before, message)
         if changed := replaced(before, tree):
-            text = f"{self._static_topic}: {excerpt(changed)}; of two publishers that disagree the last one counts"
+            text = f"{self._static_topic}: {excerpt(changed)}; if two publishers disagree, the last message is used"
             self._node.get_logger().warning(text, throttle_duration_sec=5)
         self.calibration.transforms = tree  # a new tree: the worker may be reading the old one
         if problem:

@@ -35,7 +35,7 @@ class StampCheck(StrEnum):
     """Rejected: it has the stamp of the previous cloud."""
     OUT_OF_ORDER = "out of order"
     """Rejected: a later cloud has been accepted already. Unless more follow, see `SET_BACK`."""
-    SET_BACK = "its clock was set back by less than a second; the drive goes on"
+    SET_BACK = "its clock was set back by less than a second; the drive continues"
     """Accepted, together with the out-of-order clouds right before it; counted as accepted."""
     JUMPED = "the stamp jumps; the next one shows whether it is right"
     """Neither accepted nor rejected yet; counted once that is decided."""

@@ -22,7 +22,7 @@ _KNOWN = 500  # sent transforms kept per child: all that may be received again b
 _RECENT = 5.0  # s
 _Link = tuple[str, int, float, float, float]
 """Parent, stamp (ns) and translation of a transform: two nodes that use the same clouds have the same stamps."""
-_REMEDY = "see ros.odom_source, or leave it to one of the two by ros.publish_tf_odom or ros.publish_tf_map"
+_REMEDY = "see ros.odom_source, or turn one of the two off, as with ros.publish_tf_odom or ros.publish_tf_map"
 
 
 class TransformBroadcaster:
@@ -75,7 +75,7 @@ class TransformBroadcaster:
         for stamped in message.transforms:
             sent = self._sent.get(child := frame_name(stamped.child_frame_id))
             if sent is not None and (link := _link(stamped)) not in sent:
-                text = f"another node has {excerpt(link[0])} -> {child} on /tf, too: what is in that frame jumps"
+                text = f"another node also publishes {excerpt(link[0])} -> {child} on /tf: poses in that frame jump"
                 self._other = time.monotonic(), f"{text}; {_REMEDY}"
 
 

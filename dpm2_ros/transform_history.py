@@ -95,7 +95,7 @@ class TransformHistory:
         """
         track = self._tracks.get(child)
         if track is None and len(self._tracks) >= _MOST_FRAMES:
-            raise RejectedError("frame", f"{_MOST_FRAMES} frames move already")
+            raise RejectedError("frame", f"more than {_MOST_FRAMES} moving frames")
         if track is None or track.parent != parent:
             track = self._tracks[child] = _Track(parent)
         track.add(stamp, pose, covariance)

@@ -90,7 +90,7 @@ def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
         drive(tmp_path, map_file=file)
     assert caplog.text == ""
     active = ActiveMap(config(map_directory=str(tmp_path), map_file=str(town)), "", LOG)
-    assert f"{town} is there already and stays as it is: {tmp_path / 'town-2.dpm2map'} begins" in caplog.text
+    assert f"{town} exists already and is not changed: {tmp_path / 'town-2.dpm2map'} is a new map" in caplog.text
     caplog.clear()
     active.add(keyframes(1)[0])
     active.reset()
@@ -107,7 +107,7 @@ def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
     drive(tmp_path)
     assert check_map(tmp_path / "drive-2.dpm2map").keyframes == 3
     drive(tmp_path, map_file=str(tmp_path / "drive.dpm2map"))
-    assert f"{log} is there already and stays as it is" in caplog.text
+    assert f"{log} exists already and is not changed" in caplog.text
     assert log.read_bytes() == b"log"
 
 
@@ -384,7 +384,7 @@ def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in [*keyframes(3), *keyframes(2)]:
         active.add(keyframe)
-    assert active.save().endswith("; map.ply and trajectory.tum without 2 that no loop ties to the first")
+    assert active.save().endswith("; map.ply and trajectory.tum lack 2 that no loop connects to the first")
     active.close()
     result = check_map(tmp_path / "drive.dpm2map")
     assert (result.problems, result.keyframes) == ([], 5)
@@ -399,7 +399,7 @@ def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.Ca
         assert ended.value.code == 0
     assert "3 keyframes, sound" in capsys.readouterr().out
     assert (tmp_path / "grid.pgm").is_file()
-    with pytest.raises(UsageError, match=r"ros.map_file does not name one; the youngest in .* is .*drive\.dpm2map"):
+    with pytest.raises(UsageError, match=r"ros.map_file does not name one; the newest in .* is .*drive\.dpm2map"):
         ActiveMap(config(map_directory=str(tmp_path), localization_mode=True), "", LOG)
 
 

@@ -61,7 +61,7 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
 @pytest.mark.parametrize("wanted", ["base", ""])
 def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted: str) -> None:
     """As by a calibration that is corrected while the node runs: one drive has one place, and what is wrong is said."""
-    base, moved = BaseFrame(wanted, ("odom",)), "/tf_static has moved the LiDAR in base: ~/reset takes its new place"
+    base, moved = BaseFrame(wanted, ("odom",)), "/tf_static has moved the LiDAR in base: ~/reset applies its new pose"
     for x in (1.0, 1.8):
         tree = TransformTree()
         tree.set("base", "lidar", se3.make(np.eye(3), [x, 0, 0]))
@@ -97,7 +97,7 @@ def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
     assert not late.look(whole, "lidar")
     for base in (early, late):
         assert (base.name, base.problem) == ("base", "")
-        assert base.child_problem.endswith("name footprint as ros.base_frame")
+        assert base.child_problem.endswith("set ros.base_frame to footprint")
 
 
 def test_a_frame_that_this_node_moves_is_no_base() -> None:

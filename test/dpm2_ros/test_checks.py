@@ -45,8 +45,8 @@ def test_one_unsound_transform_does_not_cost_the_others(bad: dict[str, object]) 
     ("later", "said"),
     [
         (transform("base", "lidar", x=1.0004), ""),  # as another writes it
-        (transform("base", "lidar", x=1.3), "lidar is 0.30 m and 0.0 deg from where it was in base"),
-        (transform("mast", "lidar"), "lidar is below mast, no longer below base"),
+        (transform("base", "lidar", x=1.3), "lidar has moved by 0.30 m and 0.0 deg in base"),
+        (transform("mast", "lidar"), "lidar has the parent mast, no longer base"),
         (transform("base", "camera", x=1.3), ""),  # a new one
     ],
     ids=["same", "moved", "another parent", "new"],

@@ -47,7 +47,7 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
         send_all(mapper, 2, session=OTHER)
         time.sleep(0.1)
         heard = [status for m in diagnostics for status in m.status]
-        return any(f"two in one namespace: .{OTHER} kept apart" in status.message for status in heard)
+        return any(f"several in one namespace: .{OTHER} kept separate" in status.message for status in heard)
 
     mapper.wait(reported, "the diagnostics")
 

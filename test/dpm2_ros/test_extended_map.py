@@ -51,7 +51,7 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     found.add(street(9))
     assert found.located is not None
     assert found.located.registration.ok
-    assert "grows by a new session" in found.extend()
+    assert "is extended by a new session" in found.extend()
     found.add(street(12))
     T_map_odom = found.T_map_odom("")
     assert T_map_odom is not None

@@ -154,7 +154,7 @@ def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
     found = mapper_status(robot.node, robot.node.mapper)
     assert (found.level, found.message) == (
         DiagnosticStatus.WARN,
-        f"{COUNT - 1} keyframes, 0 loops; 1 keyframes could not be taken in: {error}",
+        f"{COUNT - 1} keyframes, 0 loops; 1 keyframes could not be added to the map: {error}",
     )
     assert robot.acknowledged(DRIVE) == (1, COUNT - 1)
     robot.harness.wait(lambda: robot.stored == COUNT - 1, "the others in the file")

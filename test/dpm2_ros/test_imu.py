@@ -136,7 +136,7 @@ def test_one_that_is_named_and_never_comes_is_said(robot: Callable[..., Robot]) 
     """As where its topic is misspelled; one that is not named need not be there."""
     r = robot("input.imu_topic:=/imu/dta", topic="/imu/data")
     r.stand(0, 1)
-    said = r.status("imu", saying("nothing of use on /imu/dta yet; going on without"))
+    said = r.status("imu", saying("no usable message on /imu/dta yet; going on without"))
     assert said.level == DiagnosticStatus.WARN
 
 

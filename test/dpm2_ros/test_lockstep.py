@@ -273,4 +273,4 @@ def test_a_node_that_goes_away_ends_it(ros: Callable[..., Any], bag: Path) -> No
 def test_without_a_node_it_ends(run: Callable[..., Any], bag: Path) -> None:
     ended = run("bag_player", str(bag), "--lockstep", "--wait", "0.5")
     assert ended.returncode == 1
-    assert f"error: lockstep: no node turns {naming.POINTS} into /dpm2/odom" in ended.stderr
+    assert f"error: lockstep: no node subscribes to {naming.POINTS} and publishes /dpm2/odom" in ended.stderr

@@ -165,7 +165,7 @@ def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) ->
         its.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name(robot, 0)))
 
     def said() -> bool:
-        return any("one odom_frame of two robots: odom" in s.message for m in told for s in m.status)
+        return any("robots share an odom_frame: odom" in s.message for m in told for s in m.status)
 
     mapper.wait(said, "the report")
 

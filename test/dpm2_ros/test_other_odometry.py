@@ -109,7 +109,7 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
     assert said.level == DiagnosticStatus.WARN
     assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
     values = figures(r.status("other odometry", having(**{"clouds with it": drive.frames, "without": 0})))
-    assert float(values["its ways too long by (%)"]) == pytest.approx(100 * SLIP, abs=0.3)
+    assert float(values["its distances too long by (%)"]) == pytest.approx(100 * SLIP, abs=0.3)
     assert (values["clouds with it"], values["outweighed"]) == (str(drive.frames), "1")
 
 
@@ -206,15 +206,15 @@ def test_a_topic_without_odometry_of_use_is_named(
     r.topic.publish(edge_to_msg(np.eye(4), np.eye(6), drive.stamp(0), frame, child))
     r.wait(lambda: list(r.node.rejections.values()) == [1], "the rejection")
     r.go(0, wheels=False)
-    assert r.status("other odometry", having(without=1)).message == "nothing of use on /odom yet; going on without"
+    assert r.status("other odometry", having(without=1)).message == "no usable message on /odom yet; going on without"
 
 
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
-    """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from what the scans show" was said of what is right."""
+    """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from the motion of the scans" was said of what is right."""
     r = robot("topic")
     r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
     r.go(*range(5))
-    said = r.status("other odometry", saying("left out: by its own covariance"))
+    said = r.status("other odometry", saying("left out: its own covariance"))
     assert "outweighed" not in said.message
     assert having(outweighed=0)(said)
 

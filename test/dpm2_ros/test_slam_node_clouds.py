@@ -172,7 +172,7 @@ def test_another_lidar_on_the_topic_begins_another_drive(
         r.wait(lambda n=n: len(r.odom) > n, f"the odometry of cloud {n}")
     assert {message.child_frame_id for message in r.odom} == {"base_link"}
     assert r.off(lambda n: se3.inverse(drive.pose(0 if n < 4 else 4)) @ drive.pose(n)) < ACCURATE
-    assert "clouds come in frame rear, no longer in lidar: the odometry starts again" in capfd.readouterr().err
+    assert "clouds come in frame rear, no longer in lidar: the odometry restarts" in capfd.readouterr().err
 
 
 def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> None:
@@ -223,7 +223,7 @@ def test_a_clock_that_is_set_back_by_less_than_a_second_costs_nothing(
     r.wait(lambda: len(r.odom) == drive.frames, "the odometry of each cloud")
     assert r.stamps()[half:] == [drive.stamp(n) - back for n in range(half, drive.frames)]
     assert r.off(drive.pose) < ACCURATE
-    assert "set back by less than a second; the drive goes on" in capfd.readouterr().err
+    assert "set back by less than a second; the drive continues" in capfd.readouterr().err
 
 
 def test_one_cloud_stamped_far_ahead_costs_that_cloud_alone(
@@ -263,7 +263,7 @@ def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: 
     status = harness.status("slam_node: odometry", saying("is best effort"))
     assert (status.level, status.message) == (
         DiagnosticStatus.ERROR,
-        "/points is best effort, ros.reliability asks for reliable",
+        "/points is best effort, but ros.reliability is reliable: set it to auto",
     )
 
 
@@ -277,7 +277,7 @@ def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: C
         harness.publisher(kind, topic, reliable=False)
     harness.add(SlamNode())
     for part, (_, topic) in sensors.items():
-        says = f"{topic} is best effort, ros.reliability asks for reliable"
+        says = f"{topic} is best effort, but ros.reliability is reliable: set it to auto"
         assert harness.status(f"slam_node: {part}", saying(says)).level != DiagnosticStatus.OK
 
 

@@ -43,7 +43,7 @@ def test_two_publishers_that_place_the_lidar_otherwise_are_told(rig: Callable[..
     r.wait(lambda: r.harness.found_by(r.node, "/rosout"), "the subscription to the log")
     publish_static(r, "base_link", "lidar", se3.exp([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
     publish_static(r, "base_link", "lidar", se3.exp([0.0, 0.0, 0.2, 1.3, 0.0, 0.0]))
-    said = "/tf_static: lidar is 0.32 m and 11.5 deg from where it was in base_link"
+    said = "/tf_static: lidar has moved by 0.32 m and 11.5 deg in base_link"
     r.wait(lambda: any(line.msg.startswith(said) for line in log), "the warning")
 
 
@@ -201,7 +201,7 @@ def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
     assert status.level == DiagnosticStatus.WARN
     stamp, _, message = status.message.partition(" s (2023-11-14 22:13:20 UTC), the clock of this machine says")
     assert stamp.startswith("tracking; clouds are stamped 1700000000.")
-    assert message.endswith("a recording wants use_sim_time and /clock")
+    assert message.endswith("for a recording use_sim_time and /clock")
     values = figures(status)
     assert stamp.endswith(values["cloud stamp (s)"])
     assert abs(float(values["clock (s)"]) - time.time()) < 60

@@ -40,5 +40,5 @@ def test_lost_and_broken_are_logged_once_with_the_reason(ros: Callable[..., Any]
     harness.wait(lambda: states and states[-1].data == "tracking" and len(log) >= 2, "the log")
     assert [message.msg for message in log if message.level >= LoggingSeverity.WARN] == [
         "lost: few points fit",
-        "the odometry broke, how far it has come meanwhile is not known: broken by a pause",
+        "the odometry broke, its motion meanwhile is not known: broken by a pause",
     ]

@@ -34,7 +34,7 @@ def test_another_node_that_places_the_same_frame_is_named(
     r.mapped(1)
     for stamp in (r.drive.stamp(0), r.drive.stamp(1)):
         other.publish(TFMessage(transforms=[transform_to_msg(se3.exp([0, 0, 0, 0.5, 0, 0]), stamp, parent, child)]))
-    said = r.status(part, saying(f"another node has {parent} -> {child} on /tf"))
+    said = r.status(part, saying(f"another node also publishes {parent} -> {child} on /tf"))
     assert said.level == DiagnosticStatus.WARN
 
 
