@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small drives through the synthetic city, with exact truth."""
+"""Short drives through the synthetic city, with exact ground truth."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Filters: what they leave is what everything else sees; without the right weights the SLAM does not start."""
+"""Filters of the scan: the rest of the SLAM uses only the remaining points. With wrong weights the SLAM does not
+start."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def points() -> np.ndarray:
 
 
 class _High:
-    """As a `DynamicObjectNet`: what is higher than this moves, the likelier the higher, from `base` at 0 m."""
+    """Stand-in for a `DynamicObjectNet`. Points above `height` are dynamic; the probability is `base` at 0 m and grows
+    with height."""
 
     def __init__(self, height: float, base: float) -> None:
         self.height, self.base = height, base
@@ -57,16 +59,17 @@ def test_dynamic_objects_are_left_out_but_never_more_than_the_limit(points: np.n
     net = _High(-1.0, DYNAMIC + 0.05)
     left = without_dynamic_objects(net, points)  # type: ignore[arg-type]
     np.testing.assert_array_equal(left, ~(net.probability(points) > DYNAMIC))
-    assert (left & (points[:, 2] > -1)).any()  # less likely than that
+    assert (left & (points[:, 2] > -1)).any()  # points with a lower probability
     some = points[without_dynamic_objects(_High(-9.0, 0.6), points)]  # type: ignore[arg-type]
-    assert 0.3 * len(points) <= len(some) < len(points)  # all are likely enough
-    assert some[:, 2].max() < points[:, 2].max()  # the most likely went first
+    assert 0.3 * len(points) <= len(some) < len(points)  # all points are likely dynamic
+    assert some[:, 2].max() < points[:, 2].max()  # the most likely ones are removed first
     assert len(without_dynamic_objects(_High(0.0, 0.6), points[:0])) == 0  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.5), (-0.4, 0.0), (0.0, 0.0)], ids=["pitch", "roll", "level"])
 def test_a_tilted_sensor_is_filtered_in_level_axes(points: np.ndarray, angles: tuple[float, float]) -> None:
-    """By the ground that it shows: the same points as of a level one; of one that is level the scan as it is."""
+    """The ground in the scan shows the tilt: the filter removes the same points as for a level sensor. The scan of a
+    level sensor is passed on unchanged."""
     seen: list[np.ndarray] = []
 
     def above(scan: np.ndarray) -> np.ndarray:
@@ -83,7 +86,8 @@ def test_a_tilted_sensor_is_filtered_in_level_axes(points: np.ndarray, angles: t
 @pytest.mark.weights
 @pytest.mark.parametrize("kind", ["movers", "ground"])
 def test_what_is_left_out_does_not_depend_on_the_mount(recording: Path, kind: FilterKind) -> None:
-    """Of a street, 20 degrees down: of all that is left out by either 97 % are; in the axes of the LiDAR 2 and 7 %."""
+    """A street, seen with the sensor tilted 20 degrees down. Of all points that are removed from either scan, 97 % are
+    removed from both. Filtered in the axes of the LiDAR, it is 2 and 7 %."""
     scan = next(iter(open_source(recording).frames())).points
     leaves = make_filter(FilterSettings(kind=kind), 1)
     assert leaves is not None
@@ -94,7 +98,7 @@ def test_what_is_left_out_does_not_depend_on_the_mount(recording: Path, kind: Fi
 
 @pytest.mark.slow
 def test_ground_is_left_out(points: np.ndarray) -> None:
-    """A network that says zero everywhere: the ground is where the sensor's height puts it."""
+    """With a network whose output is zero everywhere, the ground lies where the sensor's height puts it."""
     net = GroundNet(GroundSettings(cells=32, channels=4)).eval()
     with torch.no_grad():
         for parameter in net.head.parameters():
@@ -103,7 +107,8 @@ def test_ground_is_left_out(points: np.ndarray) -> None:
 
 
 def test_what_stands_in_front_of_the_static_scan_is_left_out(points: np.ndarray) -> None:
-    """A translation that is 12 m away everywhere: what is in the image and nearer than 0.8 of that and 1 m goes."""
+    """The network returns a static scan that is 12 m away everywhere. It removes points in the image that are nearer
+    than 0.8 of this distance, less 1 m."""
     net = Dslr(DslrSettings()).eval()
     net.forward = lambda images: torch.full_like(images, 12 / 120)  # type: ignore[method-assign]
     gone = points[~without_traffic(net, points)]
@@ -113,16 +118,16 @@ def test_what_stands_in_front_of_the_static_scan_is_left_out(points: np.ndarray)
 
 
 def test_cloud_source_and_measured_are_what_the_filter_leaves(points: np.ndarray) -> None:
-    settings, times = PreprocessSettings(scatter=1), points[:, 0].copy()  # points at random are as dust
+    settings, times = PreprocessSettings(scatter=1), points[:, 0].copy()  # random points look like dust
     scan = Preprocessor(settings, lambda scan: scan[:, 2] > -1.5).prepare(Frame(0, points, times), np.zeros(6))
     assert len(scan.points) > 900
     assert min(scan.points[:, 2].min(), scan.cloud[:, 2].min(), scan.source[:, 2].min()) > -1.5
-    np.testing.assert_allclose(scan.times, scan.source[:, 0], atol=1e-6)  # each has its own
+    np.testing.assert_allclose(scan.times, scan.source[:, 0], atol=1e-6)  # each point has its own time
     np.testing.assert_allclose(scan.seen, scan.source, atol=1e-5)  # at rest
 
 
 def test_weights_in_the_home_folder_are_found_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As those of the descriptors are: no shell looks at settings."""
+    """As for the weights of the descriptors: no shell expands `~` in the settings."""
     task = DynamicObjectTask(DynamicObjectTraining(network=DynamicObjectNetSettings(cells=32, cell=1.0, channels=4)))
     save_task(task, tmp_path / "mine.safetensors", {})
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After a pause of the sensor the odometry is right, or says that it does not know; it is never silently wrong."""
+"""After a pause of the sensor, the odometry is right or reports that it is uncertain. It is never silently wrong."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from dpm2_core.slam.settings import SlamSettings
 from ...helpers.drives import off, track
 
 run = partial(track, threads=1)
-Pose = Callable[[float], Array]  # seconds to T_world_lidar (4, 4)
+Pose = Callable[[float], Array]  # time, s -> T_world_lidar (4, 4)
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +35,15 @@ def world() -> World:
 
 
 def scanned(world: World, pose: Pose, seconds: Sequence[float], beams: int = 64) -> tuple[list[Frame], Array]:
-    """The scans that a drive takes at those times, and its (N, 4, 4) true poses."""
+    """Scans of a drive at these times, and its true poses (N, 4, 4)."""
     poses = np.array([pose(s) for s in seconds])
     scans = [seen(world, T.tobytes(), s, beams) for T, s in zip(poses, seconds, strict=True)]
     return [Frame(round(s * 1e9), points) for s, points in zip(seconds, scans, strict=True)], poses
 
 
-@lru_cache(128)  # most drives begin alike
+@lru_cache(128)  # most drives begin with the same scans
 def seen(world: World, pose: bytes, second: float, beams: int) -> Points:
-    """The points of a scan from a (4, 4) pose. Not to be written to."""
+    """Points of a scan from a (4, 4) pose. They are cached: do not write to them."""
     T = np.frombuffer(pose).reshape(4, 4)
     lidar = Lidar(LidarConfig(columns=1024, beams=beams))
     return lidar.scan(world, T, second, np.random.default_rng(round(1e3 * second))).points
@@ -55,7 +55,7 @@ def with_gap(before: int, gap: float, after: int) -> list[float]:
 
 
 def along(world: World, turn: float = 0.0) -> Pose:
-    """Along the street at its own speed, or from a point of it at 6 m/s in a curve, deg/s."""
+    """Trajectory along the street at its own speed; with `turn`, deg/s, a curve at 6 m/s from a point of the street."""
     if not turn:
         return lambda s: world.drive_pose(2.0 + s)
     return lambda s: world.drive_pose(2.0) @ se3.exp(s * np.array([0, 0, np.radians(turn), 6.0, 0, 0]))
@@ -66,16 +66,16 @@ def along(world: World, turn: float = 0.0) -> Pose:
 def test_a_gap_across_which_the_views_overlap_is_bridged(world: World, gap: float, turn: float) -> None:
     frames, poses = scanned(world, along(world, turn), with_gap(10, gap, 6))
     tracked = run(frames)
-    # one scan could fit at many places: it is accepted when three scans agree
+    # One scan could fit in many positions: it is accepted when three scans agree.
     assert [t.state for t in tracked[10:12]] == [State.DEGRADED] * 2
     assert not any(t.registration.ok or t.keyframe for t in tracked[10:12])
     assert [t.state for t in tracked[13:]] == [State.TRACKING] * 3
-    assert off(tracked, poses)[-3:].max() < 0.1  # as for a drive without a gap, twice: the counterparts are fewer
+    assert off(tracked, poses)[-3:].max() < 0.1  # twice the bound without a gap: there are fewer correspondences
     assert tracked[-1].breaks == 0
 
 
 def round_a_corner(world: World) -> Pose:
-    """8 m/s straight on for a second, in a curve of 80 degrees for four, and straight on."""
+    """8 m/s: straight ahead for 1 s, a curve of 80 degrees in 4 s, and straight ahead again."""
     ahead, curve = np.array([0, 0, 0, 8.0, 0, 0]), np.array([0, 0, np.radians(20.0), 8.0, 0, 0])
 
     def pose(s: float) -> Array:
@@ -86,7 +86,7 @@ def round_a_corner(world: World) -> Pose:
 
 
 def with_imu(frames: Sequence[Frame], pose: Pose) -> list[Frame]:
-    """An IMU goes on measuring in a gap: each frame has the samples since the one before."""
+    """Frames with IMU samples: each frame has the samples since the previous one, also across a gap."""
     imu = Imu(ImuConfig(), np.random.default_rng(3))
     times = imu.times(-0.5, frames[-1].stamp * 1e-9 + 0.05)
     measured = imu.measure(times, lambda at: np.array([pose(s) for s in at]))
@@ -100,8 +100,9 @@ def with_imu(frames: Sequence[Frame], pose: Pose) -> list[Frame]:
 
 @pytest.mark.slow
 def test_an_imu_knows_the_turn_across_a_gap(world: World) -> None:
-    """34 m on, nothing of the map is seen any more: the way is that of the motion before. Without the samples of the
-    gap, which were dropped but for its last second, it goes straight on."""
+    """After 34 m nothing of the map is visible any more, so the distance is extrapolated from the motion before the
+    gap. Without the samples of the gap (previously dropped except for its last second), the prediction goes straight
+    ahead."""
     pose = round_a_corner(world)
     frames, poses = scanned(world, pose, with_gap(10, 4.2, 4))
     plain, inertial = run(frames), run(with_imu(frames, pose))
@@ -114,7 +115,7 @@ def test_an_imu_knows_the_turn_across_a_gap(world: World) -> None:
 
 @pytest.mark.slow
 def test_an_imu_knows_the_way_of_a_robot_that_sets_off_in_a_gap(world: World) -> None:
-    """At rest for a second, then 21 m on at 2.5 m/s2: nothing but the forces shows that it has moved at all."""
+    """At rest for 1 s, then 21 m at 2.5 m/s2: only the accelerometer shows that the robot has moved at all."""
 
     def pose(s: float) -> Array:
         return world.drive_pose(2.0) @ se3.exp([0, 0, 0, 1.25 * max(s - 1.0, 0.0) ** 2, 0, 0])
@@ -140,7 +141,8 @@ def test_a_gap_at_a_halt_does_no_harm(world: World) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [1.5, 4.0])
 def test_a_clock_that_is_set_is_no_way(world: World, step: float) -> None:
-    """Scans every 0.1 s whose stamps say that there was a pause: the vehicle was 14 to 40 m away, a break later."""
+    """Scans every 0.1 s whose stamps indicate a pause. Previously, the vehicle was placed 14 to 40 m away, with a
+    break."""
     seconds = [0.1 * i for i in range(24)]
     frames, poses = scanned(world, along(world), seconds)
     late = [replace(frame, stamp=frame.stamp + round(step * 1e9)) for frame in frames[10:]]
@@ -152,8 +154,9 @@ def test_a_clock_that_is_set_is_no_way(world: World, step: float) -> None:
 
 @pytest.mark.slow
 def test_a_halt_after_a_gap_stays_where_it_is_until_it_moves_on(world: World) -> None:
-    """8 m/s, 2 s without a scan, a halt that its scans agree on without confirming it: no break, which moved it 7 m."""
-    halt, again = 2.4, 0.2 * np.arange(1, 16) ** 2 / 100  # s along the drive: braked, and accelerated
+    """8 m/s, 2 s without a scan, then a halt: its scans agree but do not confirm the bridge. There is no break.
+    Previously, a break moved the pose by 7 m."""
+    halt, again = 2.4, 0.2 * np.arange(1, 16) ** 2 / 100  # s along the drive: braking, then accelerating
     at = [*(0.1 * i for i in range(15)), *[halt] * 16, *(halt + again)]
     scans, poses = scanned(world, along(world), at, beams=16)
     rng, frames = np.random.default_rng(0), []
@@ -170,7 +173,7 @@ def test_a_halt_after_a_gap_stays_where_it_is_until_it_moves_on(world: World) ->
 
 @pytest.mark.slow
 def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_the_error(world: World) -> None:
-    """Ten seconds: braked to a halt meanwhile, in a part of the street that is not in the map."""
+    """A gap of 10 s. The vehicle brakes to a halt meanwhile, in a part of the street that is not in the map."""
 
     def pose(s: float) -> Array:
         return world.drive_pose(2.0 + s) if s < 2 else world.drive_pose(24.0 + 0.2 * s)
@@ -188,12 +191,12 @@ def test_what_cannot_be_confirmed_is_lost_then_a_break_whose_uncertainty_covers_
     error = se3.way(se3.inverse(poses[0]) @ poses[tracked.index(first)], first.T_odom_lidar)
     assert np.linalg.norm(error[3:]) > 20.0
     for t in tracked[8 : tracked.index(first) + 1]:
-        assert error[3:] @ np.linalg.solve(t.covariance[3:, 3:], error[3:]) < 14.2  # 3 sigma of 3 degrees of freedom
-    # the next edge of the pose graph is as soft, so that a loop can move what comes after
+        assert error[3:] @ np.linalg.solve(t.covariance[3:, 3:], error[3:]) < 14.2  # 3 sigma with 3 degrees of freedom
+    # The next edge of the pose graph is as uncertain, so that a loop can move all later poses.
     edge = next(t.keyframe.edge for t in tracked[8:] if t.keyframe)
     assert edge is not None
     assert edge.worst_sigma > np.linalg.norm(error[3:]) / 3
-    # and within the new stretch the motion is right
+    # After the break, the relative motion is right.
     T = se3.inverse(tracked[-5].T_odom_lidar) @ tracked[-1].T_odom_lidar
     T_true = se3.inverse(poses[-5]) @ poses[-1]
     assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.05
@@ -218,17 +221,19 @@ def test_a_stream_of_a_frame_a_second_is_no_gap(world: World) -> None:
 
 @pytest.mark.slow
 def test_two_frames_at_a_time_are_no_gaps(world: World) -> None:
-    """Every eighth frame and the one after it: each gap was a pause, and no bridge closed before the next began."""
+    """Every eighth frame and the one after it. Previously, each gap counted as a pause, and no pause was bridged before
+    the next began."""
     frames, poses = scanned(world, along(world), [0.8 * i + 0.1 * j for i in range(7) for j in range(2)])
     tracked = run(frames)
-    assert [t.state for t in tracked[6:]] == [State.TRACKING] * 8  # before that the rhythm is not known
+    assert [t.state for t in tracked[6:]] == [State.TRACKING] * 8  # before that the frame rate is not known
     assert off(tracked, poses)[6:].max() < 0.1
     assert tracked[-1].breaks == 0
 
 
 @pytest.mark.slow
 def test_a_pause_after_which_the_frames_of_it_come_in_a_burst_is_none(world: World) -> None:
-    """A driver stalls for 1.5 s, then gives its frames, stamped on arrival: it was `tracking` in a place 4 m off."""
+    """A driver stalls for 1.5 s and then publishes its frames, stamped on arrival. Previously, the state was `tracking`
+    with a pose 4 m off."""
     frames, poses = scanned(world, along(world), [0.1 * i for i in range(32)])
     arrival = frames[24].stamp
     held = [replace(frame, stamp=arrival - (24 - i) * 8 * 10**6) for i, frame in enumerate(frames[10:25], 10)]
@@ -239,7 +244,7 @@ def test_a_pause_after_which_the_frames_of_it_come_in_a_burst_is_none(world: Wor
 
 
 def of_kitti(root: object, kept: list[int]) -> tuple[list[OdometryResult], Array]:
-    """The odometry of these frames of the excerpt of KITTI 00 alone, and their true poses."""
+    """Odometry of only these frames of the KITTI 00 excerpt, and their true poses."""
     source = open_source(f"{root}/sequences/00")
     assert source.poses is not None
     frames = list(source.frames(kept[0], kept[-1] + 1))
@@ -247,7 +252,8 @@ def of_kitti(root: object, kept: list[int]) -> tuple[list[OdometryResult], Array
 
 
 def test_real_gaps(kitti_root: object) -> None:
-    """Frames 30 to 49 of the excerpt of KITTI 00 missing: it used to be 19 m wrong and `tracking`."""
+    """Frames 30 to 49 of the KITTI 00 excerpt are missing. Previously, the pose was 19 m wrong and the state
+    `tracking`."""
     tracked, poses = of_kitti(kitti_root, [*range(15, 30), *range(50, 55)])
     assert [t.state for t in tracked[15:17]] == [State.DEGRADED] * 2
     assert tracked[-1].state == State.TRACKING
@@ -257,7 +263,7 @@ def test_real_gaps(kitti_root: object) -> None:
 
 @pytest.mark.weights
 def test_a_place_that_looks_alike_is_not_one_that_the_robot_can_have_reached(kitti_root: object) -> None:
-    """Five seconds of KITTI 00 missing: to the network the scans after them look like a place 37 m back."""
+    """Five seconds of KITTI 00 are missing. To the network, the scans after them look like a place 37 m back."""
     tracked, poses = of_kitti(kitti_root, [*range(23, 37), *range(85, 99)])
     wrong = off(tracked[13:], poses[13:]) > 0.5
     assert wrong.any()
@@ -272,7 +278,7 @@ def test_bench_places_gaps_and_counts_what_is_wrong(world: World) -> None:
     right = evaluated(frames, poses, gap, SlamSettings(threads=1))
     assert (right["silently_wrong_frames"], right["breaks"]) == (0, 0)
     assert 3 <= right["tracking_after_frames"] <= 4
-    # with a truth that is 2 m off after the gap, the same results are wrong, and none of them says so
+    # With a ground truth that is 2 m off after the gap, the same results are wrong, and none of them reports it.
     moved = poses.copy()
     moved[gap.stop :, 1, 3] += 2.0
     wrong = evaluated(frames, moved, gap, SlamSettings(threads=1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a map: what is tied to it, and each way by itself; corrections reach every frame."""
+"""The folder of a map: which trajectories it contains, and how corrections reach every frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from dpm2_core.slam.settings import SlamSettings
 
 
 def test_a_trajectory_has_what_is_tied_to_the_map_robot_by_robot(tmp_path: Path) -> None:
-    """Keyframes of two robots come in turns; those of one whose place is not known stood between those of the other."""
+    """Keyframes of two robots alternate. Previously, keyframes of a robot whose position was not known were written
+    between those of the other."""
     settings = SlamSettings.model_validate({"loops": {"enabled": False}})
     graph = PoseGraph(settings.pose_graph)
     mapper, step = Mapper(settings.map, graph, make_loops(settings)), se3.exp([0, 0, 0, 3.0, 0, 0])
@@ -63,9 +64,10 @@ def test_corrections_reach_the_frames_between_keyframes() -> None:
 
 
 def test_a_loop_after_a_break_moves_what_comes_after_it_alone() -> None:
-    """Frames 6 and 7 come after a pause that frame 8 gives up to bridge, and frame 10 is the next keyframe. Frames to
-    both sides were put on a line between the two keyframes: registered ones, that the loop has told the place of, were
-    off by as much as the guess across the pause was. What no scan tells, 4 and 5, is between the two still."""
+    """Frames 6 and 7 follow a pause. Frame 8 gives up bridging it, and frame 10 is the next keyframe. Previously,
+    frames on both sides were interpolated between the two keyframes: registered frames, whose position the loop
+    determines, were off by as much as the guess across the pause. Frames 4 and 5 have no registered scan and are still
+    interpolated."""
     recorder = TrajectoryRecorder()
     poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0, 0.4, 0, 0]))
     for i, T in enumerate(poses):

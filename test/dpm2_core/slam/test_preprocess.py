@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What enters the SLAM: measurements only, at one instant, downsampled."""
+"""Preprocessing of a scan: only valid measurements, deskewed to one time, downsampled."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_keeps_only_measurements_within_range() -> None:
         [[x, 0, 0, 0.5] for x in (np.nan, np.inf, 0, 1, 5, 100, 1e30)],
         np.float32,
     )  # fmt: skip
-    points.flags.writeable = False  # as those of messages
+    points.flags.writeable = False  # read-only, as in messages
     scan = Preprocessor(PreprocessSettings()).prepare(Frame(0, points), np.zeros(6))
     np.testing.assert_array_equal(scan.cloud, points[4:5])
     np.testing.assert_array_equal(scan.source, points[4:5, :3])
@@ -42,7 +42,7 @@ def test_impossible_settings_are_rejected() -> None:
 
 @given(st.lists(st.floats(-1, 1), min_size=6, max_size=6), st.floats(0.0, 0.1))
 def test_deskewing_undoes_a_constant_velocity(twist: list[float], earliest: float) -> None:
-    """A wall seen by a moving sensor, each point in the frame of its own moment, is the wall again."""
+    """Deskewing restores a wall that a moving sensor saw, each point in the frame of its own time."""
     rng = np.random.default_rng(0)
     motion = np.array(twist) * [0.5, 0.5, 0.5, 15, 15, 15]
     at_stamp = rng.uniform(-30, 30, (500, 3))

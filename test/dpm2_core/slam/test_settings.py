@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Presets of the SLAM: changes to the defaults, under what is set besides; and which numbers are allowed."""
+"""Presets of the SLAM change the defaults, and explicit settings override them. Also: which numbers are allowed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_what_is_dumped_loads_back_equal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("first", "then"), [("indoor", "outdoor"), ("auto", "indoor"), ("highway", "paper")])
 def test_a_preset_replaces_that_of_a_file_with_every_value(tmp_path: Path, first: str, then: str) -> None:
-    """What the file sets besides its own preset stays, and single values have precedence over both."""
+    """Other settings of the file stay, and single values have precedence over both presets."""
     file = tmp_path / "config.yaml"
     of_file = [f"slam.preset={first}", "slam.odometry.pause=0.9", "input.period=0.2"]
     file.write_text(dump_settings(load_settings(Config, None, of_file)))
@@ -78,7 +78,7 @@ def test_no_number_of_the_slam_may_be_negative() -> None:
 
 
 def _least(name: str) -> float:
-    """The smallest whole number that is allowed, but for what is above 0: then a hundredth."""
+    """Smallest of 0, 0.01, 1 and 3 that the setting allows."""
     for value in (0, 0.01, 1, 3):
         try:
             load_settings(Config, None, [f"{name}={value}"])
@@ -90,7 +90,7 @@ def _least(name: str) -> float:
 
 @pytest.mark.parametrize("part", ["geometric", "local_map", "odometry", "keyframes", "map"])
 def test_the_least_that_is_allowed_runs(suburb_drive: tuple[list[Frame], Array], part: str) -> None:
-    """A zero ended in a traceback, some only after the whole drive."""
+    """Previously, a zero ended in a traceback, sometimes only after the whole drive."""
     overrides = [f"{name}={_least(name)}" for name in NUMBERS if name.startswith(f"slam.{part}.")]
     config = load_settings(Config, None, ["slam.registration=geometric", "slam.loops.descriptors=false", *overrides])
     slam = make_slam(config.slam)
@@ -101,7 +101,7 @@ def test_the_least_that_is_allowed_runs(suburb_drive: tuple[list[Frame], Array],
 
 
 def test_a_config_in_the_place_of_its_slam_is_an_error_of_use() -> None:
-    """It ended with an AttributeError inside of dpm2."""
+    """Previously, it ended with an AttributeError inside dpm2."""
     for make in (make_slam, make_odometry):
         with pytest.raises(UsageError, match="want SlamSettings, which a Config has as its slam, not Config"):
             make(Config())  # type: ignore[arg-type]

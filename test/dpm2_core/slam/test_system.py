@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Slam.process` is the whole algorithm: its two steps give the same in turn, and a frame passes few modules."""
+"""`Slam.process` is the whole algorithm: calling its two steps in turn gives the same result, and a frame passes few
+modules."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ GEOMETRIC = SlamSettings.model_validate({"registration": "geometric", "threads":
 
 @pytest.mark.slow
 def test_the_steps_in_turn_are_the_whole(suburb_drive: tuple[list[Frame], Array]) -> None:
-    """As the ROS node runs them in two threads: pose for pose and keyframe for keyframe the same."""
+    """The ROS node runs the two steps in two threads: all poses and keyframes are the same."""
     frames = suburb_drive[0][:15]
     whole, steps = make_slam(GEOMETRIC), make_slam(GEOMETRIC)
     results = [whole.process(frame) for frame in frames]
@@ -57,7 +58,7 @@ def test_without_corrections_the_map_is_the_odometry(suburb_drive: tuple[list[Fr
 
 
 class _Loops:
-    """Stands where the mapper does: the last keyframe, and a loop to it from the one of that id, or none."""
+    """Stand-in for the mapper. It reports a loop from node `since` to the last keyframe, or none."""
 
     def __init__(self) -> None:
         self.keyframes: list[Keyframe] = []
@@ -65,7 +66,7 @@ class _Loops:
         self.T_map_odom = np.eye(4)
 
     def add(self, keyframe: Keyframe) -> list[Edge]:
-        self.keyframes.append(replace(keyframe, id=keyframe.id + 40))  # after those of a map that was loaded
+        self.keyframes.append(replace(keyframe, id=keyframe.id + 40))  # numbered after the keyframes of a loaded map
         if self.since is None:
             return []
         node = self.since if self.since >= 0 else len(self.keyframes) + self.since
@@ -79,7 +80,8 @@ class _Loops:
 def test_a_loop_across_a_break_ends_the_doubt_of_it(
     suburb_drive: tuple[list[Frame], Array], since: int | None, ends: bool
 ) -> None:
-    """After a pause: to before it, not to a keyframe since then. It was `degraded` for the rest of the drive."""
+    """After a pause, this needs a loop to a keyframe before the pause, not to a later one. Previously, the state was
+    `degraded` for the rest of the drive."""
     frames = [replace(frame, stamp=frame.stamp + 60 * 10**9 * (n >= 6)) for n, frame in enumerate(suburb_drive[0])]
     elsewhere = np.array([1, -1, 1, 1], np.float32)
     frames[6:] = [replace(frame, points=frame.points * elsewhere) for frame in frames[6:]]
@@ -91,7 +93,7 @@ def test_a_loop_across_a_break_ends_the_doubt_of_it(
         result = slam.process(frame)
         states.append(result.state)
         if result.odometry.breaks and result.map is not None and loops.since is None:
-            loops.since = since  # of the next keyframe
+            loops.since = since  # for the next keyframe
     assert State.LOST in states
     assert states[-1] is (State.TRACKING if ends else State.DEGRADED)
     assert result.odometry.breaks == int(not ends)
@@ -100,10 +102,12 @@ def test_a_loop_across_a_break_ends_the_doubt_of_it(
 @pytest.mark.weights
 @pytest.mark.parametrize(("registration", "most"), [("geometric", 10), ("adaptive", 11)])
 def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], registration: str, most: int) -> None:
-    """Between the recording and the recorded pose; functions of `geometry` and nouns are no stops.
+    """A frame passes few modules between the recording and the recorded pose. Functions of `geometry` and modules of
+    data types do not count.
 
-    One chooses the odometry, of streets or of rooms. By default one more than the points: what decides whether the
-    network is asked. One that is kept goes there, too. Its intensities are kept for a scan that will need them.
+    One module chooses the odometry, for streets or for rooms. The default has one module more than point-to-plane
+    registration alone: it decides whether the network runs. A frame that is kept passes it, too: its intensities are
+    stored for a scan that will need them.
     """
     names: dict[str, None] = {}
 
@@ -113,7 +117,7 @@ def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], reg
             names[name] = None
 
     def between(number: int) -> None:
-        sys.setprofile(note if number == 7 else None)  # of the ninth frame: the drive is under way
+        sys.setprofile(note if number == 7 else None)  # the ninth frame: the drive is under way
 
     numbers = iter(range(len(suburb_drive[0])))
     config = Config(slam=GEOMETRIC.model_copy(update={"registration": registration}))
@@ -133,8 +137,9 @@ def test_a_frame_passes_few_modules(suburb_drive: tuple[list[Frame], Array], reg
 def test_in_a_map_that_stays_the_place_is_known_when_it_is_found(
     suburb_drive: tuple[list[Frame], Array], tmp_path: Path
 ) -> None:
-    """Somewhere else first: `T_map_lidar` is None and keyframes are asked for; then the mapped street. The network
-    finds the place; for scans of nowhere, one after the other, it would only take time."""
+    """First, scans from elsewhere: `T_map_lidar` is None and keyframes are requested. Then the mapped street, which the
+    network recognizes. Registration is geometric: for one random scan after the other the network would only take
+    time."""
     frames, truth = suburb_drive
     settings = SlamSettings(registration="geometric", threads=1)
     path = tmp_path / "street.dpm2map"
@@ -151,7 +156,7 @@ def test_in_a_map_that_stays_the_place_is_known_when_it_is_found(
         assert all(result.T_map_lidar is None for result in results)
         assert all(result.state in (State.INITIALIZING, State.RELOCALIZING) for result in results)
         tried = [n for n, result in enumerate(results) if result.map is not None]
-        assert tried == [0, 10, 20]  # once per second, at a standstill
+        assert tried == [0, 10, 20]  # once per second, at standstill
         slam.odometry.reset()
         found = slam.process(Frame(21 * 10**8 + 9 * 10**8, frames[10].points))
         assert isinstance(found.map and found.map.located, LocalizationResult)
@@ -179,7 +184,7 @@ def test_a_keyframe_carries_its_thumbnail_into_the_map_file(
 @pytest.mark.long
 @pytest.mark.weights
 def test_in_a_corridor_keyframes_keep_a_picture_by_which_the_robot_finds_itself(tmp_path: Path) -> None:
-    """The whole way: images with the scans, a map file, and a later drive that begins somewhere along it."""
+    """End to end: images with the scans, a map file, and a later drive that begins somewhere along the corridor."""
     paint, settings = corridor.random_paint(3), SlamSettings(threads=1)
     path = tmp_path / "corridor.dpm2map"
     with open_session(path, settings, "", resume=False) as store:
@@ -201,7 +206,7 @@ def test_in_a_corridor_keyframes_keep_a_picture_by_which_the_robot_finds_itself(
 
 @pytest.mark.parametrize("hangs", ["front", "rear"])
 def test_a_camera_that_hangs_costs_the_picture_of_no_other_one(hangs: str, tmp_path: Path) -> None:
-    """Each keyframe along a corridor has a picture, by the first camera that shows something new."""
+    """Each keyframe along a corridor has an image, from the first camera that shows something new."""
     paint = corridor.random_paint(3)
     still = corridor.frame(0.0, paint).images[0]
 
@@ -227,7 +232,7 @@ def test_a_camera_that_hangs_costs_the_picture_of_no_other_one(hangs: str, tmp_p
 def test_in_a_street_keyframes_keep_no_picture(
     suburb_drive: tuple[list[Frame], Array], noise: np.random.Generator, tmp_path: Path
 ) -> None:
-    """But the first, of which nothing is known yet: a map stays small."""
+    """Except the first one, because nothing is known about the environment yet. So a map stays small."""
     image = make_image(noise)
     with open_session(tmp_path / "a.dpm2map", GEOMETRIC, "", resume=False) as store:
         slam = make_slam(GEOMETRIC, store=store)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes in the real graph: they straighten a drive that drifts, and those that are wrong bend none."""
+"""GNSS fixes in the real graph: they correct the drift of a drive, and wrong fixes do not bend it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from dpm2_core.slam.graph.robust import RobustSettings
 START = np.array([49.0, 8.4, 110.0])
 ANTENNA = np.array([0.5, 0.2, 1.0])
 SIGMA = 2.0
-STEP = isotropic(np.radians(0.15), 0.05)  # of an odometry with that sigma a step of 5 m
+STEP = isotropic(np.radians(0.15), 0.05)  # of an odometry with this sigma per step of 5 m
 Wrong = Callable[[int], Array]
 
 
 def road(count: int) -> Array:
-    """(count, 4, 4) T_enu_kf: 5 m apart on a winding road that begins north-east and climbs."""
+    """(count, 4, 4) T_enu_kf, 5 m apart on a winding road that starts to the north-east and climbs."""
     heading = 0.7 + 0.8 * np.sin(np.arange(count) / 40)
     steps = 5 * np.column_stack([np.cos(heading), np.sin(heading), np.full(count, 0.02)])
     at = np.cumsum(steps, axis=0) - steps[0]
@@ -34,7 +34,7 @@ def road(count: int) -> Array:
 
 
 def town(count: int) -> Array:
-    """As `road`, through a town: 60 to 200 m straight on, and then a corner of 20 m."""
+    """Like `road`, but through a town: 60 to 200 m straight, then a corner of 20 m."""
     rng, turns, at = np.random.default_rng(3), np.zeros(count), 8
     while at < count:
         turns[at : at + 4] = rng.choice([-1, 1]) * np.pi / 8
@@ -45,7 +45,7 @@ def town(count: int) -> Array:
 
 
 def fix_at(number: int, T: Array, error: Array, sigma: float = SIGMA) -> Fix:
-    """Where the antenna was, and an error (3,) m."""
+    """Fix at the antenna's position plus an error (3,), m."""
     ecef = geodesy.enu_frame(START) @ np.append(T[:3, :3] @ ANTENNA + T[:3, 3] + error, 1)
     covariance = np.diag([sigma, sigma, 2 * sigma]) ** 2
     return Fix(number * 10**9, geodesy.geodetic(ecef[:3]), covariance, ANTENNA)
@@ -59,9 +59,9 @@ def driven(
     background: bool = False,
     flat: bool = False,
 ) -> tuple[PoseGraph, Array]:
-    """A drive as the mapper feeds it, and its odometry alone (count, 4, 4).
+    """Graph of a drive as the mapper builds it, and its odometry alone (count, 4, 4).
 
-    `drift_deg`: a step. `flat`: the receiver states no altitude.
+    `drift_deg`: per step. `flat`: the receiver reports no altitude.
     """
     rng, true = np.random.default_rng(1), road(count)
     graph, odometry = PoseGraph(RobustSettings(), background=background), [np.eye(4)]
@@ -89,7 +89,7 @@ def driven(
 
 
 def enu_of(graph: PoseGraph, poses: Array) -> Array:
-    """(N, 3) east, north, up about the start of the road, by the graph's georeference."""
+    """Positions (N, 3) east, north, up relative to the start of the road, from the graph's georeference."""
     known = graph.georeference
     assert known is not None
     T = se3.inverse(geodesy.enu_frame(START)) @ geodesy.enu_frame(known.origin) @ known.T_enu_map
@@ -102,7 +102,7 @@ def errors(graph: PoseGraph, way: Callable[[int], Array] = road) -> Array:
 
 
 def bend(graph: PoseGraph) -> float:
-    """Largest error, m, of the way over 10 nodes, 50 m, as its length and direction at its start."""
+    """Largest error, m, of the relative translation over 10 nodes (50 m), in the frame of its first node."""
     true, poses = road(len(graph)), graph.poses
     ways = se3.inverse(se3.inverse(true[:-10]) @ true[10:]) @ se3.inverse(poses[:-10]) @ poses[10:]
     return float(np.linalg.norm(ways[:, :3, 3], axis=1).max())
@@ -124,7 +124,8 @@ def test_a_drive_that_drifts_is_straightened() -> None:
 
 
 def test_fixes_without_a_height_straighten_a_drive_as_well() -> None:
-    """Their free heights took up what east and north were off by: 8 m of error, at a stated 170 m, all of them used."""
+    """Previously, the free heights absorbed the errors in east and north: 8 m of error at a stated 170 m, with all
+    fixes used."""
     graph, _ = driven(120, drift_deg=0.05, flat=True)
     assert np.linalg.norm((enu_of(graph, graph.poses) - road(120)[:, :3, 3])[:, :2], axis=1).max() < SIGMA
     covariance = graph.georeference_covariance()
@@ -138,7 +139,7 @@ def test_where_the_map_is_comes_with_its_certainty(clean: PoseGraph) -> None:
     assert known is not None
     assert covariance is not None
     heading, sigma = np.arctan2(known.T_enu_map[1, 0], known.T_enu_map[0, 0]), np.sqrt(covariance[2, 2])
-    assert abs(heading - 0.7) < 3 * sigma  # the road begins at 0.7 rad, and the map along it
+    assert abs(heading - 0.7) < 3 * sigma  # the road and the map begin with a heading of 0.7 rad
     assert sigma < np.radians(1.5)
     assert np.sqrt(np.diag(covariance)[3:]).max() < 1.5
     assert errors(clean).max() < SIGMA
@@ -150,9 +151,9 @@ def test_where_the_map_is_comes_with_its_certainty(clean: PoseGraph) -> None:
     [
         (lambda n: np.array([40.0, -30, 10]) * (n == 60), 1),  # a jump
         (lambda n: np.array([40.0, -30, 10]) * (50 <= n < 75), 25),  # a street between high houses
-        (lambda n: np.array([12.0, -9, 0]) * (50 <= n < 75), None),  # multipath of not quite as much
-        (lambda n: np.array([40.0, -30, 10]) * (n >= 90), 30),  # to the end
-        (lambda n: np.array([4e6, 1e5, -1.5e6]) * (n < 3), 3),  # before the receiver knows
+        (lambda n: np.array([12.0, -9, 0]) * (50 <= n < 75), None),  # smaller errors: multipath
+        (lambda n: np.array([40.0, -30, 10]) * (n >= 90), 30),  # until the end
+        (lambda n: np.array([4e6, 1e5, -1.5e6]) * (n < 3), 3),  # before the receiver has a position
     ],
 )
 def test_fixes_that_are_wrong_bend_no_map(clean: PoseGraph, wrong: Wrong, off: int | None) -> None:
@@ -166,7 +167,8 @@ def test_fixes_that_are_wrong_bend_no_map(clean: PoseGraph, wrong: Wrong, off: i
 
 @pytest.mark.slow
 def test_fixes_that_are_stamped_too_late_are_moved_back() -> None:
-    """By 1 s at 5 m/s: the map lay 4.5 m off, at a stated 0.6 m. A map that is loaded is where it was."""
+    """The stamps are 1 s late at 5 m/s. Previously, the map was 4.5 m off, at a stated 0.6 m. A loaded map stays where
+    it was."""
     true, rng, graph = town(200), np.random.default_rng(1), PoseGraph(RobustSettings())
     late = np.concatenate([true[:1], true[:-1]])
     edges = [Edge("odometry", n - 1, n, Registration(se3.inverse(true[n - 1]) @ true[n], STEP)) for n in range(1, 200)]
@@ -187,7 +189,7 @@ def test_fixes_that_are_stamped_too_late_are_moved_back() -> None:
 
 
 def test_the_heading_must_be_observable_first() -> None:
-    """A robot that stands, and one that has gone 15 m with a receiver of 2 m."""
+    """A robot at standstill, and one that has moved 15 m with a receiver accuracy of 2 m."""
     standing = PoseGraph(RobustSettings())
     standing.add_node(np.eye(4))
     rng = np.random.default_rng(0)
@@ -203,7 +205,8 @@ def test_the_heading_must_be_observable_first() -> None:
     ("way", "lap", "known"), [(50, False, False), (60, False, True), (75, True, False), (90, True, True)]
 )
 def test_what_counts_is_how_far_the_fixes_lie_from_their_middle(way: int, lap: bool, known: bool) -> None:
-    """Fixes each 5 m of a way, m, straight on or once around, by a receiver of 2 m: as docs/how_to.md says."""
+    """Fixes every 5 m along a path of `way` m, straight or once around a circle, with a receiver accuracy of 2 m: as
+    docs/how_to.md states."""
     graph, curvature, before = PoseGraph(RobustSettings()), 2 * np.pi / way if lap else 1e-6, np.eye(4)
     for node, turn in enumerate(curvature * np.arange(0, way + 1, 5)):
         place = np.array([np.sin(turn), 1 - np.cos(turn), 0]) / curvature
@@ -217,8 +220,8 @@ def test_what_counts_is_how_far_the_fixes_lie_from_their_middle(way: int, lap: b
 
 
 def test_without_fixes_nothing_changes() -> None:
-    """To the bit: the graph that is written and solved is the same."""
-    with_fixes, odometry = driven(4)  # too few to tell where the map is
+    """The graph is the same to the bit, as written and as solved."""
+    with_fixes, odometry = driven(4)  # too few to locate the map
     without, _ = driven(4, fixes=False)
     np.testing.assert_array_equal(with_fixes.poses, without.poses)
     without.optimize()
@@ -242,13 +245,13 @@ def test_in_a_file_the_local_frame_is_one_more_vertex(clean: PoseGraph, tmp_path
     known = clean.georeference
     assert known is not None
     np.testing.assert_allclose(values.atPose3(120).matrix(), se3.inverse(known.T_enu_map), atol=1e-6)
-    read = read_g2o(tmp_path / "graph.g2o")  # the level says nothing of the place: 1e-14 of the weight of its tilt
+    read = read_g2o(tmp_path / "graph.g2o")  # the level edge leaves the position free: 1e-14 of the weight of its tilt
     np.testing.assert_allclose(read.graph.poses[:120], clean.poses, atol=1e-9)
     assert (int(read.graph.chained.sum()), len(read.graph.ends)) == (120, 120)
 
 
 def test_robots_that_no_loop_ties_keep_their_fixes_to_themselves(clean: PoseGraph) -> None:
-    """A second one's place in the map is not known: its fixes wait for a loop."""
+    """The position of a second robot in the map is not known: its fixes are not used until there is a loop."""
     graph, _ = driven(40)
     before, first = graph.poses, len(graph)
     graph.add_node(np.eye(4))
@@ -257,7 +260,7 @@ def test_robots_that_no_loop_ties_keep_their_fixes_to_themselves(clean: PoseGrap
     graph.optimize()
     np.testing.assert_allclose(graph.poses[:first], before, atol=0.05)
     np.testing.assert_array_equal(graph.pose(first), np.eye(4))
-    assert graph.fixes == (40, 40 + 30)  # the others are not in the graph
+    assert graph.fixes == (40, 40 + 30)  # the other fixes are not in the graph
 
 
 def test_a_georeference_that_most_fixes_deny_is_found_anew() -> None:
@@ -271,8 +274,8 @@ def test_a_georeference_that_most_fixes_deny_is_found_anew() -> None:
 
 @pytest.mark.parametrize("background", [False, True])
 def test_fixes_that_do_not_fit_the_way_say_nothing_of_where_the_map_is(background: bool) -> None:
-    """East and north swapped: the first few, on a straight road, tell a place all the same. It stayed, with a quarter
-    of the fixes used, 255 m off at a stated 0.3 m."""
+    """East and north are swapped. The first few fixes, on a straight road, still give a georeference. Previously, it
+    stayed: a quarter of the fixes was used, and the map was 255 m off at a stated 0.3 m."""
     true = road(150)
 
     def swapped(node: int) -> Array:
@@ -285,7 +288,8 @@ def test_fixes_that_do_not_fit_the_way_say_nothing_of_where_the_map_is(backgroun
 
 
 def test_one_fix_does_not_tell_how_certain_a_georeference_is() -> None:
-    """A map may know its place by fixes that are no longer in it; one of RTK's leaves a system that is singular."""
+    """The georeference of a map may come from fixes that are no longer in it. A single RTK fix leaves a singular
+    system."""
     graph, step = PoseGraph(RobustSettings()), se3.make(np.eye(3), [2.0, 0, 0])
     graph.add_node(np.eye(4))
     graph.add_node(step, Edge("odometry", 0, 1, Registration(step, STEP)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""g2o files: what is written is read back to the last digit, what is wrong is named with its line."""
+"""g2o files: they are read back to the last digit, and errors are reported with the line number."""
 
 from __future__ import annotations
 
@@ -38,14 +38,15 @@ def test_round_trip_at_full_precision(tmp_path: Path, planar: bool) -> None:
         lines.append(f"EDGE_{tag} {a} {b} " + " ".join(f"{x:.17g}" for x in (*pose, *upper)))
     first = read_g2o(file(tmp_path, *lines))
     assert first.planar is planar
-    np.testing.assert_array_equal(first.ids, [5, 7, 8, 2**60 + 1])  # more than a float64 holds
+    np.testing.assert_array_equal(first.ids, [5, 7, 8, 2**60 + 1])  # more than a float64 can represent
     np.testing.assert_allclose(first.graph.steps[1:], T[:3], atol=1e-14)
-    np.testing.assert_allclose(first.graph.poses[3], T[0] @ T[1] @ T[2], atol=1e-13)  # laid out by the odometry
+    np.testing.assert_allclose(first.graph.poses[3], T[0] @ T[1] @ T[2], atol=1e-13)  # integrated from the odometry
     write_g2o(tmp_path / "out.g2o", first)
     assert (tmp_path / "out.g2o").read_text().count(f"VERTEX_{tag} ") == 4
     second = read_g2o(tmp_path / "out.g2o")
     for name in ("poses", "steps", "T_from_to", "step_covariances", "covariances", "ends", "fixed"):
-        # A pose passes through a quaternion or an angle, a covariance through an inverse: rounding in the last digits.
+        # A pose is converted through a quaternion or an angle, a covariance through an inverse: the last digits are
+        # rounded.
         np.testing.assert_allclose(getattr(second.graph, name), getattr(first.graph, name), rtol=1e-12, atol=1e-13)
 
 
@@ -53,13 +54,14 @@ def test_an_edge_backwards_along_the_chain_is_odometry(tmp_path: Path) -> None:
     result = read_g2o(file(tmp_path, f"EDGE_SE2 1 0 -2 0 0 {I3}", f"EDGE_SE2 1 2 2 0 0 {I3}")).graph
     assert len(result.ends) == 0
     np.testing.assert_allclose(result.poses[:, 0, 3], [0, 2, 4])
-    # 1 rad of error at the far end of 2 m shows as 2 m sideways, seen from this one.
+    # A rotation error of 1 rad at one end of a 2 m edge is a sideways error of 2 m in the frame of the other end.
     np.testing.assert_allclose(result.step_covariances[1][4, 4], 1 + 2**2)
 
 
 @pytest.mark.parametrize("vertices", [True, False])
 def test_ids_that_do_not_follow_the_drive(tmp_path: Path, vertices: bool) -> None:
-    """Each node was a trajectory of its own and the odometry a heap of loops, right ones of which were rejected."""
+    """Previously, each node was a trajectory of its own. The odometry edges counted as loops, and some right ones were
+    rejected."""
     ids = np.random.default_rng(0).permutation(30).tolist()
     lines = [f"VERTEX_SE2 {id} {k} 0 0" for k, id in enumerate(ids)] if vertices else []
     lines += [f"EDGE_SE2 {a} {b} 1 0 0 {I3}" for a, b in pairwise(ids)]
@@ -73,7 +75,8 @@ def test_ids_that_do_not_follow_the_drive(tmp_path: Path, vertices: bool) -> Non
 
 
 def test_edges_in_no_order_are_not_taken_for_a_drive(tmp_path: Path) -> None:
-    """Their ends follow each other in the file, also those of a loop, which would then count as odometry."""
+    """In order of appearance the two vertices of every edge are consecutive, also those of a loop. It would then count
+    as odometry."""
     edges = [(a, a + 1) for a in range(0, 40, 2)] + [(a, (a + 20) % 40) for a in range(20)]
     rows = [edges[k] for k in np.random.default_rng(0).permutation(len(edges))]
     result = read_g2o(file(tmp_path, *(f"EDGE_SE2 {a} {b} 1 0 0 {I3}" for a, b in rows)))

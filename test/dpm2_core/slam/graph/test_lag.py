@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late fixes are: told by turns and changes of speed, and left open where there are none."""
+"""Time lag of the fixes: rotations and changes of speed make it observable; without them it remains unknown."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ SIGMA, SPEED = 1.0, 20.0
 
 
 def stretches(count: int, late: float, turn: float, wrong: float = 0.0) -> list[Stretch]:
-    """At 20 m/s, 5 m from fix to fix; `turn`: rad/s in the middle third; `wrong`: m, of half of the fixes of each."""
+    """Stretches at 20 m/s with a fix every 5 m. `turn`: rad/s in the middle third. `wrong`: m, added to half of the
+    fixes of each stretch."""
     rng, found = np.random.default_rng(0), list[Stretch]()
     for _ in range(count):
         times = np.arange(STRETCH) * 0.25
@@ -41,8 +42,8 @@ def test_none_is_found_where_there_is_none() -> None:
 
 
 def test_fixes_that_are_worse_than_they_state_tell_no_more_than_they_know() -> None:
-    """A receiver whose errors last for seconds, and are three times what it states: over 60 fixes without a lag what
-    was found was 2.1 standard deviations off, and in 6 of 100 drives beyond doubt."""
+    """A receiver whose errors last for seconds and are three times what it reports. Previously, the lag estimated from
+    60 fixes without a lag was 2.1 standard deviations off, and in 6 of 100 drives it was significant."""
     off = []
     for seed in range(100):
         noise = np.random.default_rng(seed).normal(size=(3, STRETCH + 3, 3))

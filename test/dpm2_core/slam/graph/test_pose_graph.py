@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The growing pose graph: results, covariances, and the process that optimizes it in the background."""
+"""The incremental pose graph: results, covariances, and the process that optimizes it in the background."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from dpm2_core.slam.graph.robust import RobustSettings
 
 STEP = np.diag([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02]) ** 2
 LOOP = np.diag([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05]) ** 2
-T_STEP = se3.exp([0, 0, 2 * np.pi / 50, 20 * 2 * np.pi / 50, 0, 0])  # 50 to a lap of 20 m radius
+T_STEP = se3.exp([0, 0, 2 * np.pi / 50, 20 * 2 * np.pi / 50, 0, 0])  # 50 steps per lap of 20 m radius
 DRIFT = se3.exp([0, 0, 5e-4, 0.01, 0, 0])
 
 
 def step(graph: PoseGraph, T: Array = T_STEP, covariance: Array = STEP, before: int = -1) -> Edge:
-    """The odometry from a node, by default the last one, to the next."""
+    """Odometry edge from a node, by default the last one, to the next."""
     return Edge("odometry", len(graph) + before if before < 0 else before, len(graph), Registration(T, covariance))
 
 
 def loop(a: int, b: int, covariance: Array = LOOP) -> Edge:
-    """Both saw the same place from the same pose."""
+    """Loop edge: both nodes saw the same place from the same pose."""
     return Edge("loop", a, b, Registration(np.eye(4), covariance))
 
 
@@ -54,7 +54,7 @@ def truth(count: int) -> Array:
 
 @pytest.fixture
 def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[PoseGraph]:
-    """A graph of a lap with a loop that goes to the other process however small it is."""
+    """Graph of a lap with a loop. It is solved in the background process even though it is small."""
     monkeypatch.setattr(pose_graph, "SHORT", 0)
     graph = PoseGraph(RobustSettings(), background=True)
     drive(graph, 55)
@@ -72,7 +72,7 @@ def test_a_loop_spreads_the_drift() -> None:
     after = np.linalg.norm((graph.poses - truth(51))[:, :3, 3], axis=1)
     assert after[-1] < 0.1 * before[-1]
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
-    np.testing.assert_allclose(graph.poses[0], np.eye(4), atol=1e-6)  # the first stays
+    np.testing.assert_allclose(graph.poses[0], np.eye(4), atol=1e-6)  # the first pose stays
 
 
 def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
     factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
     for node in range(5):
         np.testing.assert_allclose(values.atPose3(node).matrix(), graph.poses[node], atol=1e-12)
-    # The error that gtsam finds in the file is the one that the graph has: information and its order are right.
+    # gtsam's error for the file equals that of the graph: the information matrices and their order are right.
     moved = gtsam.Values()
     for node in range(5):
         off = se3.exp(np.array([1e-3, -2e-3, 1e-3, 0.01, 0.02, -0.01]) * node)
@@ -95,7 +95,7 @@ def test_g2o_reads_back_at_full_precision(tmp_path: Path) -> None:
         a, b = (moved.atPose3(node).matrix() for node in (edge.from_node, edge.to_node))
         off = se3.log(se3.inverse(edge.T_from_to) @ se3.inverse(a) @ b)
         expected += 0.5 * off @ np.linalg.solve(edge.covariance, off)
-    assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion against tangent, to second order
+    assert factors.error(moved) == pytest.approx(expected, rel=1e-3)  # quaternion versus tangent space, to second order
 
 
 def test_a_wrong_loop_is_rejected_with_a_reason_and_is_no_edge() -> None:
@@ -128,10 +128,10 @@ def test_background_gives_what_inline_gives(background: PoseGraph) -> None:
 
 
 def solvers(parent: int) -> list[int]:
-    """Processes that a process has for its graphs."""
+    """Solver processes that are children of the process `parent`."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the process has ended
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
             if int(fields[1]) == parent and fields[0] != "Z" and b"graph.worker" in (folder / "cmdline").read_bytes():
                 found.append(int(folder.name))
@@ -139,7 +139,7 @@ def solvers(parent: int) -> list[int]:
 
 
 def held_solver(graph: PoseGraph) -> int:
-    """The process that has the graph in hand, stopped, so that what comes next is meanwhile."""
+    """Stop the process that solves the graph, so that later calls happen during the solve. Returns its id."""
     graph.optimize()
     while not (pids := solvers(os.getpid())):
         time.sleep(0.001)
@@ -158,13 +158,13 @@ def test_nodes_added_meanwhile_follow_the_old_ones(background: PoseGraph) -> Non
 
 
 def test_nodes_and_loops_added_meanwhile_are_not_lost(background: PoseGraph) -> None:
-    """On a busy machine both graphs may be solved by the time that the first is asked for."""
+    """On a busy machine, both graphs may be solved when the first result is requested."""
     pid = held_solver(background)
     drive(background, 10)
     background.add_loop(loop(10, 60))
-    background.optimize()  # busy: it waits for its turn
+    background.optimize()  # the worker is busy: this solve is queued
     os.kill(pid, signal.SIGCONT)
-    assert background.collect(wait=True)  # the second loop was sent off by itself
+    assert background.collect(wait=True)  # the second solve was submitted automatically
     assert not background.busy
     assert all(e.ok and e.registration.reason for e in background.loops)
     assert np.linalg.norm(background.poses[60, :3, 3] - background.poses[10, :3, 3]) < 0.1
@@ -175,7 +175,7 @@ def test_a_killed_process_is_replaced(background: PoseGraph) -> None:
     background.optimize()
     background.collect(wait=True)
     (pid,) = solvers(os.getpid())
-    os.kill(pid, signal.SIGSTOP)  # so that it dies with the graph in hand
+    os.kill(pid, signal.SIGSTOP)  # so that it is killed during the solve
     background.add_loop(loop(2, 52))
     background.optimize()
     os.kill(pid, signal.SIGKILL)
@@ -208,7 +208,7 @@ def test_no_process_outlives_a_killed_program() -> None:
     for _ in range(600):
         try:
             with open(f"/proc/{pid}/stat") as file:
-                if file.read().rpartition(")")[2].split()[0] == "Z":  # ended, its status is not read yet
+                if file.read().rpartition(")")[2].split()[0] == "Z":  # ended, but its status has not been read yet
                     return
         except FileNotFoundError:
             return
@@ -224,7 +224,7 @@ def test_the_relative_covariance_of_neighbors_is_that_of_their_edge() -> None:
     assert np.trace(graph.relative_covariances([(0, 29)])[0]) > 20 * np.trace(STEP)
     with pytest.raises(ValueError, match="relative to itself"):
         graph.relative_covariances([(3, 3)])
-    pairs = [(node % 29, 29) for node in range(50)]  # more than are asked for at once
+    pairs = [(node % 29, 29) for node in range(50)]  # more pairs than one query handles at once
     each = [graph.relative_covariances([pair])[0] for pair in pairs]
     np.testing.assert_allclose(graph.relative_covariances(pairs), each, rtol=1e-6, atol=1e-12)
 
@@ -256,10 +256,11 @@ def test_a_loop_makes_the_far_end_certain() -> None:
 
 
 def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
-    """Two robots on the same circle, their nodes interleaved, the second in a frame of its own; a third stays alone."""
+    """Two robots drive on the same circle. Their nodes are interleaved, and the second has its own frame. A third robot
+    stays unconnected."""
     turn = np.linspace(0, np.pi, 12)
     truth = se3.exp(np.array([0, 0, 1.0, 20.0, 0, 0]) * turn[:, None])
-    own = se3.exp(np.array([0.0, 0.0, 2.5, 300.0, -40.0, 0.0]))  # of the second robot's frame
+    own = se3.exp(np.array([0.0, 0.0, 2.5, 300.0, -40.0, 0.0]))  # the second robot's frame
     sigma = isotropic(1e-3, 0.02)
     graph, last = PoseGraph(RobustSettings()), {}
     for k in range(len(truth)):
@@ -285,23 +286,25 @@ def test_trajectories_that_grow_side_by_side_are_tied_by_loops() -> None:
 
 
 def off_rotation(poses: Array) -> float:
-    """How far R R^T is from the identity at most."""
+    """Largest deviation of R R^T from the identity."""
     R = poses[:, :3, :3]
     return float(np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max())
 
 
 def test_rotations_stay_rotations_over_hundreds_of_background_solves(background: PoseGraph) -> None:
-    """A keyframe comes during each. Its rounding was tripled each time: after 35 none was rigid any more."""
+    """A keyframe arrives during each solve. Previously, its rounding error tripled each time: after 35 solves no pose
+    was a rigid transform any more."""
     for _ in range(300):
         background.optimize()
         background.add_node(background.pose(len(background) - 1) @ T_STEP, step(background))
         assert background.collect(wait=True)
-    assert off_rotation(background.poses) < 1e-9  # rounding adds up to some 1e-14; it is a transform up to 1e-3
+    assert off_rotation(background.poses) < 1e-9  # rounding adds up to about 1e-14; a transform may be off by 1e-3
 
 
 @pytest.mark.parametrize("moved", [False, True], ids=["by its first loop", "by the optimization"])
 def test_rotations_stay_rotations_over_hundreds_of_maps_that_are_solved_again(moved: bool) -> None:
-    """Each begins with the poses of the last, and its second drive is moved: the rounding was doubled each time."""
+    """Each graph begins with the poses of the last one, and its second trajectory is moved. Previously, the rounding
+    error doubled each time."""
     poses = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
     for _ in range(300):
         graph = PoseGraph(RobustSettings())
@@ -318,7 +321,7 @@ def test_rotations_stay_rotations_over_hundreds_of_maps_that_are_solved_again(mo
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
 def test_an_unsound_edge_is_rejected_and_the_graph_stays_as_it_was(bad: float) -> None:
-    """One of them would turn all poses to NaN with the next loop."""
+    """One such edge would turn all poses into NaN with the next loop."""
     graph = PoseGraph(RobustSettings())
     drive(graph, 55)
     covariance = STEP.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust optimization on graphs whose solution is known; covariances against the closed form."""
+"""Robust optimization of graphs whose solution is known, and covariances compared with the closed form."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOOP = np.diag([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05]) ** 2
 
 
 def laps(count: int = 120, lap: int = 50, seed: int = 0) -> tuple[Array, GraphData]:
-    """True poses of a drive in a circle, and its odometry with noise as its covariances say; no loops."""
+    """True poses of a drive in a circle, and its odometry with noise that matches its covariances; no loops."""
     rng = np.random.default_rng(seed)
     turn = 2 * np.pi / lap
     poses = se3.exp(np.array([0, 0, 1.0, 20, 0, 1]) * (turn * np.arange(count))[:, None])
@@ -58,13 +58,13 @@ def test_wrong_loops_are_rejected_and_leave_no_trace(seed: int, wrong: int) -> N
     clean = optimize(with_loops(graph, ENDS, right_loops(poses, ENDS)), RobustSettings())
     assert clean.kept.all()
     a = rng.integers(0, 50, wrong)
-    false = [(int(n), int(n + k)) for n, k in zip(a, rng.integers(15, 36, wrong), strict=True)]  # over 18 m apart
+    false = [(int(n), int(n + k)) for n, k in zip(a, rng.integers(15, 36, wrong), strict=True)]  # more than 18 m apart
     T = se3.exp(rng.normal(size=(wrong, 6)) * [0.02, 0.02, 1.0, 1, 1, 0.1])
     both = with_loops(graph, ENDS + false, np.concatenate([right_loops(poses, ENDS), T]))
     result = optimize(both, RobustSettings())
     assert result.settled
     np.testing.assert_array_equal(result.kept, np.arange(len(both.ends)) < len(ENDS))
-    # What is rejected takes no part: only where Levenberg-Marquardt stops may differ.
+    # A rejected loop has no effect: only the point where Levenberg-Marquardt stops may differ.
     assert rmse(result.poses, clean.poses) < 0.01
 
 
@@ -72,7 +72,7 @@ def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     apart = np.sqrt(chain_chi2(graph, integrate(graph)))
-    result = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # sets one aside
+    result = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # rejects one loop
     assert result.kept.all()
     assert result.rounds == 2
 
@@ -80,9 +80,9 @@ def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
 def test_few_unknowns_give_the_optimum_of_all() -> None:
     poses, graph = laps(seed=3)
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
-    few = optimize(graph, RobustSettings(loop_kernel=1e6))  # a kernel so wide is plain least squares
+    few = optimize(graph, RobustSettings(loop_kernel=1e6))  # with such a wide kernel, this is plain least squares
     every = least_squares(graph, np.ones(len(ENDS), np.bool_))
-    assert rmse(few.poses, every) < 2e-3  # to first order in corrections of about 1 m a lap
+    assert rmse(few.poses, every) < 2e-3  # to first order in corrections of about 1 m per lap
 
 
 def test_spreading_what_is_not_off_changes_nothing() -> None:
@@ -102,7 +102,7 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
     steps[50], covariances[50] = np.eye(4), 0
     ends = [(k, 50 + k) for k in range(0, 50, 10)]
     T = right_loops(poses, ends)
-    T[1] = se3.exp([0, 0, 1, 5, 5, 0])  # one of five is wrong
+    T[1] = se3.exp([0, 0, 1, 5, 5, 0])  # one of five loops is wrong
     graph = with_loops(GraphData(moved, chained, steps, covariances), ends, T)
     result = optimize(graph, RobustSettings())
     np.testing.assert_array_equal(result.kept, [True, False, True, True, True])
@@ -111,7 +111,7 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
 
 @pytest.mark.parametrize("fixed", [[], [60]], ids=["nothing fixed", "one of the second fixed"])
 def test_a_trajectory_is_placed_by_its_loops_to_what_is_placed_however_they_are_numbered(fixed: list[int]) -> None:
-    """The last one is tied to the first by three loops, and by eight to the second, whose place follows."""
+    """The last trajectory has three loops to the first one, and eight to the second one, which is placed later."""
     poses, graph = laps(150)
     chained, moved = graph.chained.copy(), graph.poses.copy()
     steps, covariances = graph.steps.copy(), graph.step_covariances.copy()
@@ -135,7 +135,7 @@ def test_covariance_grows_along_the_chain_as_its_steps_add_up() -> None:
     for node in range(1, 20):
         A = se3.adjoint(se3.inverse(graph.poses[19]) @ graph.poses[node])
         expected += A @ STEP @ A.T
-    np.testing.assert_allclose(joint, expected, rtol=1e-3, atol=1e-9)  # the first node is held by 1e-6, not by 0
+    np.testing.assert_allclose(joint, expected, rtol=1e-3, atol=1e-9)  # the first node is held with 1e-6, not with 0
 
 
 def test_an_empty_and_a_single_node_graph_are_solved() -> None:
@@ -144,7 +144,8 @@ def test_an_empty_and_a_single_node_graph_are_solved() -> None:
 
 
 def test_a_covariance_that_is_none_is_rejected() -> None:
-    """Where numpy found it, not gtsam, `dpm2 map optimize` and the other process ended in a traceback."""
+    """Previously, when numpy and not gtsam detected this, `dpm2 map optimize` and the solver process ended with a
+    traceback."""
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     bad = replace(graph, covariances=graph.covariances * 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph in the process that solves it."""
+"""A graph in the solver process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dpm2_core.slam.graph.worker import GraphWorker
 
 @pytest.mark.slow
 def test_a_graph_that_cannot_be_solved_is_said_and_the_process_lives() -> None:
-    """Where numpy found it singular, not gtsam, the process ended, and that was all that was said."""
+    """Previously, when numpy and not gtsam found the graph singular, the process ended, and only that was reported."""
     steps, chained = np.tile(np.eye(4), (5, 1, 1)), np.arange(5) > 0
     covariances = np.where(chained[:, None, None], 1e-4 * np.eye(6), 0)
     sound = GraphData(steps, chained, steps, covariances)
@@ -34,11 +34,11 @@ def test_a_graph_that_cannot_be_solved_is_said_and_the_process_lives() -> None:
     finally:
         worker.close()
     assert solution is not None
-    np.testing.assert_allclose(solution.poses, steps, atol=1e-9)  # what was right already, but for rounding
+    np.testing.assert_allclose(solution.poses, steps, atol=1e-9)  # already the solution, except for rounding
 
 
 def test_a_worker_that_is_closed_while_its_process_starts_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It waited for the solution instead, and the process stayed until its pipe was closed."""
+    """Previously, it waited for the solution, and the process stayed until its pipe was closed."""
     started: list[subprocess.Popen[bytes]] = []
     popen = subprocess.Popen
 
