@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops in a street that is driven again: the same way, in reverse, and across; the drift may be as it likes."""
+"""Loops in a street that is driven again, in the same direction, in reverse and across, with any drift."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from ....helpers.rooms import scan as room_scan
 
 OFF = isotropic(0.01, 0.7)
 STREET = np.arange(40.0, 105.0, 5.0)
-ONE_PART = np.zeros(100, np.intp)  # all keyframes are tied together
+ONE_PART = np.zeros(100, np.intp)  # all keyframes are in one part of the graph
 
 
 def suburb() -> World:
@@ -61,7 +61,7 @@ def described(s: float, lateral: float, heading: float) -> Descriptors | None:
 
 @cache
 def scan(s: float, lateral: float, heading: float) -> Points:
-    """What is seen there, the same each time."""
+    """Points seen from there, the same each time."""
     rng = np.random.default_rng([int(10 * s), int(100 + lateral), int(10 * heading)])
     return Lidar(LidarConfig()).scan(suburb(), where(s, lateral, heading), 0.1 * s, rng).points
 
@@ -79,7 +79,7 @@ def closer(with_network: bool = True, **settings: object) -> LoopCloser:
 
 
 def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings: object) -> tuple[list[Edge], Array]:
-    """The loops that are tried along the street and then at `places`, before which the odometry errs by `jump`."""
+    """Loops tried along the street and then at `places`, before which the odometry has an error of `jump`."""
     at = [(s, 0.0, 0.0) for s in STREET] + list(places)
     truth = np.array([where(*place) for place in at])
     odometry = truth.copy()
@@ -95,14 +95,15 @@ def drive(places: Sequence[tuple[float, float, float]], jump: Array, **settings:
 
 
 def errors(loops: Sequence[Edge], truth: Array) -> list[float]:
-    """Distances of the accepted ones from the truth, m."""
+    """Translation errors of the loops, m."""
     true = [se3.inverse(truth[loop.from_node]) @ truth[loop.to_node] for loop in loops]
     off = [se3.inverse(T) @ loop.T_from_to for T, loop in zip(true, loops, strict=True)]
     return [float(np.linalg.norm(T[:3, 3])) for T in off]
 
 
 def test_what_is_merged_around_a_keyframe_has_the_scale_of_that_one(noise: np.random.Generator) -> None:
-    """Where a drive leaves a room: of the scale of the first it was one of the room, without the keyframe itself."""
+    """Where a drive leaves a room, the scales differ. Previously, the scale was that of the first keyframe: the
+    descriptors were those of the room, without the keyframe itself."""
     scales = (5.0, 5.0, 1.0, 1.0)
     sets = [replace(Descriptors.of(noise.normal(0, 9, (9 + i, 3)), noise.normal(size=(9 + i, 128))), scale=scale)
             for i, scale in enumerate(scales)]  # fmt: skip
@@ -115,7 +116,7 @@ def test_what_is_merged_around_a_keyframe_has_the_scale_of_that_one(noise: np.ra
 @pytest.mark.weights
 @pytest.mark.parametrize("heading", [0.0, np.pi, np.pi / 2], ids=["same", "reverse", "across"])
 def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> None:
-    """The odometry is 2 m off, as it says it may be."""
+    """The odometry is 2 m off, which its covariance allows."""
     places = [(s, 2.5, heading) for s in (62.0, 67.0, 72.0)]
     jump = se3.exp(np.array([0, 0, np.radians(0.6), 1.2, 0.6, 0]))
     loops, truth = drive(places, jump, gap=30.0, consistency={"drift": 0.05})
@@ -123,13 +124,13 @@ def test_a_revisit_is_found_whatever_the_drift_and_heading(heading: float) -> No
     assert {loop.to_node for loop in accepted} == {len(STREET), len(STREET) + 1, len(STREET) + 2}
     assert max(errors(accepted, truth)) < 0.1
     waited = [loop for loop in loops if "waits" in loop.registration.reason]
-    assert len(waited) <= 1  # the first, for the second
+    assert len(waited) <= 1  # the first one, for the second
 
 
 @pytest.mark.slow
 @pytest.mark.weights
 def test_places_that_agree_on_no_motion_are_not_correlated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """That takes seven times as long, and nearly every candidate is another place."""
+    """Correlation takes seven times as long, and nearly every candidate is another place."""
     places = PlaceRecognition(load_network("small", 1))
     here, near, far = (described(*place) for place in ((40.0, 0.0, 0.0), (44.0, 2.0, np.pi), (104.0, 0.0, 0.0)))
     assert here is not None
@@ -167,9 +168,10 @@ def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -
 @pytest.mark.weights
 @pytest.mark.parametrize(("away", "closed"), [(500.0, False), (0.0, True)], ids=["two places", "one place"])
 def test_a_loop_is_clear_among_all_stretches_of_a_broken_drive(away: float, closed: bool) -> None:
-    """The street is in the map twice, of two stretches between which the odometry was lost; then two visits.
+    """The street is in the map twice, from two stretches between which the odometry was lost. Then two visits follow.
 
-    Places of another stretch were not compared: in a warehouse wrong aisles fitted to 92 %, the right one as well.
+    Previously, places of another stretch were not compared: in a warehouse wrong aisles fitted to 92 %, as did the
+    right one.
     """
     visits = [(s, 1.0, 0.0) for s in (62.0, 67.0)]
     at = [(s, 0.0, 0.0) for s in (*STREET, *STREET)] + visits
@@ -192,7 +194,8 @@ def test_a_loop_is_clear_among_all_stretches_of_a_broken_drive(away: float, clos
 @pytest.mark.weights
 @pytest.mark.parametrize(("things", "closed"), [(BOTH_ENDS, False), (np.concatenate([BOTH_ENDS, CABINET]), True)])
 def test_a_second_drive_in_a_room_that_looks_the_same_from_its_other_end(things: Array, closed: bool) -> None:
-    """It is tied to the first where the ends are told apart; else 3 of 8 were tied the wrong way round."""
+    """A loop joins the second drive to the first where the ends can be distinguished. Previously, 3 of 8 were joined
+    the wrong way round."""
     truth = np.array([standing(*place) for place in ROUND + ROUND])
     way, keyframes, clouds, loops = make_loops(SlamSettings()), list[Keyframe](), list[Points](), list[Edge]()
     for i, T in enumerate(truth):
@@ -209,7 +212,8 @@ def test_a_second_drive_in_a_room_that_looks_the_same_from_its_other_end(things:
 @pytest.mark.slow
 @pytest.mark.weights
 def test_what_the_odometry_would_reject_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 65 m the drive is 300 m away by its odometry, which has come 60 m: no place of the street can be this one."""
+    """At 65 m the drive is 300 m away by its odometry, but has covered only 60 m: no place of the street can be the
+    current one."""
     asked = list[int]()
     similar = PlaceRecognition.similar
 
@@ -226,7 +230,7 @@ def test_what_the_odometry_would_reject_is_not_asked_for(monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 def test_without_descriptors_the_pose_alone_leads_to_loops_but_of_one_that_borrows() -> None:
-    """What it shows is the cloud of another one, which is no second witness."""
+    """A keyframe that borrows has the cloud of another keyframe, which is no independent evidence."""
     jump = se3.exp(np.array([0, 0, 0, 0.5, 0.5, 0]))
     at = [(s, 0.0, 0.0) for s in STREET] + [(62.0, 1.0, 0.0)]
     truth = np.array([where(*place) for place in at])
@@ -256,10 +260,10 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
 @pytest.mark.slow
 @pytest.mark.weights
 def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the overlap head considers unlikely is rejected in words, even where descriptors match; its silence rejects
-    nothing."""
+    """A loop whose overlap is unlikely is rejected with this reason, even if its descriptors match. An overlap head
+    that returns NaN rejects nothing."""
     places = [(s, 2.5, 0.0) for s in (62.0, 67.0)]
-    jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest by pose is no help
+    jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest keyframe by pose does not help
 
     def probability(value: float) -> Callable:
         def predict(
@@ -281,14 +285,15 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
 @pytest.mark.slow
 @pytest.mark.weights
 def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The paper's way: the points are not asked, nor a second loop; a head that is not trained accepts nothing."""
+    """As in the paper: neither the points nor a second loop are checked. An overlap head that is not trained accepts
+    nothing."""
     places, jump = [(62.0, 2.5, 0.0)], se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))
     monkeypatch.setattr(Verifier, "verify", lambda *_: pytest.fail("the points were asked"))
     loops, truth = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)
     accepted = [loop for loop in loops if loop.registration.ok and loop.registration.reason == ""]
     assert len(accepted) == 1
     assert accepted[0].registration.overlap == max(loop.registration.overlap for loop in loops)
-    assert errors(accepted, truth)[0] < 0.5  # as the network registers
+    assert errors(accepted, truth)[0] < 0.5  # the accuracy of the network's registration
     monkeypatch.setattr(
         "dpm2_core.network.registrations.overlap_probability",
         lambda decoder, source, *_: torch.full(source.mask.shape[:1], torch.nan),
@@ -305,7 +310,7 @@ def car_park() -> World:
 
 @cache
 def in_the_car_park(s: float) -> tuple[Array, Points, Descriptors | None]:
-    """Pose at `s` m of the way, what a robot there sees, and its descriptors."""
+    """Pose at `s` m of the trajectory, the cloud of a robot there, and its descriptors."""
     world = car_park()
     lidar, T = Lidar(real_sensor(LidarConfig(beams=16, height=0.8))), world.pose_at(s, height=0.8)
     points = lidar.scan(world, T, 0.5 * s, np.random.default_rng(int(s))).points
@@ -314,7 +319,8 @@ def in_the_car_park(s: float) -> tuple[Array, Points, Descriptors | None]:
 
 
 def joined(*ways: tuple[float, float]) -> tuple[list[Edge], Array]:
-    """Loops between two robots in a car park that looks alike everywhere, each of which drives a part of one way, m."""
+    """Loops between two robots in a car park that looks alike everywhere. Each robot drives one stretch (start, stop),
+    m, of the same trajectory."""
     search, keyframes, clouds, truth, loops = closer(), list[Keyframe](), list[Points](), list[Array](), list[Edge]()
     for robot, (start, stop) in zip("ab", ways, strict=True):
         for s in np.arange(start, stop, 4.0):

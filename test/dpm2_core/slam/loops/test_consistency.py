@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loop passes when the odometry or a second loop agrees, waits while none does, and is rejected beyond all drift."""
+"""A loop is accepted if the odometry or a second loop agrees. It waits as long as none does, and is rejected beyond all
+drift."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import Consistency, ConsistencySettings, OdometryChain
 
-FIRM, LOST = isotropic(np.radians(0.15), 0.05), np.eye(6)  # of 5 m, as keyframes have it
+FIRM, LOST = isotropic(np.radians(0.15), 0.05), np.eye(6)  # per 5 m, as for keyframes
 
 
 def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> Array:
@@ -21,7 +22,7 @@ def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> Array:
 
 
 BENT = pose(0, 0, np.radians(0.7))
-"""What the odometry may well err by in 500 m: 6 m across at the end."""
+"""Plausible error of the odometry over 500 m: 6 m sideways at the end."""
 
 
 def keyframe(node: int, T: Array, covariance: Array | None = FIRM, robot: str = "") -> Keyframe:
@@ -30,7 +31,7 @@ def keyframe(node: int, T: Array, covariance: Array | None = FIRM, robot: str = 
 
 
 def straight(count: int = 101, step: float = 5.0) -> OdometryChain:
-    """A drive straight on, 500 m long."""
+    """A straight drive of 500 m."""
     path = OdometryChain()
     for node in range(count):
         path.append(keyframe(node, pose(step * node), None if node == 0 else FIRM))
@@ -46,7 +47,8 @@ def expected(path: OdometryChain, a: int, b: int) -> Array:
 
 
 def knowing(path: OdometryChain, parts: Sequence[int] | None = None) -> Consistency:
-    """With a map of all nodes, tied together or not, by the odometry that begins at the first one."""
+    """Consistency with a map of all nodes, in one part or in `parts`. Its poses are the odometry from the first
+    node."""
     consistency = Consistency(path)
     poses = np.array([path.T(0, node) for node in range(len(path))])
     consistency.update(poses, np.zeros(len(path), np.intp) if parts is None else np.array(parts))
@@ -65,20 +67,21 @@ def test_path_lengths_are_known_within_a_segment_alone() -> None:
     np.testing.assert_array_equal(path.since(3), [9, 6, np.inf, 0, np.inf, np.inf, np.inf])
     assert path.between(2, 4) == 6
     assert path.between(5, 6) == 3
-    assert path.between(3, 5) == np.inf  # the odometry was lost between them
+    assert path.between(3, 5) == np.inf  # the odometry was lost between these nodes
 
 
 @pytest.mark.parametrize(("sigma", "turn", "known"), [(1.0, 1e-3, True), (20.0, 1e-3, False), (1.0, 0.3, False)])
 def test_a_stretch_that_is_uncertain_by_less_than_the_drift_does_not_part_a_long_drive(
     sigma: float, turn: float, known: bool
 ) -> None:
-    # four keyframes whose scans leave the direction of the road open, in a drive of 1 km: 12 m of the 21 that may drift
+    # Four keyframes whose scans leave the direction of the road open, in a drive of 1 km: 12 m, where a drift of 21 m
+    # is allowed.
     path, uncertain = OdometryChain(), np.diag([turn**2] * 3 + [sigma**2, 1e-4, 1e-4])
     for node in range(201):
         path.append(keyframe(node, pose(5.0 * node), None if node == 0 else uncertain if 100 <= node < 104 else FIRM))
     assert path.between(0, 200) == (1000 if known else np.inf)
     assert path.since(200)[0] == path.between(0, 200)
-    assert path.between(90, 110) == np.inf  # 100 m of path may drift by 3 m: what lies on both sides is not known
+    assert path.between(90, 110) == np.inf  # 100 m of path may drift by 3 m, so the two sides are not connected
     assert path.between(0, 99) == 495
     assert path.between(104, 200) == 480
     assert knowing(path).is_first(loop(0, 200, np.eye(4)), ConsistencySettings()) is not known
@@ -99,7 +102,7 @@ def test_a_loop_beyond_all_drift_is_rejected() -> None:
         (checked,) = checked_by(consistency, loop(0, 100, T @ off))
         assert not checked.ok
         assert "from the odometry" in checked.registration.reason
-    # what was rejected confirms nothing
+    # A rejected loop confirms nothing.
     (checked,) = checked_by(consistency, loop(1, 99, expected(path, 1, 99) @ pose(11.9)))
     assert not checked.ok
 
@@ -114,7 +117,7 @@ def test_two_loops_that_agree_are_accepted_together() -> None:
     accepted = checked_by(consistency, loop(1, 100, drift @ expected(path, 1, 100)))
     assert [(a.from_node, a.to_node) for a in accepted] == [(1, 100), (0, 99)]
     assert all(a.ok for a in accepted)
-    # a third one finds the two accepted, and none is accepted twice
+    # A third loop agrees with the two accepted ones, and none is accepted twice.
     third = checked_by(consistency, loop(2, 98, drift @ expected(path, 2, 98)))
     assert [(a.from_node, a.to_node) for a in third] == [(2, 98)]
 
@@ -133,8 +136,8 @@ def test_a_loop_is_not_confirmed_by(a: int, b: int, off: Array) -> None:
 
 
 def test_storeys_that_look_alike_are_not_joined() -> None:
-    """A lap of 100 m that climbs by 2.8 m: less than the drift of 2 % and 1 m, and all loops to the storey below agree;
-    but so much is many times what such an odometry errs by."""
+    """A lap of 100 m that climbs by 2.8 m. This is less than the drift of 2 % and 1 m, and all loops to the storey
+    below agree. But it is many times the error of such an odometry."""
     path, lap = OdometryChain(), 20
     height = lambda node: 2.8 * min(node / lap, 1)  # noqa: E731
     for node in range(lap + 4):
@@ -151,7 +154,7 @@ def test_storeys_that_look_alike_are_not_joined() -> None:
 
 
 def drives(names: str) -> OdometryChain:
-    """Of robots, each of them 20 keyframes straight on in a frame of its own."""
+    """Drives of robots, each with 20 keyframes straight ahead in a frame of its own."""
     path = OdometryChain()
     for robot in names:
         for node in range(20):
@@ -160,7 +163,7 @@ def drives(names: str) -> OdometryChain:
 
 
 def test_between_robots_it_always_takes_two() -> None:
-    """Nothing is known of where they are to each other, however well a first loop happens to fit the map."""
+    """Their relative pose is not known, however well a first loop happens to fit the map."""
     consistency = knowing(drives("ab"), [0] * 20 + [1] * 20)
     T = pose(0.5)
     (first,) = checked_by(consistency, loop(3, 23, T))
@@ -174,9 +177,9 @@ def test_between_robots_it_always_takes_two() -> None:
     ids=["tied", "not tied", "elsewhere"],
 )
 def test_loops_to_drives_that_others_have_tied_agree_through_the_map(parts: str, off: float, agree: bool) -> None:
-    """As in a place of many short drives, where each loop may lead to another one of them."""
+    """As in a place with many short drives, where each loop may lead to a different drive."""
     consistency = knowing(drives("abc"), np.repeat([int(part) for part in parts], 20).tolist())
-    ahead = 12.0  # where the third began, 12 m on the way of the first two
+    ahead = 12.0  # the third drive began 12 m along the first two
     (first,) = checked_by(consistency, loop(3, 41, pose(ahead + 5.0 - 15.0)))
     assert not first.ok
     found = checked_by(consistency, loop(26, 43, pose(ahead + 15.0 - 30.0 + off)))
@@ -184,7 +187,8 @@ def test_loops_to_drives_that_others_have_tied_agree_through_the_map(parts: str,
 
 
 def test_loops_of_drives_that_are_tied_agree_through_the_map() -> None:
-    """The first waits; one of another drive that begins beside it says the same, and both place them."""
+    """The first loop waits. A loop of another drive, which begins next to it, agrees, and together they are
+    accepted."""
     consistency = knowing(drives("abc"), [0] * 20 + [1] * 40)
     (first,) = checked_by(consistency, loop(3, 22, pose(12.0 + 10.0 - 15.0)))
     assert not first.ok
@@ -197,15 +201,15 @@ def test_a_loop_is_the_first_where_neither_odometry_nor_another_loop_ties_its_en
     assert not consistency.is_first(loop(2, 18, pose(3.0) @ expected(path, 2, 18)), settings)
     assert consistency.is_first(loop(3, 23, T), settings)
     consistency.check(loop(3, 23, T), settings)
-    assert consistency.is_first(loop(4, 24, T), settings)  # the other one still waits
+    assert consistency.is_first(loop(4, 24, T), settings)  # the first loop is still waiting
     consistency.check(loop(4, 24, T), settings)
     assert not consistency.is_first(loop(5, 25, T), settings)
     assert consistency.is_first(loop(5, 25, pose(9.0)), settings)
 
 
 def test_a_loop_does_not_wait_forever() -> None:
-    """With all that nothing confirms, as of two drives in places that look alike, each search took longer: 22 ms where
-    1000 of them waited. One that 199 others came after is confirmed, one before these is not."""
+    """Previously, all unconfirmed loops were kept, as for two drives in places that look alike. Each search took
+    longer: 22 ms with 1000 waiting loops. A loop is still confirmed after 199 later ones, but not after 200."""
     path = drives("ab")
     for waits in (199, 200):
         consistency, rng = knowing(path, [0] * 20 + [1] * 20), np.random.default_rng(0)

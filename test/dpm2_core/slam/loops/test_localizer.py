@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place in a map is confirmed before it is sure, at a halt too; one that is far off must be found again."""
+"""A position in a map is confirmed before it is trusted, also at standstill. One that is far away must be found
+again."""
 
 from __future__ import annotations
 
@@ -21,10 +22,11 @@ from ....helpers.maps import FIRM
 
 
 class Places:
-    """Stands in for the relocalizer: what it finds is said; the map never confirms where the odometry leads."""
+    """Stand-in for the relocalizer: `find` returns given positions. Unless `confirms`, the map never confirms the pose
+    predicted by the odometry."""
 
     def __init__(self, *found: float, confirms: bool = False) -> None:
-        """`found`: meters along x, NaN where nothing is found."""
+        """`found`: meters along x, NaN where no position is found."""
         self._found, self._confirms = list(found), confirms
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
@@ -46,7 +48,7 @@ def halt(node: int) -> Keyframe:
 
 
 def test_where_the_map_cannot_be_read_nothing_is_found_and_the_drive_goes_on() -> None:
-    """As with a tile that is missing: the run ended there, without what it had found until then."""
+    """As with a missing tile. Previously, the run ended there, without the results until then."""
 
     class Torn(Places):
         def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
@@ -60,13 +62,13 @@ def test_where_the_map_cannot_be_read_nothing_is_found_and_the_drive_goes_on() -
     result = localizer.add(halt(1))
     assert (result.unreadable, result.registration.ok, result.state) == (True, False, State.DEGRADED)
     assert result.registration.reason == "tile 1_0: no such map file"
-    places.find(halt(1))  # from here on it can be read
+    places.find(halt(1))  # from here on the map can be read
     result = localizer.add(halt(2))
     assert (result.unreadable, result.state) == (False, State.TRACKING)
 
 
 def test_at_a_halt_a_second_keyframe_confirms_the_place() -> None:
-    """A mission that waits for `tracking` before it begins to drive would wait for ever."""
+    """A mission that waits for `tracking` before it starts to drive would wait forever."""
     localizer = Localizer(Places(0.0, confirms=True))
     assert localizer.add(halt(0)).state is State.RELOCALIZED
     assert localizer.wants(10**9)
@@ -90,7 +92,8 @@ def test_a_far_off_place_counts_when_it_is_found_again(found: tuple[float, ...],
 
 
 def test_a_place_that_is_turned_counts_when_it_is_found_again() -> None:
-    """In a small room that looks the same from its other end: half a turn away was near, and `tracking`, at once."""
+    """A small room that looks the same from its other end. Previously, a pose rotated by 180 degrees counted as near,
+    and the state was `tracking` at once."""
     about = se3.make(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
     class Turned(Places):
@@ -118,8 +121,8 @@ def test_a_place_that_is_turned_counts_when_it_is_found_again() -> None:
 def test_where_places_look_alike_one_counts_when_it_is_found_again_a_meter_on(
     way: tuple[float, ...], found: tuple[float, ...]
 ) -> None:
-    """Sooner or later a scan fits a wrong one clearly better: in a corridor with equal doors, of which others are open
-    than in the map, 3 of 6 drives were found 11 to 18 m wrong."""
+    """Sooner or later a scan fits a wrong position clearly better. In a corridor with equal doors, of which others are
+    open than in the map, 3 of 6 drives were localized 11 to 18 m wrong."""
 
     class Alike(Places):
         def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
@@ -135,30 +138,32 @@ def test_where_places_look_alike_one_counts_when_it_is_found_again_a_meter_on(
 
 
 def test_after_the_odometry_was_lost_a_place_that_fits_is_not_enough() -> None:
-    """In another aisle of a warehouse 90 % of the points fit; with a firm edge that was `tracking`, 22 m wrong."""
+    """In another aisle of a warehouse 90 % of the points fit. With a small edge covariance, the state was `tracking`
+    with a pose 22 m wrong."""
     localizer = Localizer(Places(0.0, 30.0, confirms=True))
     for node in range(2):
         localizer.add(halt(node))
     assert localizer.state is State.TRACKING
     localizer.odometry_lost(3)
     assert localizer.state is State.LOST
-    waiting = localizer.add(halt(2))  # made before the loss; in the node it is found in another thread, later
+    waiting = localizer.add(halt(2))  # created before the loss; in the node it is localized later, in another thread
     assert (waiting.state, localizer.state) == (State.TRACKING, State.LOST)
     found = localizer.add(halt(3))
     assert (found.state, localizer.state) == (State.RELOCALIZED, State.RELOCALIZED)
     assert localizer.T_map_odom[0, 3] == 30.0
     localizer.restart()
     localizer.odometry_lost(4)
-    assert localizer.state is State.RELOCALIZING  # there is no place to lose
+    assert localizer.state is State.RELOCALIZING  # there is no known position to lose
 
 
 def set_back(node: int) -> Keyframe:
-    """`halt` by a clock that was set back by 100 s."""
+    """`halt` with a clock that was set back by 100 s."""
     return replace(halt(node), stamp=(node - 100) * 10**9)
 
 
 def test_a_clock_that_is_set_back_ends_no_loss_and_prolongs_none() -> None:
-    """Ids tell the order. It was `lost` for ever, and at a halt no keyframe was asked for until the time came again."""
+    """Ids determine the order. Previously, the state was `lost` forever, and at a halt no keyframe was requested until
+    the clock had caught up."""
     localizer = Localizer(Places(0.0, 0.0, 0.0, confirms=True))
     localizer.add(halt(0))
     localizer.odometry_lost(1)
@@ -173,7 +178,7 @@ def test_a_clock_that_is_set_back_ends_no_loss_and_prolongs_none() -> None:
 
 @pytest.mark.slow
 def test_the_slam_says_that_its_odometry_was_lost(suburb_drive: tuple[list[Frame], Array]) -> None:
-    """It came back with a firm edge, and the localizer knew nothing of it."""
+    """Previously, the edge after the loss had a small covariance, and the localizer was not informed."""
     frames, blind = suburb_drive[0], np.full((40, 4), 0.2, np.float32)
     slam = make_slam(SlamSettings.model_validate({"registration": "geometric", "loops": {"descriptors": False}}))
     slam.use(slam.mapper, Localizer(Places(0.0, 30.0, confirms=True)))

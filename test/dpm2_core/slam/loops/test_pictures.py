@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the points fit everywhere, a picture finds the place; where it fits nowhere or twice, there is no answer."""
+"""Where the points fit everywhere, an image determines the place. If the image fits nowhere or twice, there is no
+result."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ def keyframe(x: float, paint: Paint, index: int, pictured: bool = True) -> Keyfr
 
 @cache
 def with_picture(x: float, paint: Paint, index: int) -> Keyframe:
-    """Not to be written to: the tests have maps of the same keyframes."""
+    """Cached: do not write to it. The maps of the tests share these keyframes."""
     seen = frame(x, paint, index, gain=0.8)
     picture = thumbnail(seen.images[0], PLACE_WIDTH)
     whole = Keyframe(index, index * 10**9, index, place(x), seen.points, thumbnail=picture)
@@ -52,7 +53,7 @@ def place(x: float) -> Array:
 
 
 def in_map(keyframes: list[Keyframe]) -> KnownMap:
-    """Keyframes at each of `AT`."""
+    """Map with a keyframe at each of `AT`."""
     poses = np.array([place(x) for x in AT])
     return KnownMap(keyframes, lambda n: keyframes[n].cloud, poses, lambda n: keyframes[n].thumbnail)
 
@@ -71,7 +72,8 @@ def relocalizer(paint: Paint, pictured: bool = True, visual: VisualSettings | No
 
 @pytest.mark.slow
 def test_a_place_in_a_corridor_is_found_by_its_picture_alone() -> None:
-    """To 5 cm, two steps of the fine search at half the resolution; without the picture or the map's, not at all."""
+    """The accuracy is 5 cm, two steps of the fine search at half the resolution. Without the robot's image or those of
+    the map, the place is not found."""
     visit = keyframe(18.3, PAINT, 77)
     found = relocalizer(PAINT).find(visit)
     assert found.ok, found.reason
@@ -102,7 +104,8 @@ def test_a_picture_that_fits_nowhere_or_everywhere_is_no_place(paint: Paint, see
 
 @pytest.mark.slow
 def test_localization_goes_on_along_a_corridor() -> None:
-    """Found, then confirmed at each keyframe, with an odometry that runs 4 % too far; blind, it is lost."""
+    """Relocalized, then confirmed at each keyframe, although the odometry overestimates the distance by 4 %. Without
+    images the robot never localizes."""
     for pictured in (True, False):
         localizer = Localizer(relocalizer(PAINT))
         states = []
@@ -117,7 +120,7 @@ def test_localization_goes_on_along_a_corridor() -> None:
 
 @pytest.mark.slow
 def test_a_damaged_picture_in_a_map_is_no_picture() -> None:
-    """Its neighbor shows the place, too."""
+    """The neighboring keyframe shows the place, too."""
     visit = keyframe(18.3, PAINT, 77)
     keyframes = [keyframe(x, PAINT, n) for n, x in enumerate(AT)]
     jpeg = keyframes[4].thumbnail

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A direction that the normals leave open is closed where the scan fits worse on either side."""
+"""A direction that the normals leave open is constrained if the scan fits worse on either side."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ....helpers.drives import Drive
 def test_a_direction_is_open_only_where_the_scan_fits_as_well_a_meter_away(
     suburb_drive: Drive, tunnel_drive: Drive
 ) -> None:
-    """Its covariance says open in both; in a street the scan fits clearly worse a meter away."""
+    """The covariance leaves the direction open in both drives; in a street the scan fits clearly worse a meter away."""
     sigma = {}
     for name, drive in {"street": suburb_drive, "tunnel": tunnel_drive}.items():
         registration, local_map = (
@@ -32,5 +32,5 @@ def test_a_direction_is_open_only_where_the_scan_fits_as_well_a_meter_away(
         result = registration.register(source, local_map, drive[1][5])
         doubted = replace(result, covariance=result.covariance + np.diag([0, 0, 0, 1.0, 0, 0]))
         sigma[name] = probed(registration, source, local_map, doubted).worst_sigma
-    assert sigma["street"] < 0.1  # what a loop is accepted with
+    assert sigma["street"] < 0.1  # as for an accepted loop
     assert sigma["tunnel"] > 0.5

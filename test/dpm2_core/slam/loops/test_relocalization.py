@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One cloud is enough to be found in a map, none makes one sure of a wrong place, and kidnapping is noticed."""
+"""One cloud is enough to relocalize in a map, no cloud leads to high confidence in a wrong place, and kidnapping is
+detected."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def world(preset: PresetName = "suburb", seed: int = 8) -> World:
 
 @cache
 def seen(s: float, lateral: float = 0.0, heading: float = 0.0, time: float = 0.0, of: World | None = None) -> Points:
-    """Not to be written to."""
+    """Cached points of a scan: do not write to them."""
     place = of or world()
     return LIDAR.scan(place, place.pose_at(s, lateral, heading), time, np.random.default_rng(int(10 * s))).points
 
@@ -58,9 +59,9 @@ def relocalizer() -> Relocalizer:
 
 
 def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) -> Relocalizer:
-    """`looks`: what the descriptors are of; the clouds."""
+    """`looks`: the clouds that the descriptors are computed from; by default `clouds`."""
     network, described = load_network("small", 1), dict[int, Descriptors | None]()
-    for cloud in looks or clouds:  # some look alike
+    for cloud in looks or clouds:  # some are the same cloud
         if id(cloud) not in described:
             described[id(cloud)] = PlaceRecognition(network).descriptors(lone(cloud))
     keyframes = [
@@ -73,7 +74,7 @@ def made(clouds: list[Points], poses: Array, looks: list[Points] | None = None) 
 
 
 def lone(cloud: Points) -> Keyframe:
-    """One that has nothing but its cloud."""
+    """A keyframe with only a cloud."""
     return Keyframe(0, 0, 0, np.eye(4), cloud)
 
 
@@ -116,7 +117,7 @@ def test_another_street_is_not_found_and_a_wrong_hint_finds_nothing(relocalizer:
 def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(
     kept: float, found: bool, away: tuple[float, float, float]
 ) -> None:
-    """The street stands twice in the map: as it is, and far away or above with a share of the directions kept."""
+    """The street is in the map twice: as it is, and far away or above with a fraction of the directions kept."""
     at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array(away))
     poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
     partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 2 * kept - 1] for cloud in clouds]
@@ -130,7 +131,7 @@ def test_a_place_is_found_only_where_it_fits_clearly_better_than_another_one(
 
 @pytest.mark.slow
 def test_no_place_is_found_where_another_storey_would_be_believed_alone() -> None:
-    """One stands where a keyframe was taken; on the next storey, which is built alike, 93 % of the points fit."""
+    """The robot is where a keyframe was taken. On the next storey, which is built alike, 93 % of the points fit."""
     at, up = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 0, 3.0]))
     poses, clouds = np.array([world().pose_at(s) for s in at]), [seen(s) for s in at]
     partly = [cloud[np.sin(8 * np.arctan2(cloud[:, 1], cloud[:, 0])) <= 0.6] for cloud in clouds]
@@ -141,9 +142,11 @@ def test_no_place_is_found_where_another_storey_would_be_believed_alone() -> Non
 
 @pytest.mark.slow
 def test_a_place_that_looks_less_alike_is_compared_too() -> None:
-    """Of six candidates three were verified: in a warehouse the aisle that was found was not compared with its like.
+    """Previously, three of six candidates were verified: in a warehouse, the aisle found was not compared with its
+    double.
 
-    Three places look like the scan, of which one fits to more than half; the fourth, of a keyframe further on, too.
+    Three places look like the scan, but only one of them fits to more than half. The fourth, of a keyframe further
+    along, fits as well.
     """
     here, there, whole = world().pose_at(63.0), world().pose_at(68.0), seen(63.0)
     half = whole[np.sin(8 * np.arctan2(whole[:, 1], whole[:, 0])) <= 0]
@@ -152,7 +155,7 @@ def test_a_place_that_looks_less_alike_is_compared_too() -> None:
     clouds, looks = [whole, half, half, same], [whole, whole, whole, seen(68.0)]
     poses = np.array([here, here, here, there])
     poses[:, 1, 3] += [0, 500, 1000, 1500]
-    # Of keyframes next to each other one is a candidate: what looks like nothing is between them.
+    # Only one of neighboring keyframes is a candidate, so keyframes that look like no other are inserted between them.
     nothing, between = seen(60.0, of=world("city", 5)), np.repeat(poses, 2, 0)
     between[1::2, 2, 3] += 500
     relocalizer = made(
@@ -164,8 +167,9 @@ def test_a_place_that_looks_less_alike_is_compared_too() -> None:
 
 @pytest.mark.slow
 def test_a_place_that_was_passed_often_is_compared_with_one_that_was_passed_once(tmp_path: Path) -> None:
-    """The street stands twice in the map, driven eight times and once: all six candidates, and the nine keyframes by
-    each, were of the first, where it was found, 500 m from where it was. Laps after the first one borrow."""
+    """The street is in the map twice, driven eight times and once. Previously, all six candidates, and the nine
+    keyframes around each, were of the first, and the robot localized there, 500 m from its position. Laps after the
+    first one borrow clouds."""
     at, far = np.arange(55.0, 71.0, 5.0), se3.make(np.eye(3), np.array([0, 500.0, 0]))
     streets, describe = np.array([world().pose_at(s) for s in at]), PlaceRecognition(load_network("small", 1))
     poses, looks = np.concatenate([*[streets] * 8, far @ streets]), [describe.descriptors(lone(seen(s))) for s in at]
@@ -180,7 +184,8 @@ def test_a_place_that_was_passed_often_is_compared_with_one_that_was_passed_once
 @pytest.mark.slow
 @pytest.mark.parametrize("things", [BOTH_ENDS, np.concatenate([BOTH_ENDS, CABINET])], ids=["alike", "told apart"])
 def test_in_a_room_that_looks_the_same_from_its_other_end_both_ways_are_compared(things: Array) -> None:
-    """In a small one both are within 5 m, and counted as one place: the wrong way round in 5 of 10 searches."""
+    """In a small room both poses are within 5 m. Previously, they counted as one place, and 5 of 10 searches returned
+    the wrong orientation."""
     at = np.array([standing(*place) for place in ROUND])
     relocalizer = made([scan(T, HALL, things, i) for i, T in enumerate(at)], at)
     for seed, place in enumerate([(0.4, 0.5, 330.0), (-1.2, 0.7, 160.0), (1.7, 0.4, 20.0)]):
@@ -200,7 +205,7 @@ def test_an_empty_cloud_is_no_place(relocalizer: Relocalizer) -> None:
 
 
 def keyframe(node: int, s: float, T_world_odom: Array, covariance: Array = FIRM, of: World | None = None) -> Keyframe:
-    """Taken at `s` of the street; the odometry frame lies at T_world_odom."""
+    """Keyframe at `s` of the street; the pose of the odometry frame is T_world_odom."""
     T_odom_kf = se3.inverse(T_world_odom) @ world().pose_at(s)
     edge = Registration(np.eye(4), covariance, 1.0, 0.1, "test") if node else None
     return Keyframe(node, node, node, T_odom_kf, seen(s, time=3.0, of=of), edge)
@@ -212,17 +217,17 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     origin = se3.exp(np.array([0, 0, 1.0, 30, -20, 0.5]))
     first = localizer.add(keyframe(0, 55.0, origin))
     assert first.state is State.RELOCALIZED
-    np.testing.assert_allclose(localizer.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at the lever's 60 m
-    # five meters on, the odometry errs by 0.3 m: taken up
+    np.testing.assert_allclose(localizer.T_map_odom[:3, 3], origin[:3, 3], atol=1.0)  # 0.1 deg at a lever arm of 60 m
+    # After five meters the odometry is 0.3 m off: this is corrected.
     tracked = localizer.add(keyframe(1, 60.0, origin @ se3.make(np.eye(3), np.array([0.3, 0, 0]))))
     assert tracked.state is State.TRACKING
     assert np.linalg.norm(tracked.T_map_kf[:3, 3] - world().pose_at(60.0)[:3, 3]) < 0.1
-    # the odometry was lost, and goes on somewhere: found at once
+    # The odometry was lost and continues elsewhere: the place is found at once.
     broken = se3.exp(np.array([0, 0, -0.5, 5, 5, 0]))
     again = localizer.add(keyframe(2, 95.0, broken, LOST))
     assert again.state is State.RELOCALIZED
     assert np.linalg.norm(again.T_map_kf[:3, 3] - world().pose_at(95.0)[:3, 3]) < 0.1
-    # a place that the map does not show: degraded, then lost, with a covariance that covers it
+    # A place that is not in the map: degraded, then lost, with a covariance that covers the error.
     states, sigmas = [], []
     for node in range(3, 7):
         located = localizer.add(keyframe(node, 95.0 + node, broken, of=world("city", 5)))
@@ -231,9 +236,9 @@ def test_localization_tracks_notices_kidnapping_and_admits_being_lost(relocalize
     assert states[0] is State.DEGRADED
     assert states[-1] is State.LOST
     assert sigmas[-1] >= 100.0**2 * 0.99
-    # back again
+    # Back in the map.
     assert localizer.add(keyframe(7, 70.0, broken)).state is State.RELOCALIZED
-    # one scan from elsewhere is not believed at once; at a halt one looks again after a second
+    # One scan from elsewhere is not trusted at once; at a halt, the next search follows after a second.
     assert localizer.add(keyframe(8, 72.0, broken)).state is State.TRACKING
     elsewhere = replace(keyframe(9, 74.0, broken), cloud=keyframe(9, 95.0, broken).cloud)
     doubted = localizer.add(elsewhere)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The index finds what looks alike, in any order and number, and never what has no descriptors or is not allowed."""
+"""The index returns similar places, whatever the order and number of descriptors, and never places without descriptors
+or that are not allowed."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from dpm2_core.slam.loops.retrieval import PlaceIndex, pooled
 
 
 def place(seed: int, noise: float = 0.0, count: int = 256) -> Descriptors:
-    """Descriptors whose features follow a distribution of their own; `noise` changes them a little."""
+    """Descriptors whose features have their own distribution; `noise` changes them a little."""
     kind, rng = np.random.default_rng(seed), np.random.default_rng([seed, int(1e6 * noise)])
     mixing = kind.normal(size=(16, 128))
     features = rng.normal(size=(count, 16)) @ mixing + noise * rng.normal(size=(count, 128))
@@ -51,7 +52,7 @@ def test_what_is_not_allowed_or_has_no_descriptors_is_never_found() -> None:
     index = PlaceIndex()
     for seed in range(10):
         index.append(None if seed == 4 else place(seed))
-    index.append(place(11, count=20))  # too few to say anything
+    index.append(place(11, count=20))  # too few to be distinctive
     allowed = np.ones(11, bool)
     allowed[6] = False
     found = index.nearest(pooled(place(6)), allowed, 20)

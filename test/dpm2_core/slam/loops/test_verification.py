@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A right pose is accepted, and no wrong one: not elsewhere, not on bare ground, not along a tunnel."""
+"""A right pose is accepted and no wrong one: neither elsewhere, nor on bare ground, nor along a tunnel."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from dpm2_core.slam.registration.icp import GeometricSettings
     ],
 )
 def test_a_place_must_fit_clearly_better_than_others(best: float, others: list[float], objection: str) -> None:
-    """Half as much does not fit as at the next best place; one that was not tried is assumed to fit to 80 %."""
+    """The fraction of points that do not fit must be half of that at the next best place. A place that was not tried is
+    assumed to fit to 80 %."""
     fits = [Registration(np.eye(4), np.eye(6), confidence) for confidence in (best, *others)]
     assert objection_of_others(fits[0], fits[1:]) == objection
 
