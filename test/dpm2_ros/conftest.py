@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small drive, and real nodes over real DDS: in this process for their logic, as processes for their lives."""
+"""A small drive, and real nodes over real DDS: in this process for their logic, as processes for start and end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ros_environment()["ROS_AUTOMATIC_D
 
 
 def _own_domains() -> Iterator[int]:
-    """ROS domains from 1 to 100, over and over: a fifth of them that no other run of the tests beside this one has."""
+    """ROS domains from 1 to 100, over and over: a fifth of them that no other test run on this machine uses."""
     for fifth in range(5):
         lock = (Path(tempfile.gettempdir()) / f"dpm2_test_domains_{fifth}.lock").open("w")
         try:
@@ -43,22 +43,22 @@ def _own_domains() -> Iterator[int]:
             continue
         while True:  # the lock is held for as long as the generator lives
             yield from range(1 + 20 * fifth, 21 + 20 * fifth)
-    yield from (1 + (7 * os.getpid() + n) % 100 for n in count())  # six runs at once
+    yield from (1 + (7 * os.getpid() + n) % 100 for n in count())  # a sixth run at the same time
 
 
 _domains = _own_domains()
 
-FRAMES, PERIOD, STEP = 16, 100_000_000, 0.8  # scans, ns and m between them
+FRAMES, PERIOD, STEP = 16, 100_000_000, 0.8  # number of scans; ns and m between them
 START = 1_700_000_000_000_000_000
 
 
 def new_domain() -> int:
-    """One that neither another test of this run nor a run beside it uses."""
+    """A ROS domain that neither another test of this run nor a parallel run uses."""
     return next(_domains)
 
 
 def scan(T_world_lidar: Array) -> Points:
-    """(N, 4) points of a street within 40 m: ground, house fronts, side walls. The same points from everywhere."""
+    """(N, 4) points of a street within 40 m: ground, house fronts, side walls. The same points from every pose."""
     world = _street()
     local = se3.transform(se3.inverse(T_world_lidar), world)
     return local[np.einsum("ij,ij->i", local[:, :3], local[:, :3]) < 40.0**2]
@@ -82,17 +82,17 @@ def _street() -> Points:
 
 
 def pose(n: int) -> Array:
-    """T_world_lidar of the n-th scan: straight on with a slight turn."""
+    """T_world_lidar of the n-th scan: straight ahead with a slight rotation."""
     return se3.exp([0, 0, 0.004 * n, STEP * n, 0, 0])
 
 
 class Drive:
-    """The drive, scan by scan."""
+    """The scans of the drive, with stamps and poses."""
 
     frames, period, start = FRAMES, PERIOD, START
 
     def stamp(self, n: int) -> int:
-        """ns."""
+        """Stamp of the n-th scan, ns."""
         return START + n * PERIOD
 
     def pose(self, n: int) -> Array:
@@ -136,8 +136,8 @@ def bag(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def no_earlier_nodes() -> None:
-    """For those that hear /rosout: ROS ends it for all nodes of a name as soon as one of them goes, and what an earlier
-    test has left goes when Python finds it."""
+    """For tests that listen to /rosout: when a node is destroyed, ROS ends /rosout for all nodes of its name, and a
+    node of an earlier test is destroyed only when Python collects it."""
     gc.collect()
 
 
@@ -160,7 +160,7 @@ def mapper(
     ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> Any:
     """Harness with a mapper_node that saves to tmp_path/map, and `send(name, T, cloud)` for keyframes; with the network
-    where its parameter says so."""
+    if the test's parameter is true."""
     from dpm2_ros.mapper_node import MapperNode  # these import the whole SLAM
     from test.helpers.mapping import Wires
 
@@ -181,7 +181,7 @@ def mapper(
 
 @pytest.fixture
 def run() -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs one of the executables to its end: run("slam_node", *arguments)."""
+    """Runs one of the executables until it exits: run("slam_node", *arguments)."""
 
     def finish(name: str, *arguments: str, timeout: float = 180.0) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "dpm2_ros.executables", name, *arguments]
@@ -193,7 +193,7 @@ def run() -> Callable[..., subprocess.CompletedProcess[str]]:
 
 @pytest.fixture
 def processes() -> Iterator[list[subprocess.Popen[bytes]]]:
-    """To be killed at the end."""
+    """Processes that are killed when the test ends."""
     started: list[subprocess.Popen[bytes]] = []
     yield started
     for process in started:
@@ -203,26 +203,26 @@ def processes() -> Iterator[list[subprocess.Popen[bytes]]]:
 
 @pytest.fixture
 def domain() -> int:
-    """A ROS domain of this test's own."""
+    """A ROS domain that only this test uses."""
     return new_domain()
 
 
 @pytest.fixture
 def domains() -> Iterator[int]:
-    """More of them, for a test whose processes must not meet."""
+    """More such domains, for a test whose processes must not discover each other."""
     return _domains
 
 
 @pytest.fixture
 def drive() -> Drive:
-    """The drive, scan by scan."""
+    """The scans of the drive, with stamps and poses."""
     return Drive()
 
 
 @pytest.fixture
 def rig(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
-    """Makes a Rig whose node sends diagnostics ten times a second, and takes no sensor for silent: a busy machine may
-    take its time between a cloud and the next look at what came of it."""
+    """Makes a Rig whose node sends diagnostics ten times per second and never reports a sensor as silent: on a busy
+    machine, much time may pass between a cloud and the next check of its result."""
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
     monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 300.0)
     return lambda *parameters, **options: Rig(ros, drive, *parameters, **options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every drive leaves a map that can be loaded, and takes nothing from those before it."""
+"""Every drive leaves a map that can be loaded, and changes nothing in earlier maps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def keyframes(count: int) -> list[Keyframe]:
 
 
 def driven(count: int, robot: str = "", **ros: Any) -> ActiveMap:
-    """The map of so many keyframes, which goes on."""
+    """An open map of `count` keyframes."""
     active = ActiveMap(config(**ros), robot, LOG)
     for keyframe in keyframes(count):
         active.add(keyframe)
@@ -55,7 +55,7 @@ def driven(count: int, robot: str = "", **ros: Any) -> ActiveMap:
 
 
 def drive(directory: Path, count: int = 3, robot: str = "", **ros: Any) -> None:
-    """From the start of a node to its end."""
+    """A whole drive, from the start of a node to its end."""
     active = driven(count, robot, map_directory=str(directory), **ros)
     if count:
         active.save()
@@ -67,7 +67,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    """Drives of one robot and of another, into one folder; each map is sound, and none changes any more."""
+    """Drives of two robots into one folder: each map is sound, and no later drive changes it."""
     before: dict[str, bytes] = {}
     for robot, name in (("", "drive"), ("", "drive-2"), ("blue/one", "drive_blue_one"), ("", "drive-3")):
         drive(tmp_path, robot=robot)
@@ -83,7 +83,8 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As after a crash of mapper_node; a drive without a name of its own begins a new map, and so does a reset."""
+    """The drive starts a new map, as after a crash of mapper_node. Drives without a named file do so without a warning;
+    so does a reset."""
     caplog.set_level(logging.WARNING)
     town = tmp_path / "town.dpm2map"
     for file in ("auto", "auto", str(town)):
@@ -101,7 +102,7 @@ def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
 def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It would hold that one's keyframes, or be malformed: the next number is taken."""
+    """The new map would contain keyframes of the removed one or be malformed: the next number is taken."""
     log = tmp_path / "drive.dpm2map-wal"
     log.write_bytes(b"log")
     drive(tmp_path)
@@ -112,7 +113,7 @@ def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
 
 
 def test_a_copy_of_the_map_leaves_the_log_of_one_that_was_moved(tmp_path: Path) -> None:
-    """Where it was moved to it lacks its last keyframes until the log is beside it."""
+    """The map that was moved lacks its last keyframes until its log is next to it again."""
     log = tmp_path / "town.dpm2map-wal"
     log.write_bytes(b"log")
     active = driven(1, map_directory=str(tmp_path))
@@ -122,7 +123,7 @@ def test_a_copy_of_the_map_leaves_the_log_of_one_that_was_moved(tmp_path: Path) 
 
 
 def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
-    """As `ros.map_file:=''` leaves one, or dpm2 0.1."""
+    """Such a folder is left by `ros.map_file:=''` or by dpm2 0.1."""
     drive(tmp_path, map_file="")
     assert sorted(contents(tmp_path)) == ["drive/map.ply", "drive/pose_graph.g2o", "drive/trajectory.tum"]
     drive(tmp_path)
@@ -142,7 +143,7 @@ def test_a_second_save_of_one_drive_replaces_the_first(tmp_path: Path) -> None:
 
 
 def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
-    """A whole copy, which does not grow; the same drive replaces it, another drive gets a name with a number."""
+    """The copy is complete and does not grow. The same drive replaces it; another drive gets a name with a number."""
     active = driven(2, map_directory=str(tmp_path))
     assert str(tmp_path / "town.dpm2map") in active.save("town")
     active.add(Keyframe(**vars(keyframes(3)[2])))
@@ -163,7 +164,7 @@ def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
 
 
 def test_a_name_that_leads_to_the_file_of_the_drive_itself_is_no_copy(tmp_path: Path) -> None:
-    """A copy took the file's place under the node, and no keyframe after it was kept."""
+    """A copy replaced the file that the node was writing to, and no later keyframe was kept."""
     active, town = driven(2, map_directory=str(tmp_path)), tmp_path / "town.dpm2map"
     active.save("town")
     town.unlink()
@@ -185,7 +186,7 @@ def test_a_name_stays_within_the_folder(name: str) -> None:
 
 
 def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither folder nor file, also where the other is given; a drive without a keyframe leaves nothing either."""
+    """Neither folder nor file is made for an empty setting, even if the other is given, nor for an empty drive."""
     monkeypatch.chdir(tmp_path)
     for ros in ({"map_directory": ""}, {"map_directory": "", "map_file": ""}):
         active = driven(1, **ros)
@@ -202,7 +203,7 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) -> None:
-    """The map grows without it."""
+    """The map grows in memory without a file; the problem is reported until a file can be made."""
     directory = tmp_path / "maps"
     directory.write_text("no folder")
     active = ActiveMap(config(map_directory=str(directory)), "", LOG)
@@ -216,7 +217,7 @@ def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) 
 
 
 def test_a_map_whose_file_could_not_be_made_is_not_said_to_be_saved(tmp_path: Path) -> None:
-    """The disk was full when the drive began: `town` was "saved", and there was no town.dpm2map to find oneself in."""
+    """The disk was full when the drive began: `town` was reported as saved, but there was no map to localize in."""
     (tmp_path / "full").write_text("no folder")
     active = driven(2, map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "full" / "a.dpm2map"))
     with pytest.raises(Dpm2Error, match=r"map of 2 keyframes saved in .*town, but there is no map file: .*full"):
@@ -224,7 +225,7 @@ def test_a_map_whose_file_could_not_be_made_is_not_said_to_be_saved(tmp_path: Pa
     assert [path.name for path in (tmp_path / "maps").iterdir()] == ["town"]
     (tmp_path / "full").unlink()
     assert "but there is no map file: " in active.keep()
-    active.reset()  # with which there is one
+    active.reset()  # now the file can be made
     active.add(keyframes(1)[0])
     assert re.search(r"map of 1 keyframes saved in .*, and as .*a-2\.dpm2map", active.save())
     active.close()
@@ -255,7 +256,7 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another program writes to the file, which is as a full disk: the folder is made, no copy; then all is saved."""
+    """Another program locks the file, like a full disk: the folder is saved, but no copy. Later all is saved."""
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     active = driven(1, map_directory=str(tmp_path))
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
@@ -272,7 +273,7 @@ def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("name", ["", "town"])
 def test_a_map_whose_file_was_moved_since_the_last_keyframe_is_not_saved(tmp_path: Path, name: str) -> None:
-    """It said that the map is saved in a file that was not there; back in its place, it is saved."""
+    """The node reported a map as saved in a file that did not exist. Once the file is back, the map is saved."""
     active = driven(1, map_directory=str(tmp_path))
     path, elsewhere = tmp_path / "drive.dpm2map", tmp_path / "elsewhere"
     path.rename(elsewhere)
@@ -285,7 +286,7 @@ def test_a_map_whose_file_was_moved_since_the_last_keyframe_is_not_saved(tmp_pat
 
 
 def described(**ros: Any) -> NodeConfig:
-    """As a node is by default, but for the registration of its odometry."""
+    """The default settings of a node, except for the registration of its odometry."""
     return NodeConfig.model_validate({"ros": ros, "slam": {"registration": "geometric"}})
 
 
@@ -301,14 +302,14 @@ def test_where_one_robot_starts_again_the_others_stay(tmp_path: Path) -> None:
 
 
 def street(n: int) -> Keyframe:
-    """After n scans along the street of the small drive."""
+    """Keyframe after n scans along the street of the small drive."""
     edge = Registration(se3.inverse(pose(n - 1)) @ pose(n), np.eye(6) * 1e-4, 1.0, 0.01, "test") if n else None
     return Keyframe(n, n, n, se3.inverse(pose(0)) @ pose(n), scan(pose(n)), edge)
 
 
 @pytest.mark.weights
 def test_a_drive_that_nothing_ties_to_the_map_is_no_place_in_it(tmp_path: Path) -> None:
-    """A robot was `tracking` there, wherever the frame of that drive happened to be in the map: 120 m off."""
+    """A robot was `tracking` there, at the pose that its drive's frame happened to have in the map: 120 m off."""
     made = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
     made.add(keyframes(1)[0])
     made.close()
@@ -330,7 +331,7 @@ def test_a_drive_that_nothing_ties_to_the_map_is_no_place_in_it(tmp_path: Path) 
 @pytest.mark.weights
 @pytest.mark.parametrize("descriptors", [True, False])
 def test_a_growing_map_that_does_not_serve_goes_on(tmp_path: Path, descriptors: bool) -> None:
-    """No keyframe yet, or none with descriptors: the drive stays in one piece."""
+    """A map without keyframes or without descriptors is unusable for localization: the drive continues in one piece."""
     active = ActiveMap((described if descriptors else config)(map_directory=str(tmp_path)), "", LOG)
     before, reason = (0, "no keyframe yet") if descriptors else (3, "no keyframe has descriptors")
     for keyframe in keyframes(before):
@@ -345,7 +346,7 @@ def test_a_growing_map_that_does_not_serve_goes_on(tmp_path: Path, descriptors: 
 
 
 def another_map(folder: Path) -> None:
-    """A map of one keyframe, saved in that folder as town, in which one may find oneself."""
+    """A map of one keyframe, saved in `folder` as town, in which a robot can localize."""
     made = ActiveMap(described(map_directory=str(folder)), "", LOG)
     made.add(street(0))
     made.save("town")
@@ -354,7 +355,7 @@ def another_map(folder: Path) -> None:
 
 @pytest.mark.weights
 def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: Path) -> None:
-    """Nothing else would have it; a name that names no map leaves the drive in one piece."""
+    """It would be lost otherwise. A name without a map leaves the drive in one piece."""
     another_map(tmp_path)
     active = driven(3, map_directory=str(tmp_path), map_file="")
     with pytest.raises(UsageError, match="no such map file"):
@@ -368,7 +369,7 @@ def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: 
 
 @pytest.mark.weights
 def test_what_was_saved_last_under_a_name_is_what_is_loaded_by_it(tmp_path: Path) -> None:
-    """Not the map of another drive that has the name, and for which the copy has got a number."""
+    """It is not the map of another drive that has the plain name, because of which the copy was numbered."""
     another_map(tmp_path)
     active = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
     for n in (0, 5):
@@ -380,7 +381,7 @@ def test_what_was_saved_last_under_a_name_is_what_is_loaded_by_it(tmp_path: Path
 
 
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
-    """A looped bag, a clock that was set back: a stretch of its own, whose ids count on."""
+    """After a looped bag or a clock that was set back, a separate segment begins; the keyframe ids continue."""
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in [*keyframes(3), *keyframes(2)]:
         active.add(keyframe)
@@ -391,7 +392,7 @@ def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -
 
 
 def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`dpm2 map check`, `export` for Nav2, and the hint where a map to find oneself in is not named."""
+    """`dpm2 map check`, `export` for Nav2, and the hint if localization is requested without naming a map."""
     drive(tmp_path)
     for arguments in (["check"], ["export", str(tmp_path / "grid.yaml")], ["info"]):
         with pytest.raises(SystemExit) as ended:
@@ -404,7 +405,7 @@ def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_two_nodes_that_start_together_do_not_share_a_file(tmp_path: Path) -> None:
-    """Eight at once, in one folder and of one name."""
+    """Eight start at the same time, in one folder and with the same name."""
     made: list[ActiveMap] = []
 
     def start() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in the bag arrives, unchanged, in order and in time."""
+"""The messages of the bag are published unchanged, in order and at the right time."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Listener:
         return self._log.read_text()
 
     def hear_here(self, bag: Path, **options: Any) -> None:
-        """Play in this process, to the end: where it is not the process that matters, without its imports."""
+        """Play to the end in this process: if the separate process does not matter, this saves the imports."""
         play(bag, lockstep=False, clock=True, **options)
 
 
@@ -83,19 +83,19 @@ def test_everything_arrives_as_recorded(listener: Listener, bag: Path, drive: An
     wait(lambda: ticks()[-1:] == [source.stamps[-1]], "the last of /clock")
     now = np.array(ticks())
     assert len(now) > 50
-    assert (np.diff(now) >= -20_000_000).all()  # while it waits the clock is measured, and may be ahead by a moment
+    assert (np.diff(now) >= -20_000_000).all()  # while waiting, the clock is measured and may be slightly ahead
     assert now[0] >= source.stamps[0] - 20_000_000
     assert now[-1] == source.stamps[-1]
 
 
 class VirtualTime:
-    """Of a machine on which nothing takes time but waiting: in place of the player's `time` and of its `STOP`."""
+    """Replaces the player's `time` and `STOP`, as on a machine where only waiting takes time."""
 
     def __init__(self) -> None:
         self.now = 100.0
 
     def monotonic(self) -> float:
-        self.now += 1e-6  # or what waits for others, which take real time, would wait for ever
+        self.now += 1e-6  # otherwise, waiting for other nodes, which take real time, would never end
         return self.now
 
     def monotonic_ns(self) -> int:
@@ -112,7 +112,7 @@ class VirtualTime:
 def test_each_message_goes_out_when_it_is_due(
     listener: Listener, bag: Path, drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At twice the speed, as far as the player has to do with it: not what a busy machine makes of it."""
+    """At double speed, and in virtual time: delays of a busy machine are not tested."""
     virtual = VirtualTime()
     for name in ("time", "STOP"):
         monkeypatch.setattr(f"dpm2_ros.bag_player.{name}", virtual)
@@ -128,8 +128,8 @@ def test_each_message_goes_out_when_it_is_due(
 def test_after_a_stop_the_rest_keeps_its_pace(
     listener: Listener, bag: Path, drive: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """As of a terminal (Ctrl-Z), or of a disk that keeps it waiting: the clouds of that time do not come at once. One
-    that is late by less is caught up with."""
+    """After Ctrl-Z in a terminal or a slow disk, the clouds of the pause are not published all at once. After a shorter
+    delay, the player catches up."""
     for seconds in (0.5, 4.0):
         virtual, log = VirtualTime(), tmp_path / f"{seconds}.csv"
         began, stopped = virtual.now, seconds
@@ -157,7 +157,7 @@ def test_after_a_stop_the_rest_keeps_its_pace(
 def test_start_duration_and_topics(listener: Listener, bag: Path, drive: Any) -> None:
     listener.hear_here(bag, start=0.45, duration=0.4, topics=(naming.POINTS, naming.TF_STATIC))
     listener.harness.wait(lambda: len(listener.clouds) >= 4, "four clouds")
-    listener.harness.wait(lambda: listener.static, "the calibration")  # it comes from wherever one starts
+    listener.harness.wait(lambda: listener.static, "the calibration")  # it is sent for any start time
     stamps = BagSource(bag, InputSettings(images=False)).stamps.tolist()
     assert [stamp_ns(message.header) for message in listener.clouds] == stamps[5:9]
     assert listener.images == []
@@ -175,7 +175,7 @@ def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any)
 
 
 def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listener, bag: Path) -> None:
-    """It was played again and again, thousands of times a second, each with a line in the log."""
+    """It was repeated thousands of times per second, each time with a line in the log."""
     player = listener.play(str(bag), "--wait", "90", "--loop", "--topics", naming.TF_STATIC)
     listener.harness.wait(lambda: listener.static, "the transforms")
     time.sleep(0.5)
@@ -185,7 +185,7 @@ def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listene
 
 
 def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(listener: Listener, tmp_path: Path) -> None:
-    """Of a robot whose camera repeats its own, also where a message is damaged and a transform is none."""
+    """As of a robot whose camera repeats its own transform; also if a message is damaged or a transform is invalid."""
     types = get_typestore(Stores.ROS2_JAZZY)
     kind = "tf2_msgs/msg/TFMessage"
     links = [("lidar", 1.5), *(("camera", 0.1 * n) for n in range(150)), ("lidar", math.nan)]
@@ -209,7 +209,7 @@ def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(list
 def test_a_recorded_clock_is_the_only_one(
     listener: Listener, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a simulation, whose time is not that of the recording."""
+    """Such a clock comes from a simulation, whose time differs from that of the recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
     Time, RecordedClock = types.types["builtin_interfaces/msg/Time"], types.types["rosgraph_msgs/msg/Clock"]
     kind, out = RecordedClock.__msgtype__, list[tuple[int, str, bytes]]()
@@ -222,7 +222,7 @@ def test_a_recorded_clock_is_the_only_one(
 
 
 def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
-    """Nothing is lost to a subscriber that comes later than the player."""
+    """A subscriber that starts after the player loses no message."""
     harness = ros()
     player = harness.start("bag_player", [str(bag), "--wait", "90", "--rate", "4"], tmp_path / "log")
     harness.wait(lambda: "waiting 90 s" in (tmp_path / "log").read_text(), "the player")
@@ -232,7 +232,7 @@ def test_it_waits_for_subscribers(ros: Callable[..., Any], bag: Path, tmp_path: 
 
 
 def test_it_waits_for_the_nodes_that_it_is_told(ros: Callable[..., Any], bag: Path, tmp_path: Path, drive: Any) -> None:
-    """Two of a name, in namespaces of their own; what another node hears, as RViz does, starts nothing."""
+    """Two nodes of one name in different namespaces; a subscriber of another name, such as RViz, starts nothing."""
     harness = ros()
     clouds = harness.hear(PointCloud2, naming.POINTS)
     awaited = ["--for", "robot", "--subscribers", "2", "--wait", "90", "--rate", "4"]
@@ -246,20 +246,20 @@ def test_it_waits_for_the_nodes_that_it_is_told(ros: Callable[..., Any], bag: Pa
         node.create_subscription(PointCloud2, naming.POINTS, heard.append, 100)
         node.close = lambda: None  # type: ignore[attr-defined]
         harness.add(node)
-        time.sleep(1.0)  # with one of two it does not begin
+        time.sleep(1.0)  # with one of the two, the player does not start
     assert player.wait(180) == 0
     harness.wait(lambda: [len(heard) for heard in received] == [drive.frames] * 2, "every cloud, twice")
 
 
 def play_here(*arguments: str) -> int:
-    """In this process: quicker, where nothing is to be heard."""
+    """Play in this process: quicker, if nothing needs to be received."""
     return exit_code(lambda: main(arguments))
 
 
 def test_without_a_subscriber_it_says_so_and_plays(
     bag: Path, domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))  # where nobody listens
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))  # nobody subscribes there
     assert play_here(str(bag), "--wait", "0.3", "--duration", "0.1") == 0
     assert f"playing without a subscriber to {naming.POINTS} yet" in capfd.readouterr().err
 
@@ -304,7 +304,7 @@ def test_a_truncated_bag_plays_what_is_left(
 def test_a_type_is_imported_from_the_packages_of_ros_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A bag that names a module which lies in the working directory: it is left out, and reported."""
+    """The bag names a module in the working directory: its topic is left out, and that is reported."""
     package = tmp_path / "evil" / "msg"
     package.mkdir(parents=True)
     (package.parent / "__init__.py").write_text("")
@@ -327,7 +327,7 @@ def test_a_type_is_imported_from_the_packages_of_ros_alone(
 def test_messages_of_ros1_that_ros2_defines_differently_are_left_out(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """They were sent empty. A Range has a variance since."""
+    """They were sent empty. In ROS 2, a Range also has a variance."""
     from rosbags.rosbag1 import Writer as Ros1Writer
 
     noetic = get_typestore(Stores.ROS1_NOETIC)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frame whose pose is published, in whatever order /tf_static comes: one that has no parent, and what was asked."""
+"""The frame whose pose is published, for any order of /tf_static: the requested one, or one without a parent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORDERS = list(permutations(LINKS))
 
 
 def trees(order: tuple[tuple[str, str], ...]) -> list[TransformTree]:
-    """After nothing, one, two, ... of the links."""
+    """The transform trees after none, one, two, ... of the links."""
     out = []
     for known in [(), *accumulate((link,) for link in order)]:
         out.append(TransformTree())
@@ -52,7 +52,7 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
         T_base_lidar = base.T_base_start @ base.T_start_lidar
         expected = np.eye(4) if base.name == "lidar" else whole.lookup(base.name, "lidar")
         np.testing.assert_allclose(T_base_lidar, expected, atol=1e-12)
-        np.testing.assert_array_equal(base.T_start_lidar, np.eye(4))  # odom is where it was
+        np.testing.assert_array_equal(base.T_start_lidar, np.eye(4))  # odom stays where it was
     base.restart()
     np.testing.assert_array_equal(base.T_base_start, np.eye(4))
     np.testing.assert_allclose(base.T_start_lidar, whole.lookup("footprint", "lidar"), atol=1e-12)
@@ -60,7 +60,7 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
 
 @pytest.mark.parametrize("wanted", ["base", ""])
 def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted: str) -> None:
-    """As by a calibration that is corrected while the node runs: one drive has one place, and what is wrong is said."""
+    """As when a calibration is corrected while the node runs: one drive uses one pose, and the mismatch is reported."""
     base, moved = BaseFrame(wanted, ("odom",)), "/tf_static has moved the LiDAR in base: ~/reset applies its new pose"
     for x in (1.0, 1.8):
         tree = TransformTree()
@@ -74,7 +74,7 @@ def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted:
 
 
 def test_the_place_of_another_lidar_is_not_that_of_the_first() -> None:
-    """Where /tf_static does not know it yet, there is no base."""
+    """As long as /tf_static does not contain the other LiDAR, there is no base."""
     base, tree = BaseFrame("base", ("odom",)), TransformTree()
     tree.set("base", "lidar", se3.make(np.eye(3), [1.0, 0, 0]))
     assert base.look(tree, "lidar")
@@ -88,7 +88,7 @@ def test_the_place_of_another_lidar_is_not_that_of_the_first() -> None:
 
 
 def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
-    """Two parents would tear /tf apart; also where the first one comes late. Its pose is known all the same."""
+    """Two parents would break /tf; this also holds if the first parent arrives late. The pose is known nevertheless."""
     early, late = BaseFrame("base", ("odom",)), BaseFrame("base", ("odom",))
     *_, three, whole = trees(tuple(LINKS)[:3])
     assert early.look(whole, "lidar")
@@ -101,7 +101,7 @@ def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
 
 
 def test_a_frame_that_this_node_moves_is_no_base() -> None:
-    """map -> odom -> base is published as static: odom -> map would be a circle."""
+    """map -> odom -> base is published as static: odom -> map would be a cycle."""
     tree = TransformTree()
     for parent, child in (("map", "odom"), ("odom", "base"), ("base", "lidar")):
         tree.set(parent, child, np.eye(4))

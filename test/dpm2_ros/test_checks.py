@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor messages that cannot be what they say are kept out, and what is known already stays."""
+"""Sensor messages with impossible content are rejected, and what is known already is kept."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def transform(parent: str, child: str, x: float = 1.0, w: float = 1.0) -> Transf
 
 
 def message(*transforms: TransformStamped) -> SimpleNamespace:
-    return SimpleNamespace(transforms=list(transforms))  # tf2_msgs need not be there
+    return SimpleNamespace(transforms=list(transforms))  # tf2_msgs need not be installed
 
 
 @pytest.mark.parametrize(
@@ -44,10 +44,10 @@ def test_one_unsound_transform_does_not_cost_the_others(bad: dict[str, object]) 
 @pytest.mark.parametrize(
     ("later", "said"),
     [
-        (transform("base", "lidar", x=1.0004), ""),  # as another writes it
+        (transform("base", "lidar", x=1.0004), ""),  # the same one, rounded differently
         (transform("base", "lidar", x=1.3), "lidar has moved by 0.30 m and 0.0 deg in base"),
         (transform("mast", "lidar"), "lidar has the parent mast, no longer base"),
-        (transform("base", "camera", x=1.3), ""),  # a new one
+        (transform("base", "camera", x=1.3), ""),  # a new frame
     ],
     ids=["same", "moved", "another parent", "new"],
 )
@@ -58,7 +58,7 @@ def test_what_two_publishers_say_otherwise_of_a_frame(later: TransformStamped, s
 
 
 def test_the_number_of_frames_is_bounded() -> None:
-    """Those that are known can still be moved."""
+    """Frames that are known already can still be moved."""
     tree, _ = extended(TransformTree(), message(transform("base", "lidar")))
     for k in range(50):
         tree, _ = extended(tree, message(*(transform(f"p{k}", f"c{k}_{n}") for n in range(200))))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages carry what the core has: exactly for points, to rounding for poses, in ROS' convention for covariances."""
+"""Messages carry the core's data: points exactly, poses to rounding, covariances in the convention of ROS."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_nan_points_survive() -> None:
 
 
 def test_a_large_cloud_is_converted_without_a_loop_over_its_bytes() -> None:
-    """120,000 points take 1 ms; the slow way that rclpy invites to takes over 60."""
+    """120,000 points take 1 ms; the obvious way in rclpy takes over 60 ms."""
     points = np.zeros((120_000, 4), np.float32)
     best = np.inf
     for _ in range(5):
@@ -84,7 +84,7 @@ def test_covariance_round_trip(xi: np.ndarray, seed: int) -> None:
 
 
 def test_covariance_is_translation_first_along_the_axes_of_the_header() -> None:
-    """A body turned left by 90 degrees and unsure along its own x is unsure along the header's y."""
+    """A body that is rotated left by 90 degrees and uncertain along its own x is uncertain along the header's y."""
     R = se3.exp([0, 0, np.pi / 2, 0, 0, 0])[:3, :3]
     covariance = np.diag([1e-4, 2e-4, 3e-4, 4.0, 1.0, 0.25])
     ros = conversions.covariance_to_ros(covariance, R).reshape(6, 6)
@@ -93,7 +93,7 @@ def test_covariance_is_translation_first_along_the_axes_of_the_header() -> None:
 
 @given(tangents, st.integers(0, 20))
 def test_covariance_describes_the_same_errors(xi: np.ndarray, seed: int) -> None:
-    """Errors drawn in the core's convention have, seen along the header's axes, the covariance of the message."""
+    """Errors drawn in the core's convention, expressed in the header's axes, have the covariance of the message."""
     T, covariance = se3.exp(xi), spd(seed) * 1e-8
     errors = np.random.default_rng(seed).multivariate_normal(np.zeros(6), covariance, 4000)
     perturbed = T @ se3.exp(errors)
@@ -112,7 +112,7 @@ def test_odometry_message() -> None:
     twist = message.twist.twist
     assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0, 1, 2)
     assert (twist.linear.x, twist.linear.y, twist.linear.z) == (3, 4, 5)
-    # a step of 0.1 s: a hundred times the covariance of the step
+    # a step of 0.1 s: the covariance of the twist is a hundred times that of the step
     twist_covariance = conversions.covariance_from_ros(message.twist.covariance, np.eye(3))
     np.testing.assert_allclose(twist_covariance, 100 * spd(2), rtol=1e-9)
 
@@ -132,8 +132,8 @@ def test_other_frames_are_no_keyframes(name: str) -> None:
 
 
 def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> None:
-    """The place of a camera in a map is that in the keyframe's frame: a place in a tunnel is found by it."""
-    T_base_lidar = se3.exp([np.pi, 0, 0, -0.6, 0.1, 1.7])  # a LiDAR that hangs
+    """A camera's pose in a map is relative to the keyframe's frame: place recognition in tunnels uses it."""
+    T_base_lidar = se3.exp([np.pi, 0, 0, -0.6, 0.1, 1.7])  # a LiDAR that is mounted upside down
     seen = frame(0.0, random_paint())
     keyframe = Keyframe(0, 0, 0, np.eye(4), seen.points, thumbnail=thumbnail(seen.images[0], 320))
 
@@ -148,18 +148,18 @@ def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> No
     from_base, after = pixels(conversions.keyframe_to_base(keyframe, T_base_lidar, T_base_lidar))
     assert len(from_lidar) > 1000
     np.testing.assert_allclose(from_base, from_lidar, atol=1e-2)  # the cloud is float32
-    np.testing.assert_array_equal(after.levels[0], before.levels[0])  # the JPEG itself is not made anew
+    np.testing.assert_array_equal(after.levels[0], before.levels[0])  # the JPEG itself is not encoded again
 
 
 @given(tangents, tangents, tangents)
 def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray, first: np.ndarray) -> None:
-    """The base starts at the origin wherever in its odometry the LiDAR does, a world point stays where it is, and steps
-    of base and LiDAR are one motion."""
+    """The base starts at the origin, wherever the LiDAR starts in its odometry; a world point stays at its position;
+    and steps of base and LiDAR describe the same motion."""
     T_base_lidar, T_odom_first, T_first_lidar = se3.exp(mount), se3.exp(first), se3.exp(xi)
     T_start_odom, T_odom_lidar = T_base_lidar @ se3.inverse(T_odom_first), T_odom_first @ T_first_lidar
     cloud = np.array([[1, 2, 3, 0.5]], np.float32)
     edge = Registration(T_first_lidar, spd(4), 1.0, 0.0, "geometric")
-    fix = Fix(5, np.array([49.0, 8.4, 110.0]), np.eye(3), np.array([1.0, 2.0, 3.0]))  # where that point is
+    fix = Fix(5, np.array([49.0, 8.4, 110.0]), np.eye(3), np.array([1.0, 2.0, 3.0]))  # antenna: that point
     keyframe = Keyframe(1, 5, 0, T_odom_lidar, cloud, edge, fix=fix)
     base = motion(T_odom_lidar).of_base(T_base_lidar, T_start_odom)
     start = motion(T_odom_first).of_base(T_base_lidar, T_start_odom)
@@ -174,6 +174,6 @@ def test_motion_of_the_base(xi: np.ndarray, mount: np.ndarray, first: np.ndarray
     expected = T_base_lidar @ T_first_lidar @ np.append(cloud[0, :3].astype(float), 1)
     np.testing.assert_allclose(in_odom, expected, atol=1e-5)  # the cloud is float32
     np.testing.assert_allclose(seen.edge.T_target_source, seen.T_odom_kf, atol=EXACT)
-    # exp(twist dt) of the base is the conjugated one of the LiDAR
+    # exp(twist dt) of the base is that of the LiDAR, conjugated by the mounting
     step = T_base_lidar @ se3.exp(0.1 * motion(T_odom_lidar).twist) @ se3.inverse(T_base_lidar)
     np.testing.assert_allclose(se3.exp(0.1 * base.twist), step, atol=1e-8)

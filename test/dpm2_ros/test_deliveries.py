@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is sent again, and when a drive counts as delivered; times in s."""
+"""Which keyframes are sent again, and when a drive counts as delivered; times in s."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_keyframe_that_had_to_wait_for_an_earlier_drive_is_due_at_once() -> No
 
 
 def test_an_earlier_drive_is_announced_before_it_is_sent() -> None:
-    """Most of it may have arrived: the first acknowledgment says so, before anything is sent twice."""
+    """Most of it may have arrived: the first acknowledgment shows it, before anything is sent twice."""
     drive = delivery(20, earlier=True, now=100.0)
     assert drive.announces(100.1)
     assert not drive.announces(100.2)
@@ -52,7 +52,7 @@ def test_one_acknowledgment_does_not_end_a_drive() -> None:
     drive = delivery(3)
     drive.acknowledge(3, set(), 10.0)
     assert not drive.certain(10.1)
-    drive.acknowledge(1, set(), 10.5)  # the mapper's own, where the one before was another's
+    drive.acknowledge(1, set(), 10.5)  # from this mapper; the one before came from another
     assert not drive.certain(12.5)
     for n in range(10):
         drive.acknowledge(3, set(), 13 + 0.5 * n)

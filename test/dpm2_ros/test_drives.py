@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drives of one namespace in mapper_node: one after the other, at the same time, and back again."""
+"""The drives of one namespace in mapper_node: one after the other, at the same time, and resumed."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from ..helpers.mapping import OTHER, S, core, keyframes, mapped, placed, send_al
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drives count as over after a second."""
+    """Drives count as finished after a second of silence."""
     monkeypatch.setattr(feed, "SILENT", 1.0)
     monkeypatch.setattr(feed, "BESIDE", 0.3)
 
 
 def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
-    """A forged session, or a second robot by accident: it is reported, and each gets on as if alone."""
+    """A forged session or, by accident, a second robot is reported, and each drive continues as if it were alone."""
     diagnostics = mapper.diagnostics
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
-    send_all(mapper, 1)  # it is still heard, however long the map of it took
+    send_all(mapper, 1)  # the first drive is still active, however long its mapping took
     send_all(mapper, 0, 1, session=OTHER, shift=100.0)
 
     def apart() -> bool:
-        send_all(mapper, 2)  # again and again, as a robot does
+        send_all(mapper, 2)  # repeatedly, as a robot does
         time.sleep(0.1)
         return keyframes(mapper) == 5
 
@@ -53,7 +53,7 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
 
 
 def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
-    """The robot was killed: until all of that drive is there, nobody knows where its odometry of now is in the map."""
+    """The robot was killed: until that drive is complete, the pose of its current odometry in the map is unknown."""
     move, heard = placed(mapper)
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
@@ -62,18 +62,18 @@ def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any)
     for stamp in range(5):
         move(stamp)
     time.sleep(1.0)
-    send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # at once, without a silence
+    send_all(mapper, 0, 1, session=OTHER, shift=100.0)  # immediately, without a silence
     mapped(mapper, 6)
     move(77)
     time.sleep(1.0)
-    assert not heard  # it is not placed yet, either
+    assert not heard  # the new drive has no pose in the map yet, either
     assert [k.robot for k in core(mapper).keyframes] == [""] * 6
     assert [k.id for k in core(mapper).keyframes] == [0, 1, 2, 3, 4, 5]
     assert [(e.from_node, e.to_node) for e in core(mapper).edges] == [(0, 1), (1, 2), (2, 3), (4, 5)]
 
 
 def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper: Any) -> None:
-    """Its odometry begins at zero; until the place of its new drive is decided, nobody knows where that is."""
+    """Its odometry begins at zero: until the pose of its new drive is decided, that odometry has no known pose."""
     move, heard = placed(mapper)
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
@@ -84,7 +84,7 @@ def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper:
     move(6)
     time.sleep(1.0)
     assert len(heard) == 1
-    send_all(mapper, 2)  # the drive before goes on: it was another robot's
+    send_all(mapper, 2)  # the previous drive continues: the new one was another robot's
     taken_in(mapper)
     move(7)
     mapper.wait(lambda: len(heard) == 2, "/tf again")
@@ -92,7 +92,7 @@ def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper:
 
 @pytest.mark.usefixtures("quick")
 def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
-    """The robot was out of reach, a session in its name began meanwhile: nothing that it sends is lost."""
+    """The robot was out of reach, and meanwhile a session in its name began: nothing that it sends is lost."""
     for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
         time.sleep(1.2)
         expected = keyframes(mapper) + len(ids)

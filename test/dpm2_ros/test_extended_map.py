@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that is found in a saved map, which then may grow by its drive."""
+"""A robot is localized in a saved map, which may then grow by the robot's drive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .test_active_map import LOG, described, keyframes, street
 
 @pytest.fixture
 def found(tmp_path: Path) -> Iterator[ActiveMap]:
-    """A robot that knows its place in tmp_path/drive.dpm2map, which stays as it is."""
+    """A robot that is localized in tmp_path/drive.dpm2map, a map that does not change."""
     made = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
     for n in (0, 5, 10, 15):
         made.add(street(n))
@@ -42,7 +42,7 @@ def found(tmp_path: Path) -> Iterator[ActiveMap]:
 def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     found: ActiveMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another program writes to the file; once it has ended, the map grows at the robot's place."""
+    """Another program locks the file; once it has released it, the map grows from the robot's pose."""
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
@@ -55,18 +55,18 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     found.add(street(12))
     T_map_odom = found.T_map_odom("")
     assert T_map_odom is not None
-    np.testing.assert_allclose(T_map_odom, np.eye(4), atol=0.1)  # m: as exactly as it was found
+    np.testing.assert_allclose(T_map_odom, np.eye(4), atol=0.1)  # m: as accurate as the localization
     assert len(found.mapper.keyframes) == 5
     found.close()
     with MapStore.open(tmp_path / "drive.dpm2map") as store:
         data = load_map(store)
-        assert parts_of(data).tolist() == [0] * 5  # exports left out what no edge tied
+        assert parts_of(data).tolist() == [0] * 5  # exports left out parts without an edge
         assert [(edge.from_node, edge.to_node) for edge in data.constraints][-1] == (2, 4)  # 10 is nearest to 12
 
 
 @pytest.mark.weights
 def test_an_odometry_that_starts_again_before_the_first_keyframe_of_a_session_is_not_placed(found: ActiveMap) -> None:
-    """It was tied firmly to where the odometry before had been; only a loop tells where it is."""
+    """It was tied rigidly to the last pose of the previous odometry; only a loop can determine where it is."""
     found.extend()
     assert found.T_map_odom("") is not None
     found.restart("")
@@ -80,9 +80,9 @@ def test_an_odometry_that_starts_again_before_the_first_keyframe_of_a_session_is
 def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
     found: ActiveMap, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its clouds are damaged while the robot is in it: degraded, then lost, as where nothing fits.
+    """Its clouds are damaged while the robot is localized: degraded, then lost, as if nothing matched.
 
-    The log had the reason only with a change of the state: never, where the robot had not been found yet.
+    The log had the reason only when the state changed: never, if the robot had not been localized yet.
     """
     execute(tmp_path / "drive.dpm2map", "UPDATE payloads SET cloud = x'00'")
     states = []
@@ -99,7 +99,7 @@ def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
 
 @pytest.mark.weights
 def test_the_own_map_is_known_by_any_spelling_of_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """FILE-wal stayed beside it, of two that were open at once."""
+    """With two spellings, the file was open twice, and FILE-wal was left next to it."""
     monkeypatch.chdir(tmp_path)
     active = ActiveMap(described(map_directory=".", map_file=str(tmp_path / "town.dpm2map")), "", LOG)
     active.add(street(0))

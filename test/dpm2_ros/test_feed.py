@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a feed has acknowledged for good is in the map file; what waits reaches it, or stays with its robot."""
+"""Keyframes that a feed acknowledges for good are in the map file; waiting ones reach it, or stay with their robot."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def keyframe(id: int) -> Keyframe:
 
 
 class Node(GuardedNode):
-    """A map, and the keyframes of one robot."""
+    """A node with a map, and with the feed of one robot's keyframes."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__("mapper")
@@ -53,19 +53,19 @@ class Node(GuardedNode):
         self.busy = threading.Event()
 
     def wait(self) -> Keyframe:
-        """A first keyframe that takes long."""
+        """A first keyframe that takes long to process."""
         self.busy.wait()
         return keyframe(0)
 
     def close(self) -> None:
-        """The feed first, while the mapper is still busy."""
+        """Close the feed first, while the mapper is still busy."""
         self.feed.close()
         self.busy.set()
         self.mapper.close()
 
 
 class Robot:
-    """Sends the keyframes of its drives, and hears what the mapper has."""
+    """Sends the keyframes of its drives, and receives the mapper's acknowledgments."""
 
     def __init__(self, ros: Callable[..., Any], folder: Path) -> None:
         self.harness, self.folder = ros(), folder
@@ -82,12 +82,12 @@ class Robot:
             self.wires.send(*self.last)
 
     def announce(self) -> None:
-        """As robots do: a mapper that hears nothing answers no longer, and on a busy machine it may take that long."""
+        """Repeat the last message, as robots do: a mapper stops answering a robot that is silent for long."""
         if self.last is not None:
             self.wires.send(*self.last)
 
     def acknowledged(self, session: str) -> tuple[int, int]:
-        """All below that, and how many above, by the last answer."""
+        """From the last answer: the number below which all have arrived, and how many above it have."""
         answers = [answer.data for answer in self.heard if answer.layout.dim[0].label == session]
         return (answers[-1][0], len(answers[-1]) - 1) if answers else (0, 0)
 
@@ -96,7 +96,7 @@ class Robot:
 
     @property
     def stored(self) -> int:
-        """Keyframes in the map file: what a mapper that is killed now leaves."""
+        """Keyframes in the map file: what would remain if the mapper were killed now."""
         (path,) = self.folder.glob("*.dpm2map")
         with MapStore.open(path) as store:
             return len(load_map(store))
@@ -108,7 +108,7 @@ def robot(ros: Callable[..., Any], tmp_path: Path) -> Robot:
 
 
 def test_what_has_arrived_reaches_the_map(robot: Robot) -> None:
-    """Also where the feed is closed while keyframes come faster than the mapper works: their robot may be gone."""
+    """Also if the feed is closed while keyframes arrive faster than they are mapped: their robot may be gone."""
     robot.node.mapper.add(robot.node.wait)
     robot.send(COUNT, DRIVE)
     robot.wait(DRIVE, COUNT)
@@ -120,7 +120,7 @@ def test_what_has_arrived_reaches_the_map(robot: Robot) -> None:
 
 
 def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:
-    """A mapper that is killed loses what waits in its memory; its robot has that, and sends it to the next one."""
+    """A mapper that is killed loses what waits in its memory; its robot still has it, and sends it to the next one."""
     robot.node.mapper.add(robot.node.wait)
     robot.send(COUNT, DRIVE)
     robot.wait(DRIVE, COUNT)
@@ -135,7 +135,7 @@ def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:
 def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    """It was acknowledged as one in the map file, so that its robot deleted it; /diagnostics said OK."""
+    """It was acknowledged as stored, so its robot deleted it, and /diagnostics reported OK."""
     mapper = robot.node.mapper.active.mapper
     add, errors = mapper.add, [error]
 
@@ -161,8 +161,8 @@ def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
 
 
 def test_a_drive_whose_place_is_not_decided_stays_with_its_robot(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not in the map when the mapper ends, however soon after the drive before it began."""
-    monkeypatch.setattr("dpm2_ros.feed.SILENT", 300.0)  # s without a message, by which its place would be decided
+    """It is not in the map when the mapper ends, even if it began directly after the previous drive."""
+    monkeypatch.setattr("dpm2_ros.feed.SILENT", 300.0)  # s without a message, after which its pose would be decided
     robot.node.busy.set()
     robot.send(1, DRIVE)
     robot.harness.wait(lambda: robot.acknowledged(DRIVE) == (1, 0), "the drive before")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts for Foxglove name what the nodes have: topics, fields of messages, services; and no panel is lost."""
+"""The layouts for Foxglove use existing topics, message fields and services of the nodes; and no panel is lost."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from dpm2_ros.message_types import message_type
 
 ROOT = Path(__file__).resolve().parents[2]
 LAYOUTS = sorted((ROOT / "config").glob("foxglove*.json"))
-ROBOTS = re.compile(r"^/(red|green|blue)(?=/)")  # their namespaces
+ROBOTS = re.compile(r"^/(red|green|blue)(?=/)")  # namespaces of the robots
 # docs/topics.md is compared with running nodes in test_topics.py
 ROWS = re.findall(r"^\| `([^`]+)` \| (\S+) \|", (ROOT / "docs" / "topics.md").read_text(), re.M)
 KINDS = dict(ROWS)
 
 
 def texts(value: Any) -> Iterator[str]:
-    """All keys and values that are text."""
+    """All keys and values that are strings."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield key
@@ -35,7 +35,7 @@ def texts(value: Any) -> Iterator[str]:
 
 
 def panels(layout: Any) -> list[str]:
-    """The leaves of the arrangement."""
+    """The leaves of the layout tree."""
     if isinstance(layout, str):
         return [layout]
     return [*panels(layout["first"]), *panels(layout["second"])]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random messages on every topic that slam_node and mapper_node listen to, beside a drive that must not notice them.
+"""Random messages on every topic of slam_node and mapper_node, during a drive that they must not affect.
 
-The fuzzer asks the ROS graph for topics and types, and knows neither. Left out is what is a command if it is well
-formed, whoever sends it: transforms of real frames. A readable cloud on the very topic of a drive is part of that
-drive; what is made here is hardly ever readable, and never in the drive's frame.
+The fuzzer reads topics and types from the ROS graph. It leaves out messages that, if well formed, act as commands
+whoever sends them: transforms of real frames. A readable cloud on the topic of a drive would be part of that drive; the
+fuzzer's clouds are hardly ever readable, and never in the drive's frame.
 
-Six seconds in the suite; `make fuzz` takes a minute, with a thousand messages per second, and looks at the memory too.
+The test takes six seconds; `make fuzz` takes a minute, sends a thousand messages per second, and checks memory too.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ RATE = float(os.environ.get("DPM2_FUZZ_RATE", "400"))
 LONG = SECONDS >= 30
 GROWTH = 20_000_000  # bytes
 START = 1_700_000_000_000_000_000
-SETTINGS = {"keyframes": {"distance": 2.0}, "registration": "geometric"}  # keyframes are described by the network
+SETTINGS = {"keyframes": {"distance": 2.0}, "registration": "geometric"}  # the network describes keyframes
 
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 1e-9, 12345.678)
@@ -70,31 +70,31 @@ TEXTS = (
     *("kf_", "kf_" + "9" * 4000, "kf_-1.5f3a9c01", "kf_4294967296.5f3a9c01", "kf_0.00000000", "robot/kf_0", "feature"),
 )
 LENGTHS = (0, 0, 1, 1, 2, 3, 7, 40, 500)
-KEPT = 60  # messages of each topic; one in ten that are sent is new
+KEPT = 60  # messages of each topic; one in ten of those sent is new
 
 
 def message_class(name: str) -> Any:
-    """sensor_msgs/msg/PointCloud2 as a class."""
+    """The class of a type name such as sensor_msgs/msg/PointCloud2."""
     package, kind, message = name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), message)
 
 
 class Maker:
-    """Random messages of any type; `names` are texts that mean something to those who listen."""
+    """Random messages of any type; `names` returns strings that mean something to the receiving nodes."""
 
     def __init__(self, seed: int, names: Callable[[], Sequence[str]]) -> None:
         self.random = np.random.default_rng(seed)
         self._names = names
 
     def message(self, kind: Any, names: bool = True) -> Any:
-        """One, all of its fields at random."""
+        """One message with random values in all fields."""
         out = kind()
         for field, type_name in kind.get_fields_and_field_types().items():
             value = self.value(type_name, getattr(out, field), names)
             try:
                 setattr(out, field, value)
             except (AssertionError, ValueError, TypeError, OverflowError):
-                continue  # bounded strings and the like keep their default
+                continue  # bounded strings and similar fields keep their default
         return out
 
     def value(self, type_name: str, default: Any, names: bool) -> Any:
@@ -112,7 +112,7 @@ class Maker:
 
     def one(self, type_name: str, names: bool) -> Any:
         r = self.random
-        if type_name == "builtin_interfaces/Time" and r.random() < 0.7:  # most others end there
+        if type_name == "builtin_interfaces/Time" and r.random() < 0.7:  # others are mostly rejected early
             seconds = (0, 1, 2**31 - 1, START // 10**9 + int(r.integers(-5, 5)))
             return Time(sec=seconds[r.integers(4)], nanosec=int(r.integers(10**9)))
         if "/" in type_name:
@@ -139,7 +139,7 @@ class Maker:
         )
 
     def mangled(self, data: bytes) -> bytes:
-        """A message that is damaged on its way."""
+        """A message that is damaged in transit."""
         r, out = self.random, bytearray(data)
         for _ in range(int(r.integers(1, 8))):
             at = int(r.integers(4, max(len(out), 5)))
@@ -149,12 +149,12 @@ class Maker:
 
 
 class Fuzzer:
-    """A thread that publishes; `names` as of `Maker`."""
+    """A thread that publishes; `names` as for `Maker`."""
 
     def __init__(
         self, node: Node, targets: Sequence[tuple[str, str]], names: Callable[[], Sequence[str]], rate: float
     ) -> None:
-        """`targets`: name and namespace of the nodes. `rate`: messages per second in all."""
+        """`targets`: name and namespace of the nodes. `rate`: total messages per second."""
         self._node, self._rate = node, rate
         self._maker = Maker(1, names)
         self.sent: dict[str, int] = {}
@@ -169,7 +169,7 @@ class Fuzzer:
 
     @property
     def topics(self) -> list[str]:
-        """Those that are fuzzed."""
+        """The topics that are fuzzed."""
         return [topic for topic, *_ in self._topics]
 
     def __enter__(self) -> Fuzzer:
@@ -181,7 +181,7 @@ class Fuzzer:
         self._thread.join()
 
     def _qos(self, topic: str) -> QoSProfile:
-        """Reliable, and latched where that is asked for: so it reaches every subscriber."""
+        """Reliable, and latched if a subscriber requests it: thus it reaches every subscriber."""
         requested = [info.qos_profile.durability for info in self._node.get_subscriptions_info_by_topic(topic)]
         latched = DurabilityPolicy.TRANSIENT_LOCAL in requested
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
@@ -194,7 +194,7 @@ class Fuzzer:
             publisher.publish(self._next(kind, kept))
             self.sent[topic] = self.sent.get(topic, 0) + 1
             count += 1
-            # No burst makes up for what was late: it would push a scan out of the node's queue, unread.
+            # No burst to make up for a delay: it would push an unread scan out of the node's queue.
             due = max(due + 1 / self._rate, time.monotonic())
             self._ended.wait(due - time.monotonic())
 
@@ -213,27 +213,27 @@ class Fuzzer:
 
 @pytest.fixture(scope="module")
 def street_scans(recording: Path) -> list[np.ndarray]:
-    """Of a street; in the long run the robot then stands, so that no more is to be kept."""
+    """Scans of a street; in the long run the robot then stands still, so that no more keyframes are added."""
     drive = [frame.points[::2] for frame in open_source(recording, InputSettings(images=False)).frames(0, 24)]
     return drive + 3 * len(drive) * drive[-1:] if LONG else drive
 
 
 @pytest.fixture(scope="module")
 def alone(street_scans: list[np.ndarray]) -> list[OdometryResult]:
-    """The odometry of the drive alone."""
+    """The odometry of the drive, without a fuzzer."""
     odometry = make_odometry(SlamSettings.model_validate(SETTINGS), "red")
     return [odometry.process(Frame(START + n * 10**8, points, index=n)) for n, points in enumerate(street_scans)]
 
 
 class Nodes:
-    """slam_node of robot red, and a mapper_node, as processes; a LiDAR."""
+    """slam_node of robot red, and a mapper_node, as processes; and a LiDAR."""
 
     def __init__(self, harness: Any, folder: Path) -> None:
         self.harness, self.file = harness, folder / "map.dpm2map"
         common = ("-p", "ros.map_directory:=''")
         robot = ["input.points_topic:=points", "ros.embed_mapper:=false", "slam.keyframes.distance:=2.0",
                  "slam.registration:=geometric",
-                 "ros.queue_depth:=100",  # of ten, others would push a scan out, unread, where the node is held up
+                 "ros.queue_depth:=100",  # with ten, other messages would push an unread scan out during a delay
                  "input.vertical_angle_correction_deg:='0.0'"]  # fmt: skip
         pairs = [part for pair in robot for part in ("-p", pair)]
         mapper = ("-p", f"ros.map_file:={self.file}")
@@ -251,7 +251,7 @@ class Nodes:
             harness.find(name)
 
     def names(self) -> list[str]:
-        """What a curious participant can learn: frames, keyframes that were, and will be, sessions."""
+        """What a hostile participant can learn: frames, sessions, and past and future keyframes."""
         real = {
             m.child_frame_id
             for m in self.poses[-500:]
@@ -262,12 +262,12 @@ class Nodes:
         return [*sorted(real), *sorted(sessions), *future, "red/odom", "base_link", "red"]
 
     def pose(self, n: int) -> np.ndarray | None:
-        """The node's pose of scan n: what others send on that topic has other stamps."""
+        """The node's pose of scan n: messages of others on that topic have other stamps."""
         found = [m for m in list(self.odom) if stamp_ns(m.header) == START + n * 10**8]
         return transform_matrix(found[0].pose.pose) if found else None
 
     def resident(self) -> dict[str, int]:
-        """Bytes of each process."""
+        """Resident memory of each process, bytes."""
         page = os.sysconf("SC_PAGE_SIZE")
         return {n: int(Path(f"/proc/{p.pid}/statm").read_text().split()[1]) * page for n, p in self.processes.items()}
 
@@ -323,7 +323,7 @@ def test_a_drive_does_not_notice_what_else_is_sent(
     np.testing.assert_allclose(data.poses, [k.T_odom_kf for k in keyframes], atol=1e-6)
     with MapStore.open(nodes.file) as store:
         clouds = load_map(store, descriptors=False).clouds
-        for node, keyframe in enumerate(keyframes):  # downsampled to what a message may have, else as they were
+        for node, keyframe in enumerate(keyframes):  # downsampled to the limit of a message, otherwise unchanged
             measured = set(map(bytes, unpack_cloud(pack_cloud(keyframe.cloud))))
             kept = set(map(bytes, clouds.whole(node)))
             assert kept <= measured
@@ -333,7 +333,7 @@ def test_a_drive_does_not_notice_what_else_is_sent(
         rejected = nodes.harness.status(name, lambda status: rejections(status) > 0.1 * sent)
         print(name, figures(rejected))
         assert figures(rejected)["internal errors"] == "0", logs
-    begin = len(resident) // 2  # the robot stands, everything is imported, every queue has been full
+    begin = len(resident) // 2  # the robot stands, all imports are done, every queue has been full
     growth = {name: max(r[name] for r in resident[begin:]) - resident[begin][name] for name in nodes.processes}
     print("growth of memory in the second half, MB:", {name: round(grown / 1e6, 1) for name, grown in growth.items()})
     assert not LONG or max(growth.values()) < GROWTH

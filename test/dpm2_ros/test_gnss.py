@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node with a GNSS receiver, over real DDS: fixes that come late place the map, hostile ones are counted."""
+"""slam_node with a GNSS receiver, over real DDS: late fixes georeference the map, hostile ones are counted."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_fixes_place_the_map_on_earth(rig: Callable[..., Rig], drive: Any, monke
     assert r.status("gnss", lambda s: s.message == "no fix on /fix yet").level == DiagnosticStatus.WARN
     rng = np.random.default_rng(0)
     for n in range(drive.frames):
-        if n:  # of the scan before, as a receiver that takes a tenth of a second has it
+        if n:  # fix of the previous scan, as from a receiver with a latency of 0.1 s
             ecef = T_ECEF_START @ drive.pose(n - 1) @ T_LIDAR_ANTENNA[:, 3]
             place = geodesy.geodetic(ecef[:3] + SIGMA * rng.normal(size=3))
             receiver.publish(nav(drive.stamp(n - 1), place))
@@ -56,7 +56,7 @@ def test_fixes_place_the_map_on_earth(rig: Callable[..., Rig], drive: Any, monke
     lost.status.status = NavSatStatus.STATUS_NO_FIX
 
     def is_said(status: DiagnosticStatus) -> bool:
-        receiver.publish(lost)  # it goes on: a receiver in a tunnel was "in use"
+        receiver.publish(lost)  # the messages continue: a receiver in a tunnel was reported as "in use"
         return status.message.startswith("no fix on /fix for")
 
     monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
@@ -65,9 +65,9 @@ def test_fixes_place_the_map_on_earth(rig: Callable[..., Rig], drive: Any, monke
     receiver.publish(nav(drive.stamp(n) + 18 * 10**9, place))  # GPS has no leap seconds
     status = r.status("gnss", lambda s: s.message == "stamps of another clock, +18 s from the clouds'")
     assert status.level == DiagnosticStatus.WARN
-    r.status("mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m a scan: every second one
+    r.status("mapper", having(keyframes=drive.frames // 2, waiting=0))  # 0.8 m per scan: every second one
     r.wait(lambda: sum(r.node.rejections.values()) >= 3 * (drive.frames - 1), "the rejections")
-    # map is the frame of the base's first pose, `base` over the ground
+    # map is the frame of the base's first pose, at height `base` above the ground
     known, T_start_map = mapper.graph.georeference, se3.inverse(T_BASE_LIDAR)
     found = geodesy.enu_frame(known.origin) @ known.T_enu_map
     way = se3.inverse(found) @ T_ECEF_START @ T_start_map

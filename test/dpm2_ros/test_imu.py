@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node with an IMU on the topic `imu`, over real DDS: level, in use, gone, hostile; and the drive goes on."""
+"""slam_node with an IMU on the topic `imu`, over real DDS: level, in use, gone, hostile; the drive continues."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from test.helpers.rig import Rig, publish_static
 
 from ..helpers.diagnostics import saying
 
-PITCH = np.radians(10.0)  # the slope that the robot stands on, nose up
+PITCH = np.radians(10.0)  # the slope on which the robot stands, nose up
 T_BASE_LIDAR = se3.exp([0.0, 0.1, 0.3, 0.8, 0.0, 1.2])
 T_BASE_IMU = se3.exp([0.0, 0.0, 1.0, 0.1, 0.0, 0.2])
 BIAS = np.array([0.01, -0.02, 0.015])
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 
 class Robot(Rig):
-    """Stands on a slope: clouds of one place at 10 Hz, samples at 100 Hz."""
+    """A robot that stands on a slope: clouds of one position at 10 Hz, samples at 100 Hz."""
 
     def __init__(
         self, ros: Callable[..., Any], drive: Any, *parameters: str, place: bool = True, topic: str = "/imu"
@@ -42,7 +42,7 @@ class Robot(Rig):
         self.wait(lambda: topic != "/imu" or self.imu.get_subscription_count(), "the subscription to the IMU")
 
     def sample(self, stamp: int, rates: Any = BIAS, frame: str = "imu_link") -> None:
-        """One of a robot at rest."""
+        """A sample of a robot at rest."""
         up = T_BASE_IMU[:3, :3].T @ [np.sin(PITCH), 0, np.cos(PITCH)]
         message = Imu(header=header(stamp, frame), linear_acceleration=vector(self.gravity * up))
         message.angular_velocity = vector(np.asarray(rates))
@@ -58,7 +58,7 @@ class Robot(Rig):
 @pytest.fixture
 def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 300.0)  # a busy machine may take its time
+    monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 300.0)  # a busy machine may be slow
     return lambda *parameters, **other: Robot(ros, drive, *parameters, **other)
 
 
@@ -69,11 +69,11 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
     assert r.status("imu", lambda s: s.message == "in use").level == DiagnosticStatus.OK
     first = transform_matrix(r.odom[0].pose.pose)
     np.testing.assert_allclose(first[2, :3], [np.sin(PITCH), 0, np.cos(PITCH)], atol=0.01)  # base's axes, heights
-    assert abs(np.degrees(np.arctan2(first[1, 0], first[0, 0]))) < 1  # and no other heading
+    assert abs(np.degrees(np.arctan2(first[1, 0], first[0, 0]))) < 1  # and the heading is unchanged
     late = r.drive.stamp(2)
     r.sample(late + 10**7, (NAN, 0.0, 0.0))
     r.sample(late + 10**7, (0.0, 1e9, 0.0))
-    r.sample(late - 10**8)  # back
+    r.sample(late - 10**8)  # stamped before the last one
     for k in range(20):  # a flood
         r.sample(late + 10**6 * (k == 19) + k)
     r.wait(lambda: sum(r.node.rejections.values()) >= 22, "rejections")
@@ -91,7 +91,7 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
 def test_one_that_stops_together_with_the_clouds_is_missed(
     robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No cloud says so any more: it stayed in use."""
+    """Without clouds nothing reported it: the status stayed "in use"."""
     r = robot()
     r.stand(0, 1)
     assert r.status("imu", saying("in use"))
@@ -109,7 +109,7 @@ def test_without_its_place_it_is_left_out_and_said(robot: Callable[..., Robot]) 
 
 
 def test_another_imu_on_the_topic_changes_nothing(robot: Callable[..., Robot]) -> None:
-    """Upside down, and not level: its samples are rejected and counted, the pose is that of the first alone."""
+    """The other IMU is upside down, and not level: its samples are rejected and counted, and do not affect the pose."""
     r = robot()
     publish_static(r, "base_link", "other", se3.exp([np.pi, 0, 0, 0, 0, 0]))
     r.sample(r.drive.stamp(0) - r.drive.period)
@@ -125,7 +125,7 @@ def test_another_imu_on_the_topic_changes_nothing(robot: Callable[..., Robot]) -
 def test_forces_of_the_other_sign_are_said_at_the_start(
     robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 60.0)  # they miss the first cloud
+    monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 60.0)  # these messages miss the first cloud
     r = robot()
     r.gravity = -r.gravity
     r.stand(0, 1, 2)
@@ -133,7 +133,7 @@ def test_forces_of_the_other_sign_are_said_at_the_start(
 
 
 def test_one_that_is_named_and_never_comes_is_said(robot: Callable[..., Robot]) -> None:
-    """As where its topic is misspelled; one that is not named need not be there."""
+    """As when its topic is misspelled; an IMU whose topic is not set may be absent."""
     r = robot("input.imu_topic:=/imu/dta", topic="/imu/data")
     r.stand(0, 1)
     said = r.status("imu", saying("no usable message on /imu/dta yet; going on without"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A keyframe's payload comes out of its messages as it went in, and what does not add up is rejected by name."""
+"""A keyframe's payload passes through its messages unchanged; inconsistent messages are rejected, and named."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def keyframe(noise: np.random.Generator, fix: Fix | None, picture: bytes | None,
 def test_fix_thumbnail_and_origin_travel_with_the_cloud(
     noise: np.random.Generator, fixed: bool, pictured: bool
 ) -> None:
-    """Within the budget, whatever of them there is: the cloud gives way."""
+    """Within the budget, for any combination of them: the cloud is reduced."""
     picture = thumbnail(make_image(noise), 200) if pictured else None
     sent = replace(keyframe(noise, FIX if fixed else None, picture, 100_000), origin=np.array([1.0, 0, 1.75]))
     payload = payload_from_msg(payload_to_msgs(sent, "a/3")[1])
@@ -58,13 +58,13 @@ def test_fix_thumbnail_and_origin_travel_with_the_cloud(
 def test_a_picture_that_would_cost_the_cloud_its_points_comes_smaller(
     noise: np.random.Generator, size: tuple[int, int], width: int
 ) -> None:
-    """As wide as `slam.map.thumbnail` may be; or of a square camera, as wide as those by which places are found."""
+    """It has the largest width of `slam.map.thumbnail`, or, from a square camera, that for place recognition."""
     picture = thumbnail(make_image(noise, size), width)
     assert len(picture) > 20_000
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1])
     assert payload.fix is not None
     assert payload.thumbnail is not None
-    assert 14_000 < len(payload.thumbnail) <= 20_000  # it has not lost more than it must
+    assert 14_000 < len(payload.thumbnail) <= 20_000  # it is reduced no more than necessary
     whole, small = image_of(picture), image_of(payload.thumbnail)
     assert small.camera.size[0] / small.camera.size[1] == pytest.approx(size[0] / size[1], rel=0.01)  # whole pixels
     np.testing.assert_array_equal(small.camera.K, whole.camera.resized(*small.camera.size).K)
@@ -72,7 +72,7 @@ def test_a_picture_that_would_cost_the_cloud_its_points_comes_smaller(
 
 
 def test_a_large_picture_without_a_camera_stays_at_home(noise: np.random.Generator) -> None:
-    """It could not be used; no node makes such a one."""
+    """Such an image could not be used; no node makes one."""
     picture = thumbnail(make_image(noise, (1024, 768)), 1024)
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture.replace(b'"size"', b'"seize"')), "a/3")[1])
     assert payload.thumbnail is None
@@ -80,7 +80,7 @@ def test_a_large_picture_without_a_camera_stays_at_home(noise: np.random.Generat
 
 
 def test_descriptors_travel_in_half_of_the_budget(noise: np.random.Generator) -> None:
-    """All 320 of a frame do; of more the first, any number of which is as evenly spread as all."""
+    """All 320 of a frame fit; of more, only the first ones: any number of first ones is as evenly spread as all."""
     for count, most in ((600, 325), (320, 320)):
         made = Descriptors.of(noise.normal(0, 15, (count, 3)).astype("f4"), noise.normal(0, 1, (count, 128)))
         sent = replace(keyframe(noise, FIX, None, 100_000), descriptors=made)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch file gives to the nodes starts them.
+"""The nodes start with what the launch file passes to them.
 
-launch and launch_ros are in no package registry. What is computed here is the launch file's own, plain Python; the
-processes are started here as launch_ros starts them, with what the file hands to it.
+launch and launch_ros are in no package registry. These tests run the launch file's own code, which is plain Python,
+and start the processes as launch_ros does, with what the file passes to it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ DEFAULTS = {name: info.get_default(call_default_factory=True) for name, info in 
 
 @pytest.fixture(scope="module")
 def launch_file() -> ModuleType:
-    """The launch file, with mocks in place of launch and launch_ros, which have no wheels."""
+    """The launch file, with mocks in place of launch and launch_ros, for which there are no wheels."""
     path = ROOT / "launch" / "dpm2.launch.py"
     spec = importlib.util.spec_from_file_location("dpm2_launch", path)
     assert spec is not None
@@ -64,7 +64,7 @@ def defaults(launch_file: ModuleType) -> dict[str, str]:
 
 
 def write(parameters: dict[str, Any], path: Path, node: str = "/**") -> Path:
-    """As launch_ros writes them for a node; `node`: its full name, if the launch file gives it one."""
+    """Write parameters as launch_ros does for a node; `node`: its full name, if the launch file sets one."""
     path.write_text(yaml.safe_dump({node: {"ros__parameters": parameters}}))
     return path
 
@@ -73,14 +73,14 @@ def write(parameters: dict[str, Any], path: Path, node: str = "/**") -> Path:
 def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     launch_file: ModuleType, domain: int, tmp_path: Path, kind: type[SlamNode] | type[MapperNode]
 ) -> None:
-    """Whatever a launch argument may leave empty, `config_file` among them."""
+    """All parameters that a launch argument may leave empty, including `config_file`."""
     empty = {
         parameter: ""
         for parameter in launch_file.PARAMETERS.values()
         if isinstance(DEFAULTS.get(parameter, ""), str) and parameter not in ("ros.odom_frame", "ros.odom_source")
     }
     assert CONFIG_FILE in empty
-    quick = {"slam.registration": "geometric", "slam.loops.descriptors": False}  # without the seconds of the network
+    quick = {"slam.registration": "geometric", "slam.loops.descriptors": False}  # without loading the network
     given = {"use_sim_time": False} | quick | empty | launch_file.parameters(defaults(launch_file))
     file = write(given, tmp_path / "p.yaml")
     ros_context(["--ros-args", "--params-file", str(file)], domain)
@@ -117,7 +117,7 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
     node = rclpy.create_node("any", automatically_declare_parameters_from_overrides=True)
     try:
         config = load_parameters(node)
-        assert node.get_parameter("use_sim_time").value is True  # by the bag
+        assert node.get_parameter("use_sim_time").value is True  # because of the bag
     finally:
         end_ros(node)
     changed = {name for name, default in DEFAULTS.items() if of(config, name) != default}
@@ -130,7 +130,7 @@ def test_every_argument_is_a_parameter_that_is_taken(launch_file: ModuleType, tm
 def test_an_argument_overrides_the_parameter_file_whatever_sections_that_has(
     launch_file: ModuleType, tmp_path: Path, domain: int, namespace: str, sections: list[str]
 ) -> None:
-    """rcl keeps the sections of all files in the order in which they appear first, and the last one decides."""
+    """rcl keeps the sections of all files in the order of their first appearance, and the last one takes precedence."""
     kept, lost = {"input.image_topic": "/of_the_file"}, {"input.points_topic": "/of_the_file"}
     own = f"{namespace}/slam_node".lstrip("/")
     tree = {
@@ -150,7 +150,7 @@ def test_an_argument_overrides_the_parameter_file_whatever_sections_that_has(
 
 
 def test_launch_waits_until_a_map_is_saved(launch_file: ModuleType, tmp_path: Path) -> None:
-    """From Ctrl-C to SIGTERM, after which SIGKILL is 5 s away, as in launch: 10 s were not enough on a busy machine."""
+    """From Ctrl-C to SIGTERM; SIGKILL follows 5 s later, as in launch: 10 s were not enough on a busy machine."""
     commands(launch_file, defaults(launch_file) | {"embed_mapper": "false", "rviz": "false"}, tmp_path)
     given = {call.kwargs["executable"]: call.kwargs for call in launch_file.Node.call_args_list}
     assert set(given) == {"slam_node", "mapper_node"}
@@ -159,7 +159,7 @@ def test_launch_waits_until_a_map_is_saved(launch_file: ModuleType, tmp_path: Pa
 
 @pytest.mark.parametrize(("names", "count"), [("", "1"), ("red,blue", "2")])
 def test_the_bag_waits_for_each_slam_node(launch_file: ModuleType, tmp_path: Path, names: str, count: str) -> None:
-    """RViz hears the clouds before any of them."""
+    """RViz receives the clouds before any of them."""
     value = defaults(launch_file) | {"bag": "drive.mcap", "robots": names, "rviz": "false"}
     words = dict(commands(launch_file, value, tmp_path))["bag_player"]
     assert words[words.index("--for") + 1] == "slam_node"
@@ -257,7 +257,7 @@ def of(config: NodeConfig, name: str) -> Any:
 
 
 def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> list[tuple[str, list[str]]]:
-    """Executable and arguments of each process, as launch_ros makes them of what the file hands to it."""
+    """Executable and arguments of each process, as launch_ros makes them from what the file passes to it."""
     launch_file.Node.reset_mock()
     launch_file.LaunchConfiguration.side_effect = lambda name: SimpleNamespace(perform=lambda context: context[name])
     launch_file.ParameterValue.side_effect = lambda text, value_type: value_type(text)
@@ -279,7 +279,7 @@ def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> li
 
 
 def test_paths_may_begin_at_home(launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No shell expands what stands behind `:=`: `params_file:=~/mine.yaml` was no such file, and so was the bag."""
+    """No shell expands text after `:=`: the files of `params_file:=~/mine.yaml` and of `bag:=~/...` were not found."""
     monkeypatch.setenv("HOME", str(tmp_path))
     file = write({}, tmp_path / "mine.yaml")
     value = defaults(launch_file) | {"bag": "~/drive.mcap", "params_file": "~/mine.yaml", "rviz": "false"}
@@ -292,7 +292,7 @@ def test_paths_may_begin_at_home(launch_file: ModuleType, tmp_path: Path, monkey
 def test_what_it_starts_with_lifecycle_is_managed_over_the_services(
     launch_file: ModuleType, ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """A robot's slam_node and the mapper_node beside it, from nothing to a map file and back, and to their end."""
+    """A robot's slam_node and the separate mapper_node, from nothing to a map file and back, and to their exit."""
     fast = {"input.images": False, "slam.loops.descriptors": False, "slam.registration": "geometric"}
     file, maps = write(fast | {"slam.keyframes.distance": 1.0}, tmp_path / "fast.yaml"), tmp_path / "maps"
     value = defaults(launch_file) | {"lifecycle": "true", "embed_mapper": "false", "namespace": "red", "rviz": "false"}

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node and mapper_node as managed nodes, over their lifecycle services: round and round, every map and every
-keyframe kept, and nothing left over."""
+"""slam_node and mapper_node as managed nodes, over their lifecycle services: in repeated cycles every map and every
+keyframe is kept, and nothing is left over."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ class Managed:
 
     @property
     def keyframes(self) -> int:
-        """In the map."""
+        """Number of keyframes in the map."""
         return len(self.node.slam.mapper.keyframes)
 
 
 class Lidar:
-    """Of a robot."""
+    """The LiDAR of a robot."""
 
     def __init__(self, harness: Any, drive: Any) -> None:
         self.harness, self.drive = harness, drive
@@ -85,7 +85,7 @@ class Lidar:
 
 
 class Robot:
-    """Its keyframes as messages."""
+    """A robot's keyframes as messages."""
 
     def __init__(self, harness: Any) -> None:
         self._wires = Wires(harness)
@@ -98,13 +98,13 @@ class Robot:
 
 
 def held() -> tuple[int, int]:
-    """Threads of Python and open files of this process."""
+    """Number of Python's threads, and of open files, of this process."""
     gc.collect()
     return threading.active_count(), len(os.listdir("/proc/self/fd"))
 
 
 def ids(path: Path) -> list[int]:
-    """Of the keyframes in a map file."""
+    """The ids of the keyframes in a map file."""
     with MapStore.open(path) as store:
         return [keyframe.id for keyframe in load_map(store).keyframes]
 
@@ -130,14 +130,14 @@ def test_rounds_keep_every_map_and_leave_nothing(
         assert (result.problems, result.keyframes >= 1) == ([], True)
         assert (tmp_path / name / "map.ply").is_file()
     assert m.state == "unconfigured"
-    # One of them may have been counted while something of the harness was ending.
+    # The counted round may include something of the harness that was ending.
     no_more = lambda: all(now <= then for now, then in zip((*held(), m.entities), after[2], strict=True))  # noqa: E731
     m.harness.wait(no_more, f"no more than {after[2]}, as of {after}")
 
 
 @pytest.mark.slow
 def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
-    """And goes on where it was."""
+    """After activation, it continues where it was."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
     lidar = Lidar(m.harness, drive)
     assert m.state == "unconfigured"
@@ -165,7 +165,7 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
 def test_time_that_goes_back_while_it_is_inactive_is_noticed(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """A simulation that begins anew, a bag that is played again: so does the odometry."""
+    """As when a simulation or a bag starts again: the odometry starts again, too."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
     lidar = Lidar(m.harness, drive)
     assert m.change(CONFIGURE, ACTIVATE)
@@ -174,12 +174,12 @@ def test_time_that_goes_back_while_it_is_inactive_is_noticed(
     m.harness.wait(lambda: not lidar.clouds.get_subscription_count(), "the end of the subscription")
     assert m.change(ACTIVATE)
     lidar.send(0, 1)
-    assert lidar.odom[-1].pose.pose.position.x == pytest.approx(drive.pose(1)[0, 3], abs=0.1)  # m, as of any scan
+    assert lidar.odom[-1].pose.pose.position.x == pytest.approx(drive.pose(1)[0, 3], abs=0.1)  # m, as for any scan
 
 
 def test_a_clock_that_is_asked_for_while_it_is_active_goes_on(ros: Callable[..., Any]) -> None:
-    """`ros2 param set use_sim_time true`: it stood still after the next deactivation, and clouds without a stamp, which
-    get its time, were rejected as repeated."""
+    """`ros2 param set use_sim_time true`: the clock stopped at the next deactivation. Clouds without a stamp, which
+    are stamped with its time, were then rejected as repeated."""
     managed = Managed(ros(*FAST), SlamNode)
     harness, clock = managed.harness, managed.harness.publisher(Clock, "/clock")
     value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
@@ -239,7 +239,7 @@ def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
 def test_what_cannot_be_configured_stays_unconfigured(
     ros: Callable[..., Any], tmp_path: Path, kind: type[SlamNode] | type[MapperNode], wrong: str
 ) -> None:
-    """And leaves nothing: no thread, no topic, no empty map."""
+    """It leaves no thread, no topic and no empty map."""
     given = (wrong, "slam.loops.descriptors:=true", "input.images:=false")
     m = Managed(ros(*given, f"ros.map_directory:={tmp_path / 'maps'}"), kind)
     before, entities = held()[0], m.entities
@@ -291,7 +291,7 @@ def test_who_has_asked_before_the_cleanup_is_answered(
 
 @pytest.mark.slow
 def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """Without a map, which it has not begun. Both executables, from nothing to a map and back: test_launch.py."""
+    """It leaves no map, since none was begun. For both executables, from nothing to a map and back: test_launch.py."""
     harness = ros()
     options = ["--lifecycle", "--ros-args", "-p", f"ros.map_directory:={tmp_path / 'maps'}"]
     process = harness.start("slam_node", options, tmp_path / "log")

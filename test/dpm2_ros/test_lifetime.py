@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes end cleanly, with the map saved, however impatient whoever stops them is."""
+"""Processes end cleanly, with the map saved, however often they are interrupted."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ SAVED = ["map.ply", "pose_graph.g2o", "trajectory.tum"]
 
 @contextmanager
 def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Iterator[subprocess.Popen[bytes]]:
-    """slam_node in a process of its own, from when it listens: its map in `folder`/map, its log, which has no trace of
-    a bug, in `folder`/log."""
+    """slam_node as a process, from the time it subscribes: its map is in `folder`/map, its log in `folder`/log. The
+    log must contain no traceback."""
     given = [part for parameter in (f"ros.map_directory:={folder / 'map'}", *parameters) for part in ("-p", parameter)]
     process = harness.start("slam_node", ["--ros-args", *given, *GEOMETRIC], folder / "log")
     harness.wait(lidar.get_subscription_count, "slam_node")
@@ -56,7 +56,7 @@ def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Ite
 
 
 def test_slam_node_saves_its_map_when_stopped(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
-    """By two SIGINT, as `ros2 launch` sends them."""
+    """Two SIGINT are sent, as by `ros2 launch`."""
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     lidar = harness.publisher(PointCloud2, naming.POINTS)
@@ -74,7 +74,7 @@ def test_slam_node_saves_its_map_when_stopped(ros: Callable[..., Any], drive: An
 
 
 def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
-    """From the moment Python runs the entry point; then no map is begun."""
+    """This holds from the moment Python runs the entry point; no map is begun."""
     saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
     process = start("slam_node", saving, ros_environment(domain), tmp_path / "log")
     while not _handles_sigint(process) and process.poll() is None:
@@ -86,7 +86,7 @@ def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
 
 
 def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """Its node is there, and does not listen yet."""
+    """Its node exists, but does not subscribe yet."""
     harness = ros()
     process = harness.start("slam_node", [], tmp_path / "log")
     harness.wait(lambda: "slam_node" in harness.node.get_node_names(), "the node")
@@ -96,7 +96,7 @@ def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: P
 
 
 def test_a_second_signal_that_comes_while_python_ends(bag: Path, tmp_path: Path, domain: int) -> None:
-    """The process ends in hundreds of ms; signals every 5 ms meet each moment of it."""
+    """The process ends within hundreds of ms; signals every 5 ms arrive in each phase of it."""
     log = tmp_path / "log"
     process = start("bag_player", [str(bag), "--wait", "90"], ros_environment(domain), log)
     try:
@@ -124,7 +124,7 @@ for _ in range(2000):
 
 
 def test_a_signal_may_meet_each_moment_of_a_wait() -> None:
-    """With `threading.Event` one of some hundred did not come back, with `queue.SimpleQueue` one of some thousand:
+    """With `threading.Event` one wait of some hundred did not return, with `queue.SimpleQueue` one of some thousand:
     `bag_player` waits a hundred times per second."""
     subprocess.run([sys.executable, "-c", STOPPED], check=True, timeout=120)
 
@@ -145,8 +145,8 @@ def test_who_waits_is_woken_and_later_waits_end_at_once() -> None:
 
 @pytest.mark.parametrize("given", [{}, {"ROS_LOG_DIR": "/proc"}])
 def test_without_a_folder_for_logs_it_says_what_to_set(domain: int, given: dict[str, str]) -> None:
-    """As in a systemd unit, which has no HOME; or where there is one that cannot be written, as after a start by root,
-    which nobody can in /proc."""
+    """As in a systemd unit, which has no HOME; or with a folder that cannot be written, as after a start as root. /proc
+    is a folder that nobody can write."""
     environment = {name: text for name, text in ros_environment(domain).items() if name not in ("HOME", "ROS_LOG_DIR")}
     environment |= given
     command = [sys.executable, "-m", "dpm2_ros.executables", "bag_player"]
@@ -158,7 +158,7 @@ def test_without_a_folder_for_logs_it_says_what_to_set(domain: int, given: dict[
 def test_arguments_that_a_node_does_not_know_are_errors(
     run: Callable[..., subprocess.CompletedProcess[str]],
 ) -> None:
-    """Without `--ros-args` every parameter was ignored without a word. Both nodes read theirs alike."""
+    """Without `--ros-args` every parameter was silently ignored. Both nodes parse their arguments in the same way."""
     done = run("slam_node", "-p", "slam.registration:=geometric")
     assert (done.returncode, done.stdout) == (2, "")
     assert "error: unknown argument -p; those of ROS, such as -p, come after --ros-args" in done.stderr
@@ -174,7 +174,7 @@ def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
 
 
 def test_what_cannot_listen_leaves_no_map(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """Its map was opened before."""
+    """Its map had been opened before."""
     ros(f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={naming.POINTS}")
     with pytest.raises(UsageError, match="is that of the first LiDAR"):
         SlamNode()
@@ -182,7 +182,7 @@ def test_what_cannot_listen_leaves_no_map(ros: Callable[..., Any], tmp_path: Pat
 
 
 def test_a_map_that_cannot_be_saved_at_the_end_is_an_error(rig: Callable[..., Rig], tmp_path: Path) -> None:
-    """With the exit code of the next test."""
+    """The next test checks the exit code."""
     (tmp_path / "map").write_text("in the way")
     r = rig(f"ros.map_directory:={tmp_path / 'map'}")
     r.send_and_wait(0)
@@ -194,7 +194,7 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_an_error(rig: Callable[..., Ri
 def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """Another program writes to it, which is as a full disk; that the folder cannot be made was the only error."""
+    """Another program locks it, with the effect of a full disk; only the folder that cannot be made was reported."""
     harness, path = ros(), tmp_path / "town.dpm2map"
     (tmp_path / "map").write_text("in the way")
     keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
@@ -210,7 +210,7 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
         assert process.wait(180) == 1
     output = (tmp_path / "log").read_text()
     problem = rf"map file incomplete: {path}: .*locked; 1 keyframes are in memory only"
-    assert len(re.findall(problem, output)) == 2  # at once, and at the end
+    assert len(re.findall(problem, output)) == 2  # immediately, and at the end
     assert re.search(rf"^error: {problem}$", output, re.MULTILINE)
     assert f"{tmp_path / 'map'}: no map saved" in output
 
@@ -218,14 +218,14 @@ def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
 def test_a_drive_through_player_slam_node_and_mapper_node(
     ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """Three processes, the mapper apart: every cloud comes out, and the mapper, which SIGTERM ends, saves the map of
-    all keyframes."""
+    """Three processes, with a separate mapper: every cloud gets its odometry, and the mapper, which SIGTERM ends,
+    saves the map of all keyframes."""
     harness = ros()
     odometry, keyframes = harness.hear(Odometry, "/dpm2/odom"), harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
     paths = harness.hear(PathMsg, "/dpm2/path", LAST_ONE)
 
     def made() -> int:
-        """Keyframes; one that the mapper has not acknowledged yet is sent again."""
+        """Number of keyframes; one that the mapper has not acknowledged yet is sent again."""
         return len({message.child_frame_id for message in keyframes})
 
     apart = ["-p", "ros.embed_mapper:=false", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
@@ -234,7 +234,7 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
     mapper = harness.start("mapper_node", ["--ros-args", *saving, *GEOMETRIC], tmp_path / "mapper.log")
     harness.wait(lambda: harness.node.count_subscribers("/dpm2/keyframe") == 1, "the mapper")
     harness.find("slam_node")
-    slowly = ["--wait", "90", "--rate", "0.25"]  # on a busy machine, too, nothing is dropped
+    slowly = ["--wait", "90", "--rate", "0.25"]  # so that nothing is dropped, even on a busy machine
     assert harness.start("bag_player", [str(bag), *slowly], tmp_path / "player.log").wait(180) == 0
     harness.wait(lambda: len(odometry) == drive.frames, "every pose")
     slam.send_signal(signal.SIGINT)
@@ -251,13 +251,13 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
 def test_replay_is_checked_by_what_arrived(
     bag: Path, drive: Any, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `make demo` does: all checks hold; and without one pose, or in a wrong order of events, they do not."""
+    """As `make demo` does it: all checks pass; if a pose is missing or events are in a wrong order, they fail."""
     parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0, **QUICK}
     source = BagSource(bag, InputSettings(images=False))
-    for name, value in ros_environment(domain).items():  # it draws a domain, which may be that of another test
+    for name, value in ros_environment(domain).items():  # replay would draw a domain, which another test may use
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("tools.replay.ros_environment", lambda: ros_environment(domain))
-    # Slowly: on a busy machine, too, nothing is dropped.
+    # Slowly, so that nothing is dropped, even on a busy machine.
     result = replay(source, tmp_path, 0.25, parameters)
     outcome = evaluate_replay(source, result, tmp_path)
     assert all(outcome.checks.values()), outcome.checks
@@ -281,7 +281,7 @@ def test_replay_is_checked_by_what_arrived(
 
 
 def test_ros_ends_in_time_or_the_process_does(domain: int) -> None:
-    """Also where what hangs holds Python's lock, so that neither a signal nor another thread is heard."""
+    """Also if the code that hangs holds Python's lock, so that neither signals nor other threads are handled."""
     stuck = "ctypes.PyDLL(None).sleep(120)"
     code = f"""
 import ctypes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Livox' CustomMsg on a topic: followed where its package is installed, named where it is not."""
+"""Livox' CustomMsg on a topic: it is subscribed to if its package is installed, and reported otherwise."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ SECONDS = np.linspace(0, 0.1, 50)
 
 
 def offering(node: Node, kind: str) -> Node:  # noqa: F811
-    """The node, told by the graph that its topics have publishers of that type."""
+    """The node, with a graph that reports publishers of that type on its topics."""
     info = SimpleNamespace(topic_type=kind, qos_profile=SimpleNamespace(reliability=None))
     node.get_publishers_info_by_topic = lambda topic: [info]  # type: ignore[assignment,return-value]
     return node
 
 
 def test_a_missing_package_is_named(node: Callable[..., Node]) -> None:  # noqa: F811
-    """A driver that sends the type cannot run where it is missing, so that the graph's answer is made up here."""
+    """A driver that sends the type cannot run without the package, so the graph's answer is made up here."""
     if message_type(CUSTOM) is not None:
         pytest.skip("the package is installed")
     made = MatchedSubscription(offering(node(), CUSTOM), PointCloud2, "/livox/lidar", print, RosSettings())
@@ -59,7 +59,7 @@ def test_other_types_are_left_alone(node: Callable[..., Node]) -> None:  # noqa:
 
 
 def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  # noqa: F811
-    """From the driver's type, over DDS, into a frame with the time of each point; a PointCloud2 comes after it."""
+    """From the driver's type, over DDS, into a frame with the time of each point; a PointCloud2 follows it."""
     kind: Any = message_type(CUSTOM)
     if kind is None:
         pytest.skip("livox_ros_driver2 is not installed")
@@ -84,7 +84,7 @@ def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  
 
 
 def recorded(folder: Path) -> Path:
-    """Five clouds of a CustomMsg."""
+    """A bag with five clouds as CustomMsg."""
     stamps = range(10**9, 15 * 10**8, 10**8)
     sent = [(stamp + 10**8, "/livox/lidar", custom_message(stamp, POINTS, SECONDS)) for stamp in stamps]
     return write_bag(folder, {"/livox/lidar": CUSTOM}, sent, livox_store())
@@ -93,8 +93,8 @@ def recorded(folder: Path) -> Path:
 def test_a_recording_is_played_in_lockstep(
     ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was refused: no node turned its clouds into an odometry. Where the package is not installed, the bytes go out
-    under another type."""
+    """It was rejected, because no node made an odometry of its clouds. If the package is not installed, the bytes
+    are sent under another type."""
     monkeypatch.setattr(bag_player, "message_type", lambda kind: message_type(kind) or PointCloud2)
     kind, n, seen = message_type(CUSTOM) or PointCloud2, ros().node, list[int]()
     odometry = n.create_publisher(Odometry, "dpm2/odom", 10)
@@ -107,7 +107,7 @@ def test_a_recording_is_played_in_lockstep(
         odometry.publish(message)
 
     n.create_subscription(kind, "/livox/lidar", answer, 10, raw=True)
-    play(recorded(tmp_path / "bag"))  # an error, where a cloud has no odometry
+    play(recorded(tmp_path / "bag"))  # raises an error if a cloud has no odometry
     assert seen == [0, 10**8, 2 * 10**8, 3 * 10**8, 4 * 10**8]
 
 

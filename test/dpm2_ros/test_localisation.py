@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A slam_node process that finds itself, over real DDS, in a map that `dpm2 run --map` made; it stays as it is."""
+"""A slam_node process localizes, over real DDS, in a map that `dpm2 run --map` made; the map does not change."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from ..helpers.command import dpm2
 
 pytestmark = pytest.mark.weights
 ODOMETRY = "slam.registration=geometric"
-"""Of scans one after the other: places are found by the network all the same."""
+"""Odometry from one scan to the next; place recognition uses the network nevertheless."""
 
 
 @pytest.fixture(scope="module")
 def made(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its map, as the command makes it."""
+    """The map of the recording, as the command makes it."""
     folder = tmp_path_factory.mktemp("map")
     done = dpm2("run", recording, "--out", folder / "out", "--map", folder / "drive.dpm2map", "--set", ODOMETRY)
     assert done.returncode == 0, done.stderr
@@ -72,8 +72,8 @@ class Robot:
         return bool(self.lidar.get_subscription_count() and self.message(""))
 
     def send(self, *frames: int) -> None:
-        """Scans, 0.1 s apart whatever their place in the drive, each when the one before has come out; of one place no
-        two are the same, as of no LiDAR."""
+        """Publish scans 0.1 s apart, whatever their position in the drive, each after the odometry of the one before.
+        No two scans are identical, even if repeated, as with a real LiDAR."""
         for n in frames:
             frame = next(iter(self._source.frames(n, n + 1)))
             self._stamp += 100_000_000
@@ -87,7 +87,7 @@ class Robot:
         self._stamp -= round(seconds * 1e9)
 
     def stand(self, frame: int, condition: Callable[[], Any], what: str) -> None:
-        """The same scan again and again, until something holds."""
+        """Publish the same scan repeatedly, until the condition is true."""
 
         def again() -> Any:
             self.send(frame)
@@ -101,14 +101,14 @@ class Robot:
         return f"{statuses[-1].message} " if statuses else ""
 
     def off(self, T_map_lidar: Array) -> float:
-        """Distance from a place to where the last transforms put the robot, m; infinite before map -> odom is known."""
+        """Distance between a pose and the robot's by the last transforms, m; infinite before map -> odom is known."""
         last = {t.child_frame_id: transform_matrix(t.transform) for m in self.tf for t in m.transforms}
         if "odom" not in last:
             return np.inf
         return float(np.linalg.norm((last["odom"] @ last["lidar"] - T_map_lidar)[:3, 3]))
 
     def point(self, T_map_lidar: Array, frame: str) -> None:
-        """As RViz does."""
+        """Publish an initial pose, as RViz does."""
         message = PoseWithCovarianceStamped(header=header(0, frame))
         message.pose.pose = pose_to_msg(T_map_lidar)
         publisher = self.harness.publisher(PoseWithCovarianceStamped, "/initialpose")
@@ -135,7 +135,7 @@ def place(recording: Path, n: int) -> Array:
 def test_finds_itself_tracks_and_notices_being_carried_off(
     robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:
-    """From the middle of the map; carried back while it runs; and all through the file stays as it is."""
+    """It starts in the middle of the map, and is carried back while it runs; the file never changes."""
     before = digest(made)
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true", "slam.keyframes.distance:=2.0")
     assert "relocalising" in r.message("slam_node: localisation")
@@ -145,7 +145,7 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
     r.harness.wait(lambda: r.off(place(recording, 18)) < 0.1, "its place in the map")
     r.harness.wait(lambda: r.message("slam_node: localisation").startswith("tracking"), "the second result")
     seen = len(r.diagnostics)
-    r.send(19)  # the state that is published is that at the last cloud
+    r.send(19)  # the published state is that at the last cloud
     info = lambda: [s.message for d in r.diagnostics[seen:] for s in d.status if s.name.endswith("odometry")]  # noqa: E731
     r.harness.wait(lambda: any(text.startswith("track") for text in info()), "the state")
     # carried off: scans from 15 m behind, which the odometry cannot follow
@@ -161,8 +161,8 @@ def test_finds_itself_tracks_and_notices_being_carried_off(
 def test_hints_and_services_give_reasons(
     robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:
-    """A hint in another frame, a map saved that stays as it is, a file that is gone: rejected, and the drive goes
-    on."""
+    """A hint in another frame, a save of a map that does not change, a file that is gone: each is rejected, and the
+    drive continues."""
     r = robot(f"ros.map_file:={made}", "ros.localization_mode:=true")
     r.stand(0, lambda: r.off(np.eye(4)) < 0.2, "map -> odom")
     r.point(np.eye(4), "odom")
@@ -170,8 +170,8 @@ def test_hints_and_services_give_reasons(
     saved = r.harness.call(Trigger, "/slam_node/save_map")
     assert not saved.success
     reset = r.harness.call(Trigger, "/slam_node/reset")
-    assert (reset.success, "and the search" in reset.message) == (True, True)  # the map stays
-    # the file goes: it cannot be loaded again, and the robot keeps what it has
+    assert (reset.success, "and the search" in reset.message) == (True, True)  # the map is kept
+    # without its file the map cannot be loaded again, and the robot keeps what it has loaded
     made_elsewhere = made.rename(made.with_name("gone.dpm2map"))
     try:
         result = r.harness.call(Trigger, "/slam_node/load_map")
@@ -186,7 +186,7 @@ def test_hints_and_services_give_reasons(
     seen = len(r.tf)
     again = lambda: any(t.header.frame_id == "map" for m in r.tf[seen:] for t in m.transforms)  # noqa: E731
     r.stand(1, again, "the robot in the map again")
-    r.go_back(20.0)  # its clock is set: odom begins anew, so that the place in the map has to be found anew
+    r.go_back(20.0)  # its clock is set back: odom starts again, so the robot must be relocalized in the map
     r.stand(3, lambda: "time went back" in r.log.read_text(), "the restart")
     seen = len(r.tf)
     r.stand(3, lambda: again() and r.off(place(recording, 3)) < 0.2, "the robot in the map after the jump")
@@ -194,7 +194,7 @@ def test_hints_and_services_give_reasons(
 
 @pytest.mark.long
 def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_path: Path) -> None:
-    """One node makes a map, finds itself in it, and lets it grow by a session; each response has a message."""
+    """One node makes a map, localizes in it, and extends it by a session; each response has a message."""
     path = tmp_path / "own.dpm2map"
     r = robot(f"ros.map_file:={path}", "slam.keyframes.distance:=2.0")
     assert not r.harness.call(Trigger, "/slam_node/load_map").success
@@ -230,7 +230,7 @@ def test_from_mapping_to_localizing_and_back(robot: Callable[..., Robot], tmp_pa
 def test_another_map_by_its_name_while_the_node_runs(
     robot: Callable[..., Robot], recording: Path, made: Path, tmp_path: Path
 ) -> None:
-    """From a map that is being made to a saved one; what cannot be loaded leaves what was."""
+    """It switches from a map that is being made to a saved one; a map that cannot be loaded changes nothing."""
     maps = tmp_path / "maps"
     maps.mkdir()
     shutil.copy(made, maps / "town.dpm2map")
@@ -245,7 +245,7 @@ def test_another_map_by_its_name_while_the_node_runs(
     refused = named("../town")
     assert not refused.successful
     assert "map_name" in refused.reason
-    assert not r.harness.call(Trigger, "/slam_node/load_map").success  # nothing is named
+    assert not r.harness.call(Trigger, "/slam_node/load_map").success  # no map is named
     assert named("nowhere").successful
     lost = r.harness.call(Trigger, "/slam_node/load_map")
     assert (lost.success, "no such map file" in lost.message) == (False, True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""In lockstep a replay is exact: what slam_node sees is what `dpm2 run` sees, of cameras and of two LiDARs."""
+"""In lockstep a replay is exact: slam_node receives what `dpm2 run` reads, with cameras and with two LiDARs."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ MS = 1_000_000
 
 
 Shots = list[tuple[int, int]]
-"""Stamps of images and the log times at which they were recorded, ns."""
+"""Stamps of images, and the log times at which they were recorded, ns."""
 
 
 def with_shots(bag: Path, folder: Path, shots: Shots, later: int) -> Path:
-    """The drive with images of these times, each different, and its calibration recorded `later` (ns)."""
+    """The drive with images at these times, all different, and with its calibration recorded `later` (ns)."""
     types = get_typestore(Stores.ROS2_JAZZY)
     source, rng = open_bag(bag), np.random.default_rng(2)
     out: list[tuple[int, str, bytes]] = []
@@ -65,8 +65,8 @@ def with_shots(bag: Path, folder: Path, shots: Shots, later: int) -> Path:
 
 @pytest.fixture(scope="module")
 def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The drive with three images a cloud, recorded 30 ms after their stamps: the nearest is the second, which comes
-    after the cloud; and with a calibration that comes only after the first cloud."""
+    """The drive with three images per cloud, recorded 30 ms after their stamps: the nearest is the second, recorded
+    after the cloud. The calibration is recorded only after the first cloud."""
     stamps = BagSource(bag).stamps.tolist()
     shots = [(stamp + shift * MS, stamp + (shift + 30) * MS) for stamp in stamps for shift in (-20, 12, 45)]
     return with_shots(bag, tmp_path_factory.mktemp("fast") / "camera", shots, 45 * MS)
@@ -75,15 +75,15 @@ def fast_camera(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_lockstep_gives_the_trajectory_of_dpm2_run(
     ros: Callable[..., Any], fast_camera: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """Bit for bit, images included: here every pose is moved by the image of its cloud."""
+    """The trajectories are identical bit for bit, with images: here every pose depends on its cloud's image."""
     settings = ["slam.odometry.degraded_sigma=0.0001", "slam.visual.min_correlation=0.0", "slam.visual.distinct=0.0"]
-    settings += ["slam.registration=geometric", "slam.loops.descriptors=false"]  # else the network would be loaded
+    settings += ["slam.registration=geometric", "slam.loops.descriptors=false"]  # otherwise the network would be loaded
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     given = [*(text.replace("=", ":=") for text in settings), "ros.base_frame:=velo_link", "ros.map_directory:=''"]
     arguments = ["--ros-args", *(part for one in given for part in ("-p", one))]
     harness.start("slam_node", arguments, tmp_path / "node")
-    harness.find("slam_node")  # its odometry of the first clouds would be lost otherwise
+    harness.find("slam_node")  # otherwise its odometry of the first clouds would be lost
     player = harness.start("bag_player", [str(fast_camera), "--lockstep"], tmp_path / "player")
     assert player.wait(180) == 0, (tmp_path / "player").read_text()
     assert f"each of {drive.frames} clouds had its odometry" in (tmp_path / "player").read_text()
@@ -96,18 +96,18 @@ def test_lockstep_gives_the_trajectory_of_dpm2_run(
         return [pose_to_msg(one.T_odom_lidar) for one in tracked]
 
     assert [message.pose.pose for message in odometry] == expected()
-    assert [message.pose.pose for message in odometry] != expected("input.image_time_offset=-0.03")  # other images
+    assert [message.pose.pose for message in odometry] != expected("input.image_time_offset=-0.03")  # with other images
     run(fast_camera, tmp_path / "out", settings=settings)
     written = read_trajectory(tmp_path / "out" / "trajectory.tum")
     assert written.keys.tolist() == [stamp_ns(message.header) for message in odometry]
     poses = [transform_matrix(message.pose.pose) for message in odometry]
-    np.testing.assert_allclose(written.poses, poses, rtol=0, atol=1e-10)  # it has 12 digits
+    np.testing.assert_allclose(written.poses, poses, rtol=0, atol=1e-10)  # the file has 12 digits
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_lockstep_builds_the_frames_of_dpm2_run(ros: Callable[..., Any], bag: Path, tmp_path: Path, seed: int) -> None:
-    """Of a camera with up to three images a cloud, whose stamps jitter by more than their distance, and at times one
-    in the middle of two clouds; recorded from at once to 0.7 s later, and its calibration after the last cloud."""
+    """The camera has up to three images per cloud, with stamps that jitter by more than their distance, and sometimes
+    one midway between two clouds. Images are recorded up to 0.7 s late, the calibration after the last cloud."""
     rng, shots = np.random.default_rng(seed), []
     for n, cloud in enumerate(BagSource(bag).stamps.tolist()):
         if n % 6 == 0:
@@ -131,12 +131,12 @@ def test_lockstep_builds_the_frames_of_dpm2_run(ros: Callable[..., Any], bag: Pa
 def test_a_gap_is_no_clock_that_was_set(
     ros: Callable[..., Any], bag: Path, tmp_path: Path, ahead: int, gap: int
 ) -> None:
-    """In lockstep no time passes in it but by /clock. Where the stamps alone go on by so many ms, a clock was set."""
+    """In lockstep, time passes in a gap only by /clock. If only the stamps jump by so many ms, a clock was set."""
     types, source = get_typestore(Stores.ROS2_JAZZY), open_bag(bag)
     kinds = {topic: source.types[topic] for topic in (naming.POINTS, f"{naming.KITTI.truth}/odom")} | {naming.IMU: IMU}
     set_at = BagSource(bag).stamps.tolist()[8]
     messages = [(time, topic, bytes(data)) for topic, time, data in source.messages(list(kinds))]
-    for time in BagSource(bag).stamps.tolist():  # none in the gap either: the last cloud before waits to its end
+    for time in BagSource(bag).stamps.tolist():  # none in the gap either: the last cloud before it waits to its end
         sample = bag_messages.imu(time, np.full(3, 0.01), np.array([0, 0, 9.8]))
         messages.append((time + MS, naming.IMU, bytes(types.serialize_cdr(sample, IMU))))
     for n, (time, topic, data) in enumerate(messages):
@@ -155,8 +155,8 @@ SECOND = "/second/points"
 
 
 def with_second(bag: Path, folder: Path, seed: int) -> Path:
-    """The drive with a second LiDAR 1 m to the left, whose clouds are recorded up to 0.3 s after their stamps: these
-    jitter by up to 45 ms, some are missing, and some come twice."""
+    """The drive with a second LiDAR 1 m to the left. Its clouds are recorded up to 0.3 s after their stamps, which
+    jitter by up to 45 ms; some clouds are missing, and some are repeated."""
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(seed)
     source = open_bag(bag)
     kinds = {topic: kind for topic, kind in source.types.items() if topic != naming.IMAGE}
@@ -200,7 +200,7 @@ def test_lockstep_joins_the_clouds_of_two_lidars_as_dpm2_run_does(
 
 
 def test_a_node_whose_answer_is_lost_is_asked_again(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
-    """Which of the clouds is that of its second LiDAR."""
+    """The request is which clouds are those of its second LiDAR."""
     recording, asked, never = with_second(bag, tmp_path / "two", 0), [], Future()
     node = ros().add(Listener(SECOND, start_parameter_services=False))
 
@@ -231,7 +231,7 @@ def test_two_lidars_of_a_node_that_does_not_say_which_is_the_second_end_it(
 
 
 class Responder:
-    """Publishes an odometry for clouds, as slam_node does, but only for those that it is asked for."""
+    """Publishes an odometry for clouds, as slam_node does, but only for the selected ones."""
 
     def __init__(self, harness: Any, responds: Callable[[int], bool]) -> None:
         self.harness, self._responds = harness, responds
@@ -248,7 +248,7 @@ class Responder:
 def test_a_cloud_without_odometry_is_reported_and_the_next_goes_out(
     ros: Callable[..., Any], bag: Path, drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(lockstep, "TIMEOUT", 3.0)  # the odometry of the others comes within that, however busy it is
+    monkeypatch.setattr(lockstep, "TIMEOUT", 3.0)  # enough time for the odometry of the others, even on a busy machine
     node = Responder(ros(), lambda n: n != 5)
     with pytest.raises(Dpm2Error, match=f"1 of {drive.frames} clouds had no odometry"):
         play(bag)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""In lockstep each cloud has the IMU samples and the fix that it has in `dpm2 run`."""
+"""In lockstep, each cloud has the same IMU samples and the same fix as in `dpm2 run`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MS = 1_000_000
 
 def recorded(bag: Path, folder: Path) -> Path:
     """The drive as sweeps of 0.1 s that are recorded at their stamps, with an IMU at 200 Hz, and with fixes that are
-    recorded up to 0.45 s after theirs."""
+    recorded up to 0.45 s after their stamps."""
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(0)
     source, stamps = open_bag(bag), BagSource(bag).stamps.tolist()
     first, last = stamps[0], stamps[-1]
@@ -50,8 +50,8 @@ def recorded(bag: Path, folder: Path) -> Path:
 def test_the_samples_of_a_sweep_and_a_late_fix_are_those_of_dpm2_run(
     ros: Callable[..., Any], bag: Path, tmp_path: Path
 ) -> None:
-    """The last samples of a sweep are recorded after its stamp; a fix that comes right after a cloud is the next
-    one's."""
+    """The last samples of a sweep are recorded after its stamp; a fix that is recorded directly after a cloud is
+    associated with the next cloud."""
     recording = recorded(bag, tmp_path / "recorded")
     expected = list(BagSource(recording, InputSettings(gnss_topic=naming.FIX)).frames())
     assert all(frame.imu is not None and frame.imu.stamps[-1] == frame.stamp + 100 * MS for frame in expected)

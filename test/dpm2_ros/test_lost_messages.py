@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What never arrived is counted: exactly by the publisher's numbers, else by the rhythm of the stamps."""
+"""Lost messages are counted: exactly by the publisher's numbers, otherwise by the period of the stamps."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def count(stamps: list[int], numbers: list[int] | None = None) -> int:
 
 @given(arrived=st.sets(st.integers(0, 300), min_size=1), first=st.integers(1, 10**6), seed=st.integers(0, 9))
 def test_numbers_are_exact_whatever_the_stamps_say(arrived: set[int], first: int, seed: int) -> None:
-    """From the first that arrives to the last; a publisher has numbered others before."""
+    """Losses are counted from the first received message to the last; numbers before the first do not count."""
     kept = sorted(arrived)
     stamps = np.cumsum(np.random.default_rng(seed).integers(0, 10**10, kept[-1] + 1))[kept]
     assert count(stamps.tolist(), [first + n for n in kept]) == kept[-1] - kept[0] + 1 - len(kept)
 
 
 def test_another_publisher_begins_anew() -> None:
-    """Of the first some had been sent before anybody listened; the second is heard from its first message on."""
+    """The first publisher had sent some messages before the subscription; the second is received from its first on."""
     stamps = [n * PERIOD for n in range(6)]
     assert count(stamps, [7, 8, 10, 1, 2, 3]) == 1
     assert count(stamps, [7, 8, 10, 4, 5, 6]) == 1 + 3
@@ -40,7 +40,7 @@ def test_another_publisher_begins_anew() -> None:
 
 
 def test_several_publishers_have_no_common_numbers() -> None:
-    """Without a number in between nothing is known of the numbers around it."""
+    """After a message without a number, nothing is known about the numbers around it."""
     losses = Losses()
     for n, number in enumerate([1, 2, None, 40, 41]):
         losses.add(n * PERIOD, number)
@@ -49,7 +49,7 @@ def test_several_publishers_have_no_common_numbers() -> None:
 
 @pytest.mark.parametrize("missing", [{10}, {10, 11, 12}, {9, 15, 16, 40}, set(range(20, 35)), set(range(8, 60, 3))])
 def test_the_rhythm_of_the_stamps_tells_what_is_missing(missing: set[int]) -> None:
-    """With the jitter of a spinning LiDAR: a twentieth of a period."""
+    """The stamps jitter as those of a spinning LiDAR: by a twentieth of a period."""
     jitter = np.random.default_rng(0).integers(-PERIOD // 20, PERIOD // 20, 60)
     stamps = [n * PERIOD + int(jitter[n]) for n in range(60) if n not in missing]
     assert count(stamps) == len(missing - {59})
@@ -75,7 +75,7 @@ def test_nothing_is_said_before_the_rhythm_is_known() -> None:
 
 
 def test_what_is_rejected_is_not_lost() -> None:
-    """Its number is known; what is missing before it is lost all the same."""
+    """Its number is known; messages that are missing before it are still counted as lost."""
     losses = Losses()
     losses.add(0, 1)
     losses.skip(2)

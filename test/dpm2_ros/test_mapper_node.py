@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mapper apart builds the same map as the embedded one, from messages alone."""
+"""The separate mapper builds the same map as the embedded one, from messages only."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_keyframes_become_a_map_in_either_order_of_messages(mapper: Any, tmp_pat
 
 
 def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path) -> None:
-    """By default; all keyframes are in it before the node ends. A reset saves it, and a new map gets its own files."""
+    """By default, all keyframes are in the file before the node ends. A reset saves it; a new map gets new files."""
 
     def stored(name: str) -> int:
         with MapStore.open(tmp_path / "map" / name) as store:
@@ -84,7 +84,7 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
         mapper.wait(lambda expected=id + 1: keyframes(mapper) == expected, "the keyframe")
     mapper.wait(lambda: stored("drive.dpm2map") == 3, "all of them in the file")
     assert mapper.call(Trigger, "/mapper_node/reset").success
-    mapper.wait(lambda: keyframes(mapper) == 0, "the empty map")  # which comes after the save
+    mapper.wait(lambda: keyframes(mapper) == 0, "the empty map")  # this follows the save
     assert read_trajectory(tmp_path / "map" / "drive" / "trajectory.tum").keys.tolist() == [1000, 1001, 1002]
     mapper.send(0, np.eye(4), points(0))
     mapper.wait(lambda: keyframes(mapper) == 1 and stored("drive-2.dpm2map") == 1, "the keyframe in the new file")
@@ -93,7 +93,7 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
 
 
 def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """The file could not be made when the drive began: the node ended as if there had been none to make."""
+    """The file could not be made when the drive began, but the node ended as if no file had been requested."""
     (tmp_path / "full").write_text("no folder")
     harness = ros(f"ros.map_file:={tmp_path / 'full' / 'town.dpm2map'}")
     harness.mapper = harness.add(MapperNode())
@@ -108,7 +108,7 @@ def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
     mapper: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Once, by the one that publishes it, as by the export: a robot on the next floor went by the walls of both."""
+    """The node that publishes the grid reports it once, as the export does: the grid shows the walls of both floors."""
     grids, log = mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE), list[str]()
 
     def said() -> list[str]:
@@ -127,7 +127,7 @@ def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
 
 
 def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
-    """As a trajectory of its own, which nothing ties to the first; ids count on."""
+    """It starts a trajectory of its own, without an edge to the first one; the ids continue."""
     for id in (0, 1, 2, 0):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
     mapped(mapper, 4)
@@ -137,8 +137,8 @@ def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
 
 
 def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
-    """Once a keyframe of the robot is in the map: before, its drive may be any, and the mapper one that was started
-    again, which sent the identity until then."""
+    """It is sent only once a keyframe of the robot is in the map. Before, the drive may be any, and the mapper may have
+    been restarted: it sent the identity until then."""
     move, heard = placed(mapper)
     move(33)
     move(34, frame="no name")
@@ -154,14 +154,14 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
 
 
 def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) -> None:
-    """map -> odom would be that of the one and of the other in turn."""
+    """map -> odom would switch between the transforms of the two robots."""
     told, keyframe = mapper.diagnostics, Keyframe(0, 1000, 0, np.eye(4), points(0))
     wires = {robot: Wires(mapper, f"/{robot}") for robot in ("red", "blue")}
     for count, (robot, its) in enumerate(wires.items()):
         its.wait()
         its.send(keyframe, keyframe_name(robot, 0))
         mapper.wait(lambda before=count: keyframes(mapper) > before, "its keyframe")
-    for robot, its in wires.items():  # what was heard more than 5 s ago is over, and this machine may be busy
+    for robot, its in wires.items():  # drives end after 5 s of silence, and this machine may be busy
         its.pose.publish(edge_to_msg(np.eye(4), np.eye(6) * 1e-4, 1000, "odom", keyframe_name(robot, 0)))
 
     def said() -> bool:
@@ -171,7 +171,7 @@ def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) ->
 
 
 def hostile_parts(id: int) -> list[Any]:
-    """Messages under the name of a keyframe that a robot is about to send, each unsound in its way."""
+    """Messages with the name of a keyframe that a robot is about to send, each invalid for a different reason."""
     name, T = keyframe_name("", id, S), np.eye(4)
     poses = [edge_to_msg(T, np.eye(6) * variance, 5, "odom", name) for variance in (-1.0, 1e300)]
     for value in (np.nan, np.inf):
@@ -201,7 +201,7 @@ def hostile_parts(id: int) -> list[Any]:
 
 @pytest.mark.parametrize("mapper", [True], ids=["descriptors"], indirect=True)
 def test_nothing_under_the_name_of_a_keyframe_displaces_it(mapper: Any) -> None:
-    """Unsound messages are rejected one by one, and counted by their reason; the robot's own then make its map."""
+    """Invalid messages are rejected one by one, and counted by reason; the robot's own messages then make its map."""
     wires = dict(zip((Odometry, PointCloud2, UInt8MultiArray), mapper.wires.all, strict=True))
     bad = hostile_parts(1)
     for message in bad:
@@ -230,7 +230,7 @@ def test_no_name_ends_the_mapper(mapper: Any, name: str) -> None:
 
 @pytest.mark.parametrize("mapper", [True], ids=["descriptors"], indirect=True)
 def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
-    """The keyframe is used, and what is compared with others comes from the mapper's own network."""
+    """The keyframe is used; its descriptors are computed again with the mapper's own network."""
     name, cloud = keyframe_name("", 0, S), points(0)
     foreign = Descriptors.of(np.ones((256, 3), "f4"), np.ones((256, 128)))
     mapper.wires.send(Keyframe(0, 9, 0, np.eye(4), cloud, descriptors=foreign), name, "0123456789abcdef")
@@ -241,7 +241,7 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
 
 
 def test_topics_that_bring_nothing_are_forgotten(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand namespaces cannot make a thousand subscriptions; a robot that comes after them is heard."""
+    """A thousand namespaces cannot make a thousand subscriptions; a robot that appears after them is received."""
     monkeypatch.setattr(mapper_node, "PATIENCE", 1.0)
     topics = [f"/x{n}/dpm2/keyframe_odom" for n in range(80)]
     many = rclpy.create_node("many", use_global_arguments=False)

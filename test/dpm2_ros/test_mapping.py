@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map is made beside the odometry, and gives way to it."""
+"""Mapping runs in parallel to the odometry, and has lower priority."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_only_the_thread_of_the_map_gives_way() -> None:
 
 
 def test_the_path_of_a_long_drive_is_soon_made() -> None:
-    """It holds Python's lock, once a second: 2,000 keyframes, each pose and stamp in its place."""
+    """It holds Python's lock, once per second: 2,000 keyframes, with all poses and stamps in the right order."""
     poses, best = se3.exp(np.arange(2000)[:, None] * np.array([0.001, 0.0, 0.02, 0.5, 0.0, 0.01])), np.inf
     for _ in range(3):
         begin = time.thread_time()
@@ -66,13 +66,13 @@ def test_the_path_of_a_long_drive_is_soon_made() -> None:
 def test_a_loop_after_which_the_robot_stands_still_counts(
     mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, saved: bool
 ) -> None:
-    """What another process has solved of a large graph was taken in with the next keyframe alone: a robot that had come
-    home and stopped stayed where it was without that loop, and so did the map that ~/save_map wrote."""
-    monkeypatch.setattr("dpm2_core.slam.graph.pose_graph.SHORT", 1)  # else small graphs are solved at once
+    """A solution that another process had computed for a large graph was applied only with the next keyframe. If the
+    robot had come home and stopped, its pose and the map of ~/save_map stayed without that loop."""
+    monkeypatch.setattr("dpm2_core.slam.graph.pose_graph.SHORT", 1)  # otherwise small graphs are solved immediately
     move, transforms = placed(mapper)
     send_all(mapper, 0, 1, 2)
     mapped(mapper, 3)
-    graph = core(mapper).graph  # its thread has nothing to do now
+    graph = core(mapper).graph  # its thread is idle now
     graph.add_loop(Edge("loop", 0, 2, Registration(se3.exp([0, 0, 0, 10.02, 0, 0]), np.eye(6) * 1e-8)))
     graph.optimize()  # as with the last keyframe
     if saved:
@@ -82,7 +82,7 @@ def test_a_loop_after_which_the_robot_stands_still_counts(
         path = mapper.hear(PathMsg, "/dpm2/path", 10)
         mapper.wait(lambda: path and path[-1].poses[-1].pose.position.x > 10.01, "the path with that loop")
         poses = np.array([transform_matrix(one.pose) for one in path[-1].poses])
-    np.testing.assert_allclose(poses[:, 0, 3], [0, 5.01, 10.02], atol=1e-3)  # of 0.1 mm, as certain as the loop is
+    np.testing.assert_allclose(poses[:, 0, 3], [0, 5.01, 10.02], atol=1e-3)  # with a sigma of 0.1 mm, that of the loop
     move(1)
     mapper.wait(lambda: transforms, "a transform")
     assert transforms[-1].transforms[0].transform.translation.x == pytest.approx(0.02, abs=1e-3)
@@ -91,8 +91,8 @@ def test_a_loop_after_which_the_robot_stands_still_counts(
 def test_a_map_file_catches_up_while_the_robot_stands(
     mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """It was written to with the next keyframe alone: of a robot that charged, what a full disk had kept out of it was
-    lost with the power, hours after there was room. Another program that writes is, after 5 s, as a full disk."""
+    """The file was written only with the next keyframe. What a full disk had kept out of it was lost if a robot that
+    charged was then switched off, even hours after there was room. A lock for over 5 s acts as a full disk."""
     monkeypatch.setattr("dpm2_ros.mapping.RETRY", 0.2)
     send_all(mapper, 0)
     mapped(mapper, 1)
@@ -108,9 +108,9 @@ def test_a_map_file_catches_up_while_the_robot_stands(
 
 
 def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once 10,000 loops waited for it in DDS, each later keyframe with loops kept the map waiting for 0.1 s, and was an
-    internal error, after which neither path nor map nor grid was due for it."""
-    hung = rclpy.create_node("hung", use_global_arguments=False)  # nobody calls back
+    """Once 10,000 loops waited for it in DDS, each later keyframe with loops delayed the map by 0.1 s and was an
+    internal error, after which neither path nor map nor grid was published for it."""
+    hung = rclpy.create_node("hung", use_global_arguments=False)  # its callbacks are never called
     hung.create_subscription(DiagnosticArray, "/dpm2/loop_candidates", lambda message: None, KEEP_ALL)
     mapper.wait(lambda: mapper.mapper.count_subscribers("/dpm2/loop_candidates"), "the one that hangs")
     send_all(mapper, 0)
@@ -126,7 +126,7 @@ def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatc
 
 
 def test_keyframes_come_to_their_turn_while_a_large_map_is_built(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of 2,000 keyframes takes 6 s, for which the thread of the map took none in."""
+    """Building the map of 2,000 keyframes takes 6 s, during which the thread of the map added no keyframes."""
     end, begun = time.monotonic() + 30, threading.Event()
 
     def large(*given: Any) -> Iterator[None]:
@@ -144,7 +144,7 @@ def test_keyframes_come_to_their_turn_while_a_large_map_is_built(mapper: Any, mo
     send_all(mapper, 1)
     mapper.wait(lambda: shown, "the map")
     assert time.monotonic() < end
-    assert shown[0].width <= 500  # of the first keyframe, as it was when the work began
+    assert shown[0].width <= 500  # of the first keyframe, as at the start of the work
 
 
 def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
@@ -159,7 +159,7 @@ def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
         return PathMsg()
 
     display, begin = Display(publisher, lambda: 0.0, make), time.monotonic()
-    for change in (1, 2):  # in two parts, the second whatever has changed or not
+    for change in (1, 2):  # in two parts, the second whether or not anything has changed
         assert display.due(change)
         assert not display.due(change)
         display.publish()
@@ -170,8 +170,8 @@ def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
 
 
 def test_what_nobody_waits_for_any_more_is_not_built_on(mapper: Any) -> None:
-    """Else who came next got the map of when another one had left, and until then it was kept in memory. It is built
-    anew for who comes next, also where nothing has changed since."""
+    """Otherwise, the next subscriber received the map of the time when the last one had left, and until then it stayed
+    in memory. It is built anew for the next subscriber, even if nothing has changed since."""
     publisher, begun = mapper.publisher(PathMsg, "/shown"), []
 
     def make() -> Generator[None, None, PathMsg]:
@@ -250,7 +250,7 @@ class Failing(GuardedNode):
 
 
 def test_work_that_fails_by_a_bug_is_answered(ros: Callable[..., Any]) -> None:
-    """Who asked waited for ever; the node counts it, and says so in /diagnostics."""
+    """The client waited forever. The node counts the failure and reports it in /diagnostics."""
     harness = ros()
     node = harness.add(Failing())
     answer = harness.call(Trigger, "/failing/work")

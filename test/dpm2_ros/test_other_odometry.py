@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node beside an odometry that the robot has already, over real DDS: one tree, whatever that odometry does."""
+"""slam_node with another odometry on the robot, over real DDS: one tree, whatever that odometry does."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from ..helpers.diagnostics import figures, having, saying
 from .conftest import pose, scan
 
 T_BASE_LIDAR = se3.exp([0.0, 0.0, 0.2, 0.8, 0.0, 1.2])
-JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their ways are too long
-STEPS = 5  # samples of the wheels to a cloud
+JUMP, SLIP = 9, 0.02  # cloud before which the wheels jump by 0.5 m; fraction by which their distances are too long
+STEPS = 5  # samples of the wheels per cloud
 NONE = "ros.publish_tf_odom:=false"
 
 
 class Robot(Rig):
-    """Its wheels, its LiDAR 0.8 m ahead of the base and 1.2 m above, and slam_node."""
+    """Its wheels, its LiDAR 0.8 m ahead of the base and 1.2 m above it, and slam_node."""
 
     def __init__(self, ros: Callable[..., Any], drive: Any, source: str, *parameters: str) -> None:
         super().__init__(ros, drive, f"ros.odom_source:={source}", *parameters)
@@ -41,17 +41,17 @@ class Robot(Rig):
         self.topic = self.harness.publisher(Odometry, "/odom") if source == "topic" else None
         publish_static(self, "base_link", "lidar", T_BASE_LIDAR)
         self.wait((self.topic or self.tf).get_subscription_count, "the subscription to the wheels")
-        self.covariance = lambda n: 1e-4 * np.eye(6)  # that the topic states by cloud n
-        self._T, self.wheels = se3.exp([0.0, 0.0, 1.0, 5.0, 0.0, 0.0]), {}  # an origin of their own
+        self.covariance = lambda n: 1e-4 * np.eye(6)  # stated on the topic at cloud n
+        self._T, self.wheels = se3.exp([0.0, 0.0, 1.0, 5.0, 0.0, 0.0]), {}  # an origin of its own
 
     def base(self, t: float) -> Array:
-        """Truth, T_start_base at a cloud's number."""
+        """Ground truth T_start_base at the (fractional) number of a cloud."""
         begin, end = self.drive.pose(int(t)), self.drive.pose(int(t) + 1)
         T = begin @ se3.exp((t - int(t)) * se3.way(begin, end))
         return T_BASE_LIDAR @ T @ se3.inverse(T_BASE_LIDAR)
 
     def turn_wheels(self, n: int) -> None:
-        """From the cloud before to this one, and a sample beyond."""
+        """Publish the samples from the previous cloud to this one, and one more."""
         for step in range(1 if n else 0, STEPS + 1):
             t = n - 1 + step / STEPS if n else 0.0
             if n:
@@ -74,7 +74,7 @@ class Robot(Rig):
             self.send_and_wait(n)
 
     def links(self) -> dict[tuple[str, str], dict[int, Array]]:
-        """What is on /tf by parent and child, at each stamp."""
+        """The transforms on /tf by parent and child, at each stamp."""
         out: dict[tuple[str, str], dict[int, Array]] = {}
         for message in self.heard:
             for t in message.transforms:
@@ -86,14 +86,14 @@ class Robot(Rig):
 @pytest.fixture
 def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Robot]:
     monkeypatch.setattr("dpm2_ros.diagnostics.PERIOD", 0.1)
-    monkeypatch.setattr("dpm2_ros.other_odometry.WAIT", 2.0)  # a busy machine may take its time
+    monkeypatch.setattr("dpm2_ros.other_odometry.WAIT", 2.0)  # a busy machine may be slow
     return lambda *parameters: Robot(ros, drive, *parameters)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["tf", "topic"])
 def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any, source: str) -> None:
-    """At the stamp of every cloud map -> odom and the wheels' odom -> base make our pose, right to centimeters."""
+    """At the stamp of every cloud, map -> odom and the wheels' odom -> base make our pose, accurate to centimeters."""
     r = robot(source)
     r.go(*range(drive.frames))
     r.wait(lambda: len(r.links().get(("map", "odom"), {})) == drive.frames, "map -> odom of every cloud")
@@ -105,7 +105,7 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
         T_map_base = links["map", "odom"][stamp] @ r.wheels[stamp]
         np.testing.assert_allclose(T_map_base, transform_matrix(message.pose.pose), atol=1e-6)
         assert np.linalg.norm((T_map_base - r.base(n))[:3, 3]) < ACCURATE
-    said = r.status("other odometry", saying("outweighed"), since=0)  # for a while after the jump
+    said = r.status("other odometry", saying("outweighed"), since=0)  # reported for a while after the jump
     assert said.level == DiagnosticStatus.WARN
     assert float(said.message.split()[1]) == pytest.approx(0.5, abs=0.05)
     values = figures(r.status("other odometry", having(**{"clouds with it": drive.frames, "without": 0})))
@@ -115,7 +115,7 @@ def test_slip_and_a_jump_of_half_a_meter(robot: Callable[..., Robot], drive: Any
 
 @pytest.mark.slow
 def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) -> None:
-    """The drive goes on without it, /diagnostics says so, and map -> odom is sent where it is known alone."""
+    """The drive continues without it, /diagnostics reports it, and map -> odom is sent only if it is known."""
     r = robot("tf")
     r.go(0, 1, 2, wheels=False)
     missing = "no transform from 'base_link' to 'odom'"
@@ -139,18 +139,18 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
 def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
     robot: Callable[..., Robot], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where its samples come right after the clouds, none was ever used that had not been there for the first ones: no
-    cloud waited any more, and without that wait nothing was known at its stamp."""
+    """If its samples always arrived right after the clouds, and none had been there for the first clouds, none was ever
+    used: clouds no longer waited, and without that wait nothing was known at their stamps."""
     monkeypatch.setattr("dpm2_ros.other_odometry.PATIENCE", 1)
     r = robot("topic")
     r.go(0, wheels=False)
     r.turn_wheels(0)
-    r.go(1, wheels=False)  # from now on none waits, unless one would have had it so
+    r.go(1, wheels=False)  # from now on clouds wait only if that would have helped
     r.turn_wheels(1)
     for n in (2, 3):
-        time.sleep(0.3)  # for the wheels, which come by another topic than the cloud
+        time.sleep(0.3)  # for the wheels, which are on another topic than the cloud
         r.send(n)
-        time.sleep(0.3)  # on a busy machine the cloud may come later yet, and need not wait
+        time.sleep(0.3)  # on a busy machine the cloud may arrive even later, and need not wait
         r.turn_wheels(n)
         r.wait(lambda n=n: len(r.odom) > n, "the odometry of the cloud")
     r.status("other odometry", having(**{"clouds with it": 2, "without": 2}))
@@ -158,10 +158,10 @@ def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
 
 
 def test_map_to_odom_waits_for_what_it_tells_of_the_end_of_a_sweep(robot: Callable[..., Robot], drive: Any) -> None:
-    """Of clouds that are stamped at their end, and an odometry at 10 Hz that had told of their middle alone when the
-    pose was there, map -> odom was never sent, and an odometry in use was said to be left out."""
+    """For clouds that are stamped at their end, an odometry at 10 Hz had reached only their middle when the pose was
+    ready. map -> odom was then never sent, and an odometry in use was reported as left out."""
     r = robot("topic")
-    points = scan(pose(0))  # it stands
+    points = scan(pose(0))  # the robot stands still
     columns = {name: points[:, i] for i, name in enumerate(("x", "y", "z"))}
     columns["time"] = np.linspace(-0.1, 0, len(points)).astype(np.float32)
 
@@ -176,11 +176,11 @@ def test_map_to_odom_waits_for_what_it_tells_of_the_end_of_a_sweep(robot: Callab
     said = r.status("other odometry", having(**{"clouds with it": 4, "without": 0}))
     assert "going on without" not in said.message
     r.wait(lambda: len(r.links().get(("map", "odom"), {})) == 3, "map -> odom")
-    assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in range(3)]  # of the last one with the next
+    assert sorted(r.links()["map", "odom"]) == [drive.stamp(n) for n in range(3)]  # the last follows later
 
 
 def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
-    """Another frame, numbers that are none: counted, and the drive goes on."""
+    """Another frame, or values that are not finite: they are counted, and the drive continues."""
     r = robot("topic")
     r.go(0, 1)
     good, nan = np.eye(4), np.full((6, 6), np.nan)
@@ -191,7 +191,7 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
     r.topic.publish(far)
     r.wait(lambda: sum(r.node.rejections.values()) == 3, "three rejections")
     stated = edge_to_msg(r.wheels[drive.stamp(1)], nan, drive.stamp(1) + 1, "odom", "base_link")
-    r.topic.publish(stated)  # a sound pose; its covariance is left out
+    r.topic.publish(stated)  # a valid pose; only its covariance is ignored
     r.go(2, 3)
     assert sum(r.node.rejections.values()) == 3
     assert r.off(r.base) < ACCURATE
@@ -201,7 +201,7 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
 def test_a_topic_without_odometry_of_use_is_named(
     robot: Callable[..., Robot], drive: Any, frame: str, child: str
 ) -> None:
-    """Not a transform that is missing: TF has no part in it."""
+    """No missing transform is reported: TF is not involved."""
     r = robot("topic")
     r.topic.publish(edge_to_msg(np.eye(4), np.eye(6), drive.stamp(0), frame, child))
     r.wait(lambda: list(r.node.rejections.values()) == [1], "the rejection")
@@ -210,7 +210,7 @@ def test_a_topic_without_odometry_of_use_is_named(
 
 
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
-    """By 1000 m2 a cloud: "outweighed: 0.00 m, 0.0 deg from the motion of the scans" was said of what is right."""
+    """With 1000 m2 per cloud, "outweighed: 0.00 m, 0.0 deg from the motion of the scans" was reported of a correct one."""
     r = robot("topic")
     r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
     r.go(*range(5))
@@ -220,8 +220,8 @@ def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot
 
 
 def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], drive: Any) -> None:
-    """Where the scan is registered. At the stamp, here that of the first point, a robot that speeds up had ways that
-    are too short; here the wheels begin between the two."""
+    """The scan is registered at that time. At the stamp, here that of the first point, the distances of an accelerating
+    robot were too short; here the wheels begin between the two times."""
     r = robot("tf")
     for stamp in (drive.stamp(0) + 40_000_000, drive.stamp(0) + 60_000_000):
         r.tf.publish(TFMessage(transforms=[transform_to_msg(np.eye(4), stamp, "odom", "base_link")]))
@@ -249,7 +249,7 @@ def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], dr
     ids=["own, inverted", "another's, inverted", "mapper apart", "leaf, no odom", "apart, no odom", "apart, no map"],
 )
 def test_every_frame_has_one_parent(robot: Callable[..., Robot], parameters: tuple[str], expected: set) -> None:
-    """`publish_tf_odom` is for odom -> base alone: beside another odometry it cut the tree between map and odom."""
+    """`publish_tf_odom` is for odom -> base only: with another odometry it separated the tree between map and odom."""
     r = robot(*parameters)
     r.go(0, 1, 2, wheels=parameters[0] == "tf")
     r.wait(lambda: set(r.links()) == expected and min(map(len, r.links().values())) >= 2, f"{expected}")

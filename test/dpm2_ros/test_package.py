@@ -28,7 +28,7 @@ EXECUTABLES = ("slam_node", "mapper_node", "bag_player")
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """What `pip install .` installs, built from a copy: building leaves files behind."""
+    """The wheel that `pip install .` installs, built from a copy, since building leaves files behind."""
     out = tmp_path_factory.mktemp("wheel")
     copy = out / "source"
     files = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
@@ -63,7 +63,7 @@ def test_the_wheel_has_what_ros2_looks_for(wheel: zipfile.ZipFile) -> None:
 
 def test_ros2_run_starts_the_console_script_of_its_own_environment(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     stub = next(name for name in wheel.namelist() if name.endswith("lib/dpm2_ros/slam_node"))
-    assert wheel.getinfo(stub).external_attr >> 16 & 0o111 == 0o111  # pip keeps executable what is
+    assert wheel.getinfo(stub).external_attr >> 16 & 0o111 == 0o111  # pip keeps executable files executable
     for folder in ("lib/dpm2_ros", "bin"):
         (tmp_path / folder).mkdir(parents=True)
     path, script = tmp_path / "lib" / "dpm2_ros" / "slam_node", tmp_path / "bin" / "slam_node"
@@ -101,7 +101,7 @@ def test_console_scripts_lead_to_functions(wheel: zipfile.ZipFile) -> None:
 
 
 def test_ros_wheels_are_required_unless_ros_is_there(tmp_path: Path) -> None:
-    """With ROS sourced the wheels would shadow it; without, they are ROS."""
+    """With ROS sourced, the wheels would shadow it; without, the wheels provide ROS."""
     for distribution, requested in (("", True), ("jazzy", False)):
         environment = os.environ | {"ROS_DISTRO": distribution}
         command = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(tmp_path)]
@@ -125,7 +125,7 @@ def test_package_xml_agrees_with_setup_py(wheel: zipfile.ZipFile) -> None:
     assert f"\nVersion: {root.findtext('version')}\n" in metadata
     assert root.findtext("name") == "dpm2_ros"
     assert root.findtext("export/build_type") == "ament_python"
-    # colcon takes a package with an invalid address for plain Python, silently
+    # colcon silently treats a package with an invalid address as plain Python
     assert re.fullmatch(r"[\w.+-]+@[\w-]+(\.[\w-]+)*\.[a-zA-Z]{2,}", root.find("maintainer").get("email"))
 
 
@@ -159,7 +159,7 @@ def test_the_rviz_layout_shows_topics_that_exist() -> None:
 
 
 def test_tf2_msgs_built_here_talks_to_those_of_ros(domain: int) -> None:
-    """The type hash is what DDS compares; this is the one that ROS 2 Jazzy's own package announces."""
+    """DDS compares the type hash; this is the one that ROS 2 Jazzy's own package announces."""
     import rclpy
     from tf2_msgs.msg import TFMessage
 

@@ -36,7 +36,7 @@ def load(domain: int) -> Iterator[Load]:
         arguments = ["--ros-args", *(part for pair in parameters for part in ("-p", pair))] if parameters else []
         if params_file is not None:
             arguments = ["--ros-args", "--params-file", str(params_file)]
-        end_ros(*nodes)  # of the call before
+        end_ros(*nodes)  # of the previous call
         nodes.clear()
         ros_context(arguments, domain)
         nodes.append(rclpy.create_node("parameters", automatically_declare_parameters_from_overrides=True))
@@ -62,7 +62,7 @@ def test_every_setting_is_declared_described_and_read_only(load: Load) -> None:
 
 
 def test_some_change_while_a_node_runs(load: Load) -> None:
-    """One at a time or together, all or none; what is not allowed is refused with the reason, as at the start."""
+    """One at a time or together, all or none; invalid values are rejected with the reason, as at the start."""
     config, node = load("ros.map_period:=3.0")
     seen: list[NodeConfig] = []
     follow_changes(node, config, seen.append)
@@ -103,7 +103,7 @@ def test_types_and_ranges(load: Load) -> None:
 def test_values_of_every_kind(load: Load) -> None:
     config, node = load(
         "ros.queue_depth:=3",
-        "ros.sync_timeout:=1",  # ROS takes it for an integer
+        "ros.sync_timeout:=1",  # ROS reads it as an integer
         "slam.map.voxel:=0.3",
         "ros.reliability:=best_effort",
         "ros.publish_tf_odom:=false",
@@ -127,7 +127,7 @@ def test_parameters_override_the_file(load: Load, tmp_path: Path) -> None:
 
 
 def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None:
-    """As a parameter file or a launch file gives them."""
+    """Parameter files and launch files pass empty texts."""
     empty = [name for name, info in flat_fields(NodeConfig) if info.get_default(call_default_factory=True) == ""]
     config, node = load("config_file:=''", *(f"{name}:=''" for name in empty))
     assert config == NodeConfig()
@@ -135,7 +135,7 @@ def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None
 
 
 def test_what_was_dumped_can_be_loaded(load: Load, tmp_path: Path) -> None:
-    """`ros2 param dump` writes null for what is not set, which the parser of ROS reads as a text."""
+    """`ros2 param dump` writes null for a setting without a value, which the parser of ROS reads as a string."""
     node = load()[1]
     file = tmp_path / "dump.yaml"
     dumped: dict[str, Any] = {}
@@ -151,7 +151,7 @@ def test_what_was_dumped_can_be_loaded(load: Load, tmp_path: Path) -> None:
 
 
 def test_a_home_folder_is_meant_by_its_sign(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No shell looks at parameters."""
+    """No shell expands `~` in parameters."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "settings.yaml").write_text("ros: {queue_depth: 5}\n")
     ros = load("config_file:='~/settings.yaml'", "ros.map_directory:='~/maps'", "ros.map_file:='~/town.dpm2map'")[0].ros
@@ -187,7 +187,7 @@ def test_mistakes_are_named(load: Load, parameter: str, message: str) -> None:
 
 
 def test_a_process_ends_with_2_and_one_line(run: Callable[..., subprocess.CompletedProcess[str]]) -> None:
-    """Here of an empty list, to which ROS gives no type; what it says of others is above."""
+    """Here for an empty list, to which ROS gives no type; messages for other mistakes are tested above."""
     done = run("slam_node", "--ros-args", "-p", "input.T_lidar_cam:=[]")
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2
@@ -208,7 +208,7 @@ def test_the_page_of_parameters_is_up_to_date() -> None:
 
 
 def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(load: Load, tmp_path: Path) -> None:
-    """Also above a file of settings: neither its defaults nor those of the node count as given."""
+    """It also applies with a settings file: defaults of the file or the node do not count as given."""
     file = tmp_path / "config.yaml"
     file.write_text("slam: {keyframes: {distance: 7.0}}")
     config, node = load("slam.preset:=paper", f"config_file:={file}", "slam.neural.refined:=4")

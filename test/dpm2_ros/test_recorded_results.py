@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of sensors and of what dpm2 made of them, played to nodes of dpm2 and to others."""
+"""Recordings of sensors together with results of dpm2, played to nodes of dpm2 and to other nodes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EYE = np.eye(4)
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Five clouds, and beside each a pose, a path, and /tf."""
+    """Five clouds, each with a pose, a path, and /tf."""
     kinds = {topic: f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}" for topic, kind in KINDS.items()}
     out = list[tuple[int, str, bytes]]()
     for at in range(1_000_000_000, 1_050_000_000, 10_000_000):
@@ -46,7 +46,7 @@ def recording(tmp_path: Path) -> Path:
 def test_what_a_node_publishes_now_is_not_played_beside_it(
     ros: Callable[..., Any], recording: Path, capfd: pytest.CaptureFixture[str], runs: bool, asked: bool
 ) -> None:
-    """Poses of the recording and of the node came in turns, 16 m apart; a mapper took both for two robots."""
+    """Otherwise, poses of the recording and of the node alternated, 16 m apart; a mapper took them for two robots."""
     harness = ros()
     heard = {topic: harness.hear(kind, topic) for topic, kind in KINDS.items()}
     if runs:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""examples/relocalise_action.py beside a real node: it ends when the place is known, and says so where it is not."""
+"""examples/relocalise_action.py with a real node: it ends once the robot is localized, and reports if it is not."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytest.importorskip("py_trees", reason="no py_trees: pip install '.[test]'")
 
 
 def action(harness: Any, timeout: float) -> subprocess.Popen[str]:
-    """The example, in the domain of a harness."""
+    """Start the example in the domain of a harness."""
     environment = {**os.environ, "ROS_DOMAIN_ID": str(harness.node.context.get_domain_id())}
     command = [sys.executable, str(EXAMPLE), str(timeout)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
@@ -38,7 +38,7 @@ def action(harness: Any, timeout: float) -> subprocess.Popen[str]:
 @pytest.mark.weights
 def test_a_robot_that_is_lost_finds_itself(ros: Callable[..., Any], recording: Path, tmp_path: Path) -> None:
     drive = first_scans(recording, 10, tmp_path / "drive")
-    quick = ("--set", "slam.registration=geometric")  # from scan to scan: the place is found by the network
+    quick = ("--set", "slam.registration=geometric")  # for the odometry only: the network recognizes the place
     made = dpm2("run", drive, "--out", tmp_path / "out", "--map", tmp_path / "street.dpm2map", *quick)
     assert made.returncode == 0, made.stderr
     finding = ("ros.localization_mode:=true", "slam.loops.descriptors:=true", "input.images:=false")
@@ -49,7 +49,7 @@ def test_a_robot_that_is_lost_finds_itself(ros: Callable[..., Any], recording: P
     process = action(harness, 150.0)
     (scan,) = open_source(drive, InputSettings(images=False)).frames(4, 5)
     stamp = 100 * 10**9
-    while process.poll() is None:  # the robot stands
+    while process.poll() is None:  # the robot stands still
         stamp += 10**8
         lidar.publish(cloud_to_msg(scan.points, stamp, "lidar"))
         time.sleep(0.2)

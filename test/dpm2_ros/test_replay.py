@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A replay loses nothing, and what is lost all the same is counted."""
+"""A replay loses nothing, and any loss is counted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PROFILE, SEGMENT = "FASTRTPS_DEFAULT_PROFILES_FILE", 32 * 2**20
 
 
 def all_gone(sent: int) -> Callable[[DiagnosticStatus], bool]:
-    """Whether each of so many clouds has been processed, dropped, rejected or lost."""
+    """Whether each of `sent` clouds has been processed, dropped, rejected or lost."""
     ends = ("processed", "dropped", "rejected", "lost on the way")
     return lambda status: sum(int(n) for what, n in figures(status).items() if what.startswith(ends)) == sent
 
@@ -35,12 +35,12 @@ def all_gone(sent: int) -> Callable[[DiagnosticStatus], bool]:
 def test_started_at_the_same_moment_nothing_is_lost(
     ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """The node subscribes when it is ready; no cloud waits for an import. Then too fast: what is dropped is counted."""
+    """The node subscribes only once it is ready: no cloud waits for an import. At high speed, drops are counted."""
     harness = ros()
     diagnostics = harness.diagnostics
     arguments = ["--ros-args", "-p", "ros.map_directory:=''"]
     node = harness.start("slam_node", arguments, tmp_path / "node", PYTHONPROFILEIMPORTTIME="1")  # imports in the log
-    # In time also on a busy machine, where 0.1 s may be too little for a cloud.
+    # Slow enough for a busy machine, on which 0.1 s may be too short for a cloud.
     player = harness.start("bag_player", [str(bag), "--wait", "90", "--rate", "0.3"], tmp_path / "player")
     assert player.wait(180) == 0
     assert f"{drive.frames} of them clouds" in (tmp_path / "player").read_text()
@@ -49,7 +49,7 @@ def test_started_at_the_same_moment_nothing_is_lost(
     assert figures(gone)["processed"] == str(drive.frames)
     assert "import time:" in ready
     assert "import time:" not in driving
-    # Too fast, whichever process is held up meanwhile: the node stands still until all of them are there.
+    # Too fast, regardless of delays in any process: the node is stopped until all clouds have been published.
     lidar = harness.publisher(PointCloud2, naming.POINTS)
     harness.wait(lidar.get_subscription_count, "the subscription to the clouds")
     harness.find("slam_node")
@@ -68,7 +68,7 @@ def test_started_at_the_same_moment_nothing_is_lost(
 
 
 def test_losses_are_in_diagnostics(rig: Callable[..., Rig], drive: Any) -> None:
-    """Real ones: while the executor is held up, DDS keeps as many clouds as the queue may hold, and no more."""
+    """The losses are real: while the executor is blocked, DDS keeps no more clouds than the queue depth."""
     r = rig("ros.queue_depth:=2")
     r.send_and_wait(0)
     holding, going_on = threading.Event(), threading.Event()
@@ -90,7 +90,7 @@ def test_losses_are_in_diagnostics(rig: Callable[..., Rig], drive: Any) -> None:
 
 
 def segments(process: subprocess.Popen[bytes]) -> list[int]:
-    """Bytes of the shared memory that Fast DDS has in a process."""
+    """Sizes in bytes of the shared memory segments that Fast DDS has in a process."""
     maps = Path(f"/proc/{process.pid}/maps").read_text().splitlines()
     spans = [line.split()[0].split("-") for line in maps if "/dev/shm/fastrtps_" in line and "port" not in line]
     return [int(end, 16) - int(begin, 16) for begin, end in spans]
@@ -99,7 +99,7 @@ def segments(process: subprocess.Popen[bytes]) -> list[int]:
 def test_the_dds_profile_is_used_unless_the_user_has_one(
     processes: list[Any], bag: Path, domains: Iterator[int], tmp_path: Path
 ) -> None:
-    """The user's may be named by either variable, or Fast DDS be configured by another."""
+    """The user's profile may be named by either variable, or another variable may configure Fast DDS."""
     shipped = Path(__file__).parents[2] / "config" / "fastdds.xml"
     own = tmp_path / "own.xml"
     own.write_text(shipped.read_text().replace(str(SEGMENT), str(SEGMENT // 2)))
@@ -112,7 +112,7 @@ def test_the_dds_profile_is_used_unless_the_user_has_one(
         "transports": {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
     }
     for name, more in environments.items():
-        alone = {"ROS_DOMAIN_ID": str(next(domains))}  # each sees the memory of those in its domain
+        alone = {"ROS_DOMAIN_ID": str(next(domains))}  # each process sees the memory of those in its domain
         given = [str(bag), "--wait", "120"]
         processes.append(start("bag_player", given, inherited | alone | more, tmp_path / name))
     for name, process in zip(environments, processes, strict=True):
@@ -123,7 +123,7 @@ def test_the_dds_profile_is_used_unless_the_user_has_one(
         found[name] = segments(process)
         process.send_signal(signal.SIGINT)
     assert max(found["none"]) >= SEGMENT, found
-    for name in ("own", "newer name"):  # there may be others, of whoever else is in that domain
+    for name in ("own", "newer name"):  # there may be segments of other processes in that domain
         assert any(SEGMENT // 2 <= size < SEGMENT for size in found[name]), found
     assert max(found["transports"], default=0) < SEGMENT // 2, found
 

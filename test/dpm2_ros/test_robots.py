@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two real slam_node processes and a mapper_node over real DDS: one map, whoever starts late, dies or is cut off."""
+"""Two slam_node processes and a mapper_node over real DDS make one map, even if one starts late, dies or is cut off."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from dpm2_ros.keyframe_messages import descriptors_from_msg, descriptors_to_msg,
 from dpm2_ros.tf_message import TFMessage
 
 GEOMETRIC = ("-p", "slam.registration:=geometric", "-p", "slam.loops.descriptors:=false")
-"""Without the network, where it does not matter what a keyframe is made of: a node starts in half the time."""
+"""Without the network, for tests to which the content of keyframes does not matter: nodes start in half the time."""
 
 
 class Fleet:
-    """Processes of robots and of their mapper; scans for each."""
+    """Processes of robots and of their mapper; scans for each robot."""
 
     def __init__(self, harness: Any, recording: Path, folder: Path, parameters: Sequence[str] = ()) -> None:
-        """`parameters`: of all nodes."""
+        """`parameters`: for all nodes."""
         self.harness, self.folder, self._parameters = harness, folder, parameters
         self.source = open_source(recording, InputSettings(images=False))
         self.tf = harness.hear(TFMessage, "/tf")
@@ -51,19 +51,19 @@ class Fleet:
         return self.harness.start(name, ["--ros-args", *arguments, *self._parameters], self.folder / log)
 
     def mapper(self, file: str = "map.dpm2map") -> subprocess.Popen[bytes]:
-        """A mapper_node for all robots."""
+        """Start a mapper_node for all robots."""
         parameters = ("-p", "ros.map_directory:=''", "-p", f"ros.map_file:={self.folder / file}")
         return self._start("mapper_node", "mapper.log", *parameters)
 
     def robot(self, name: str) -> subprocess.Popen[bytes]:
-        """A slam_node in a namespace."""
+        """Start a slam_node in a namespace."""
         pairs = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
                  f"ros.odom_frame:={name}/odom", "slam.keyframes.distance:=2.0",
                  f"ros.map_directory:={self.folder / 'robots'}"]  # fmt: skip
         if name not in self._lidars:
             self._lidars[name] = self.harness.publisher(PointCloud2, f"/{name}/points")
             self._odom[name] = self.harness.hear(Odometry, f"/{name}/dpm2/odom")
-        before = self._listeners(name)  # of one that was killed DDS knows for a while
+        before = self._listeners(name)  # DDS still lists a killed one for a while
         process = self._start(
             "slam_node", f"{name}.log", "-r", f"__ns:=/{name}", *(x for p in pairs for x in ("-p", p))
         )
@@ -74,12 +74,12 @@ class Fleet:
         return process
 
     def _listeners(self, name: str) -> set[bytes]:
-        """Who subscribes to the scans of a robot."""
+        """The subscribers to the scans of a robot."""
         infos = self.harness.node.get_subscriptions_info_by_topic(f"/{name}/points")
         return {bytes(info.endpoint_gid) for info in infos}
 
     def drive(self, name: str, *frames: int) -> None:
-        """Scans, each when the one before has come out."""
+        """Publish scans, each after the odometry of the one before."""
         for n in frames:
             frame = next(iter(self.source.frames(n, n + 1)))
             self._stamp += 100_000_000
@@ -88,26 +88,26 @@ class Fleet:
             self.harness.wait(lambda before=before: len(self._odom[name]) > before, f"{name}: scan {n}")
 
     def map(self, file: str = "map.dpm2map") -> MapData:
-        """As it is in the file now."""
+        """The map in the file, as it is now."""
         with MapStore.open(self.folder / file) as store:
             return load_map(store, descriptors=False)
 
     def ids(self, name: str, file: str = "map.dpm2map") -> list[int]:
-        """Of a robot's keyframes that are in the map."""
+        """The ids of a robot's keyframes in the map."""
         try:
             return [keyframe.id for keyframe in self.map(file).keyframes if keyframe.robot == name]
-        except Dpm2Error:  # the file is being made
+        except Dpm2Error:  # the file is being created
             return []
 
     def received(self, name: str, count: int, file: str = "map.dpm2map") -> None:
-        """Wait until the first keyframes of a robot are in the map, and no others."""
+        """Wait until exactly the first `count` keyframes of a robot are in the map."""
         with suppress(AssertionError):
-            # On a busy machine the network that describes them, in a thread that gives way, takes its time.
+            # On a busy machine the network, in a thread of low priority, takes long to describe them.
             self.harness.wait(lambda: self.ids(name, file) == list(range(count)), f"{name}'s keyframes", timeout=240)
         assert self.ids(name, file) == list(range(count)), (self.folder / "mapper.log").read_text()[-2000:]
 
     def T_map_lidar(self, name: str) -> Array | None:
-        """By the last transforms; None before map -> odom is known."""
+        """Pose of the LiDAR by the last transforms; None before map -> odom is known."""
         last = {t.child_frame_id: transform_matrix(t.transform) for m in list(self.tf) for t in m.transforms}
         if f"{name}/odom" not in last:
             return None
@@ -124,13 +124,13 @@ def fleet(request: pytest.FixtureRequest, ros: Callable[..., Any], recording: Pa
 @pytest.mark.timeout(900)  # two of those waits, and others
 @pytest.mark.parametrize("fleet", [GEOMETRIC[:2]], ids=["descriptors"], indirect=True)
 def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
-    """The second joins late, in the middle of what the first has seen, and learns where it is in the map."""
+    """The second robot joins late, in the middle of the area that the first has mapped, and is localized in the map."""
     fleet.mapper()
     fleet.robot("red")
     fleet.drive("red", *range(19))
     wait = fleet.harness.wait
     fleet.received("red", 7)
-    for scan in range(19, 24):  # keyframes are sent again, odometry is not: the mapper may begin to listen late
+    for scan in range(19, 24):  # keyframes are sent again, odometry is not: the mapper may subscribe late
         fleet.drive("red", scan)
         with suppress(AssertionError):
             wait(lambda: fleet.T_map_lidar("red") is not None, "map -> red/odom", timeout=5)
@@ -160,7 +160,7 @@ def test_two_robots_one_map_each_with_its_own_correction(fleet: Fleet) -> None:
 
 
 def test_an_outage_costs_nothing(fleet: Fleet) -> None:
-    """The mapper stands still while the robot drives, dies, and another one takes its place: all are sent again."""
+    """The mapper is stopped while the robot drives, is killed, and is replaced: all keyframes are sent again."""
     first = fleet.mapper("first.dpm2map")
     fleet.robot("red")
     fleet.drive("red", *range(6))
@@ -180,9 +180,9 @@ def test_an_outage_costs_nothing(fleet: Fleet) -> None:
 
 @pytest.mark.long
 def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
-    """While the mapper stood still: no keyframe is lost, its next start sends them first, then those of the drive that
-    goes on. While the mapper listens: what has arrived is deleted from its disk. Each start is a session of its own in
-    the same map: ids count on, no odometry leads from one to the other."""
+    """While the mapper is stopped, no keyframe is lost: after a restart the robot sends the old ones first, then those
+    of the new drive. While the mapper runs, delivered keyframes are deleted from the robot's disk. Each start is a
+    session of its own in the same map: ids continue, and no odometry edge connects the sessions."""
     mapper = fleet.mapper()
     red = fleet.robot("red")
     fleet.drive("red", *range(5))
@@ -215,14 +215,14 @@ def test_a_robot_that_is_killed_and_comes_back(fleet: Fleet) -> None:
 
 @pytest.mark.weights
 def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
-    """Descriptors come out as they went in; a cloud too large is downsampled until it fits, a small one is not
-    touched."""
+    """Descriptors are received as they were sent; a cloud that is too large is downsampled until it fits, a small
+    one is not changed."""
     from dpm2_core.network.pretrained import load_network
     from dpm2_core.slam.store.cloud_codec import unpack_cloud
 
     points = next(iter(open_source(recording, InputSettings(images=False)).frames(0, 1))).points
     descriptors = load_network("small", 1).describe(Frame(0, points))
-    tilted = replace(descriptors, up=np.array([0.6, 0, 0.8], np.float32))  # no base says what level is: not sent
+    tilted = replace(descriptors, up=np.array([0.6, 0, 0.8], np.float32))  # no base defines the level: not sent
     assert descriptors_from_msg(descriptors_to_msg(tilted, 5, "red/kf_1.00000000")) == (None, "")
     room = replace(descriptors, scale=5.0)
     assert descriptors_from_msg(descriptors_to_msg(room, 5, "red/kf_1.00000000")) == (None, "")
@@ -230,7 +230,7 @@ def test_a_keyframe_is_at_most_100_kB_on_the_wire(recording: Path) -> None:
         keyframe = Keyframe(1, 2, 3, np.eye(4), cloud, None, "", descriptors)
         seen, packed = payload_to_msgs(keyframe, "red/kf_1.00000000", "0123456789abcdef")
         size = len(serialize_message(seen)) + len(serialize_message(packed))
-        assert size < 99_500  # the pose is another 0.7 kB
+        assert size < 99_500  # the pose adds 0.7 kB
         again, weights = descriptors_from_msg(seen)
         assert again is not None
         assert weights == "0123456789abcdef"

@@ -20,7 +20,7 @@ Graph = dict[str, set[str]]
 
 
 def allowed(node: str) -> Graph:
-    """What the policy lets a node do, by kind, with names as the graph has them."""
+    """What the policy allows a node to do, by kind, with names as in the graph."""
     (profile,) = ET.parse(POLICY).getroot().findall(f"enclaves/enclave[@path='/dpm2/{node}']/profiles/profile")
     assert (profile.get("node"), profile.get("ns")) == (node, "/")
     out: Graph = {kind: set() for kind in KINDS.values()}
@@ -34,7 +34,7 @@ def allowed(node: str) -> Graph:
 
 
 def done(harness: Any, node: str, missing: Callable[[Graph], bool]) -> Graph:
-    """What a node does, by kind, as another one sees it, once nothing is missing."""
+    """What another node sees a node do, by kind, once nothing is missing."""
 
     def look() -> Graph:
         if node not in harness.node.get_node_names():
@@ -43,7 +43,7 @@ def done(harness: Any, node: str, missing: Callable[[Graph], bool]) -> Graph:
         return {kind: {name for name, _ in find(node, "/")} for kind, find in looks.items()}
 
     harness.wait(lambda: not missing(look()), f"all that {node} does")
-    time.sleep(0.5)  # for what it does besides
+    time.sleep(0.5)  # for anything beyond that
     return look()
 
 
@@ -71,7 +71,7 @@ APART = {
 def test_nodes_do_what_the_policy_allows(
     ros: Callable[..., Any], make: Any, managed: bool, parameters: tuple[str, ...], without: Graph
 ) -> None:
-    """All of it and nothing else, but for what one way of running them does without."""
+    """All of it and nothing else, except for what that way of running the node leaves out."""
     harness = ros("slam.loops.descriptors:=false", "slam.registration:=geometric", *parameters)
     made = make(managed)
     if managed:
@@ -83,7 +83,7 @@ def test_nodes_do_what_the_policy_allows(
 
 
 def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
-    """With a bag that `dpm2 convert` makes of KITTI."""
+    """The bag is one that `dpm2 convert` makes of KITTI."""
     harness = ros()
     harness.start("bag_player", [str(bag), "--wait", "180", "--lockstep"], tmp_path / "log")
     expected = allowed("bag_player")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a killed process leaves of shared memory is freed by the next one; that of living ones stays."""
+"""The next process frees the shared memory of a killed process; that of running processes is kept."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _up(domain: int) -> subprocess.Popen[str]:
 
 
 def _segments(process: subprocess.Popen[str]) -> list[Path]:
-    """Those whose lock files a process holds: of our profile's transport, and a small one of rmw's."""
+    """Segments whose lock files a process has locked: of our profile's transport, and a small one of rmw's."""
     rows = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
     held = {int(row[5].rpartition(":")[2]) for row in rows if row[1] == "FLOCK" and row[4] == str(process.pid)}
     locks = [path for path in Path("/dev/shm").glob("fastrtps_*_el") if "port" not in path.name]
@@ -65,7 +65,7 @@ def test_the_next_process_frees_what_a_killed_one_has_left(domain: int) -> None:
         processes.append(_up(domain))
         assert not any(segment.exists() for segment in killed)
         assert not any(segment.with_name(f"{segment.name}_el").exists() for segment in killed)
-        # The living one holds its locks; what has just begun might not have taken its own yet.
+        # The running process has its locks; a process that has just started may not have taken its locks yet.
         assert all(segment.is_file() for segment in (*living, *fresh))
     finally:
         for process in processes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slam_node over real DDS: a test publishes clouds and images and subscribes to what comes out."""
+"""slam_node over real DDS: a test publishes clouds and images and subscribes to the results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reli
 
 @pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
 def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliable: bool) -> None:
-    """Also from a best-effort publisher, which a reliable subscription would never hear."""
+    """This includes a best-effort publisher, from which a reliable subscription would never receive a cloud."""
     r = rig("use_sim_time:=true", reliable=reliable)
     clock = r.harness.publisher(Clock, "/clock")
     r.wait(clock.get_subscription_count, "the subscription to /clock")
@@ -74,8 +74,8 @@ def test_keyframes_map_path_and_tf(rig: Callable[..., Rig], drive: Any) -> None:
     assert [k.header.frame_id for k in keyframes] == [f"kf_{n}" for n in range(len(keyframes))]
     assert [stamp_ns(k.header) for k in keyframes] == [stamp_ns(p.header) for p in poses]
     assert poses[1].child_frame_id == "kf_1"
-    assert keyframes[1].width == 320  # all of a frame
-    assert len(keyframes[1].data) <= BUDGET // 2  # the other half is the cloud's
+    assert keyframes[1].width == 320  # all descriptors of a frame
+    assert len(keyframes[1].data) <= BUDGET // 2  # the other half is for the cloud
     r.wait(lambda: maps and stamp_ns(maps[-1].header) == stamp_ns(poses[-1].header), "the map of the last keyframe")
     assert maps[-1].header.frame_id == "map"
     assert maps[-1].width > 1000
@@ -106,12 +106,12 @@ def test_the_map_is_bounded_and_built_only_for_listeners(
     maps = r.harness.hear(PointCloud2, "/dpm2/map", LATCHED)
     r.wait(lambda: maps, "the map, once there is a subscriber")
     time.sleep(0.3)
-    assert [m.width for m in maps] == [1000]  # and not again while nothing changes
+    assert [m.width for m in maps] == [1000]  # and it is not sent again while nothing changes
     assert len(built) == 1
 
 
 def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], drive: Any) -> None:
-    """Built only for listeners; a late one gets it at once; house fronts occupied, the street free."""
+    """Built only for subscribers; a late one receives it immediately. House fronts are occupied, the street is free."""
     r = rig("ros.grid.resolution:=0.25", "ros.grid_max_cells:=200000")
     r.send_and_wait(0, 1)
     r.mapped(1)
@@ -141,7 +141,7 @@ def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], dri
 
 
 def test_it_is_silent_also_after_the_only_cloud(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
-    """But not before it: a driver may take its time to start."""
+    """It is not silent before that cloud: a driver may need long to start."""
     monkeypatch.setattr("dpm2_ros.state.SILENT", 0.5)
     r = rig()
     states = r.harness.hear(String, "/dpm2/state", LATCHED)
@@ -154,7 +154,7 @@ def test_it_is_silent_also_after_the_only_cloud(rig: Callable[..., Rig], monkeyp
 
 def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
     silent = lambda seconds: monkeypatch.setattr("dpm2_ros.state.SILENT", seconds)  # noqa: E731
-    silent(300.0)  # clouds may take their time, but where it is the silence that is looked at
+    silent(300.0)  # clouds may be slow, unless the silence itself is tested
     r = rig()
     states = r.harness.hear(String, "/dpm2/state", LATCHED)
     r.wait(lambda: states, "the latched state")
@@ -172,7 +172,7 @@ def test_the_state_is_latched_and_sent_at_each_change(rig: Callable[..., Rig], m
 
 
 def mapped_elsewhere(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Any, list[Odometry]]:
-    """A node without a mapper of its own; what acknowledges its keyframes, and their poses as they come."""
+    """A node without a mapper of its own, a publisher of acknowledgments, and the received poses of its keyframes."""
     r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", *parameters)
     received = r.harness.publisher(UInt32MultiArray, "/dpm2/keyframes_received")
     r.wait(received.get_subscription_count, "the node")
@@ -182,7 +182,7 @@ def mapped_elsewhere(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, An
 
 
 def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Rig], drive: Any) -> None:
-    """Without a mapper all are missing, a warning; once one acknowledges some, they are not."""
+    """Without a mapper all count as missing, which is a warning; once one acknowledges some, the warning ends."""
     r, received, poses = mapped_elsewhere(rig)
     r.send_and_wait(*range(drive.frames))
     none = r.status("mapper", saying(f"0 of {drive.frames} keyframes"))
@@ -194,7 +194,7 @@ def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Ri
 
 
 def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..., Rig], tmp_path: Path) -> None:
-    """A recorder or RViz receives them, and no mapper."""
+    """A recorder or RViz receives them, but no mapper does."""
     r, _, poses = mapped_elsewhere(rig, f"ros.map_directory:={tmp_path}")
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
@@ -209,7 +209,7 @@ def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..
 def test_keyframes_that_end_with_the_node_are_named(
     rig: Callable[..., Rig], tmp_path: Path, capfd: pytest.CaptureFixture[str], folder: str
 ) -> None:
-    """Without a folder to keep them in, or with one that cannot be made, and no mapper: gone without a word."""
+    """Without a mapper and without a usable folder, the keyframes were silently lost."""
     (tmp_path / "file").touch()
     directory = tmp_path / folder if folder else "''"
     r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", f"ros.map_directory:={directory}")
@@ -224,14 +224,14 @@ def test_keyframes_that_end_with_the_node_are_named(
 
 
 def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Rig]) -> None:
-    """Else it goes on to place the odometry of the next one by the one before."""
+    """Otherwise it continues to place the odometry of the next drive by that of the previous one."""
     r, received, poses = mapped_elsewhere(rig)
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
     last = max(pose.child_frame_id for pose in poses)
     received.publish(received_to_msg(last.rpartition(".")[2], 6, []))
     r.status("mapper", saying("6 of 6 keyframes"))
-    time.sleep(2.5)  # until it is certain, and nothing of this drive is sent again
+    time.sleep(2.5)  # until delivery is confirmed, and nothing of this drive is sent again
     assert r.harness.call(Trigger, "/slam_node/reset").success
     r.wait(lambda: any(pose.child_frame_id == last + EARLIER for pose in poses), "the end of the drive")
 
@@ -256,7 +256,7 @@ def test_save_map_says_what_it_did(rig: Callable[..., Rig], drive: Any, tmp_path
 def test_clouds_are_processed_while_a_map_is_saved(
     rig: Callable[..., Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A large map takes seconds."""
+    """Saving a large map takes seconds."""
     begun, may_end, save = threading.Event(), threading.Event(), ActiveMap.save
 
     def slow(self: ActiveMap, name: str = "") -> str:
@@ -281,8 +281,8 @@ def test_clouds_are_processed_while_a_map_is_saved(
 
 
 def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive: Any, tmp_path: Path) -> None:
-    """The disk is full as far as the file system goes: the map's folder is a file. A reset that cannot save the map
-    changes nothing, neither the odometry nor the robot's place; the response says why."""
+    """A file in place of the map's folder has the effect of a full disk. A reset that cannot save the map changes
+    neither the odometry nor the robot's pose; the response gives the reason."""
     r = rig(f"ros.map_directory:={tmp_path / 'map'}", f"ros.map_file:={tmp_path / 'a.dpm2map'}")
     tf = r.harness.hear(TFMessage, "/tf")
     r.send_and_wait(*range(6))
@@ -299,7 +299,7 @@ def test_a_map_that_cannot_be_saved_is_a_response(rig: Callable[..., Rig], drive
     assert transform_matrix(r.odom[-1].pose.pose)[0, 3] == pytest.approx(drive.pose(6)[0, 3], abs=0.1)
     r.wait(lambda: len(placed()) > before, "map -> odom")
     assert r.keyframes
-    (tmp_path / "map").unlink()  # so that the end of the node can save
+    (tmp_path / "map").unlink()  # so that the node can save when it ends
 
 
 def test_reset_starts_again(rig: Callable[..., Rig], drive: Any) -> None:

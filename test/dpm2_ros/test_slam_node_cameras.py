@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images and a second LiDAR beside the clouds of slam_node: joined, missing, late, rejected with a reason."""
+"""Images and a second LiDAR for slam_node: synchronized with the clouds, missing, late, or rejected with a reason."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def with_camera(rig: Callable[..., Rig], *parameters: str) -> tuple[Rig, Camera]
 
 PLACE = "input.T_lidar_cam:=[0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5]"
 AHEAD = se3.make(R_AHEAD, np.zeros(3))
-"""As a matrix."""
+"""The same rotation as a matrix."""
 
 
 def test_an_image_joins_its_cloud(rig: Callable[..., Rig]) -> None:
@@ -53,7 +53,7 @@ def test_the_cloud_is_painted_into_its_image_for_who_looks(rig: Callable[..., Ri
     r.wait(lambda: r.node.count_subscribers("/dpm2/projection"), "the subscription")
     camera.send(1)
     r.send_and_wait(1)
-    # The first one may be painted only now: its odometry comes before that.
+    # The first one may be painted only now: its odometry is published before that.
     r.wait(lambda: painted and stamp_ns(painted[-1].header) == r.drive.stamp(1), "the projection")
     assert (painted[-1].height, painted[-1].width, painted[-1].encoding) == (6, 8, "rgb8")
     assert painted[-1].header.frame_id == "camera"
@@ -66,7 +66,7 @@ SECOND = "input.second_image_topic:=/rear/image"
 
 
 def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second looks back. Without a place it is left out, said; late and silent it costs its image alone."""
+    """The second looks back. Without extrinsics it is left out, reported; late or silent, only its image is missing."""
     r, camera = with_camera(rig, PLACE, SECOND, "ros.sync_timeout:=1.0")
     rear = Camera(r, "/rear/image", "/rear/camera_info", "rear")
     frames, T = record_frames(r), se3.exp([0, 0, np.pi, 0, 0, 0]) @ AHEAD
@@ -84,7 +84,7 @@ def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypat
         r.send_and_wait(n)
     for part in ("camera", "second camera"):
         r.status(part, saying("in use"), since=0)
-    rear.send(3)  # the first one has none
+    rear.send(3)  # the first camera has none
     r.send_and_wait(3)
     camera.send(4)
     r.send_and_wait(4)
@@ -102,7 +102,7 @@ def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypat
 
 
 def test_two_cameras_of_one_frame_are_one_too_many(rig: Callable[..., Rig]) -> None:
-    """As drivers of stereo cameras may send them: the second one's place is not known then."""
+    """Drivers of stereo cameras may send them so: the extrinsics of the second camera are then unknown."""
     r, camera = with_camera(rig, PLACE, SECOND, "ros.sync_timeout:=1.0")
     rear = Camera(r, "/rear/image", "/rear/camera_info")
     frames = record_frames(r)
@@ -115,7 +115,7 @@ def test_two_cameras_of_one_frame_are_one_too_many(rig: Callable[..., Rig]) -> N
 
 
 def test_two_cameras_on_one_topic_are_not_taken_for_one_that_jumps(rig: Callable[..., Rig]) -> None:
-    """The images of the one that was heard first count, with its calibration, also where the other's are nearer."""
+    """Only the images of the camera received first are used, with its calibration, even if the other's are nearer."""
     r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
     other, frames = Camera(r, frame="left"), record_frames(r)
     for name, x in (("camera", 0.5), ("left", -1.0)):
@@ -135,7 +135,7 @@ def test_two_cameras_on_one_topic_are_not_taken_for_one_that_jumps(rig: Callable
 
 
 def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
-    """While they are missing, images are rejected, and that is said."""
+    """While they are missing, images are rejected, and that is reported."""
     r, camera = with_camera(rig, "ros.sync_timeout:=2.0")
     frames, T = record_frames(r), se3.exp([0.1, -1.2, 1.2, 0.3, 0.0, -0.1])
     for n in range(6):
@@ -151,7 +151,7 @@ def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
 
 
 def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
-    """Each sees one side of the street; the second is turned and stands to the right. Then it stops."""
+    """Each sees one side of the street; the second is rotated and mounted to the right. Then it stops."""
     r = rig("input.second_points_topic:=/right", "ros.sync_timeout:=2.0", "input.vertical_angle_correction_deg:='0.0'")
     T = se3.exp([0, 0, -1.5, 0.3, -0.5, 0.1])
     publish_static(r, "lidar", "right", T)
@@ -169,7 +169,7 @@ def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
     assert frames[-1].time_offset is not None
     assert set(np.round(frames[-1].time_offset, 6)) == {0.0, np.float32(-0.02)}
     r.status("second lidar", lambda s: s.message == "in use", since=0)
-    r.send_and_wait(5)  # alone
+    r.send_and_wait(5)  # without the second LiDAR
     assert len(frames[5].points) == len(scan(pose(5)))
     r.processed(6)
     r.status("second lidar", having(received=5, matched=5, late=0))
@@ -178,7 +178,7 @@ def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
 def test_a_camera_that_never_comes_comes_late_and_stops(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every cloud gets its pose all the while, and /diagnostics shows it."""
+    """Every cloud gets its pose throughout, and /diagnostics shows the state of the camera."""
     r, camera = with_camera(rig, PLACE, "ros.sync_timeout:=0.05")
     frames = record_frames(r)
     r.send_and_wait(0, 1, 2)
@@ -196,12 +196,12 @@ def test_a_camera_that_never_comes_comes_late_and_stops(
 
 
 def test_without_a_camera_no_cloud_waits_for_one(rig: Callable[..., Rig], drive: Any) -> None:
-    """Images are wanted by default; a drive without any is as fast from its first cloud on as one that wants none."""
+    """Images are on by default; a drive without any is as fast from its first cloud as one with images disabled."""
     r = rig("input.images:=true", "input.second_image_topic:=/rear/image", "ros.sync_timeout:=5.0")
     assert r.node.slam.odometry.uses_images
     began = time.monotonic()
     r.send_and_wait(*range(drive.frames))
-    assert time.monotonic() - began < 20.0  # the first five would wait 5 s each; without it is under a second
+    assert time.monotonic() - began < 20.0  # the first five would wait 5 s each; without waits it takes under a second
 
 
 def test_images_that_nothing_looks_at_are_not_received(rig: Callable[..., Rig]) -> None:

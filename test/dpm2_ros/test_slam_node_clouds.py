@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds that are bad, of another LiDAR, repeated, late, ahead, too many or none: slam_node goes on and says so."""
+"""Bad clouds, of another LiDAR, repeated, late, ahead, too many or none: slam_node continues and reports them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from .conftest import pose, scan
 
 
 def test_times_that_the_motion_contradicts_are_said(rig: Callable[..., Rig], drive: Any) -> None:
-    """Of a driver that de-skews its clouds and sends the times of their points all the same, on a robot that swings."""
+    """A driver de-skews its clouds, but still sends the times of their points, on a robot whose heading oscillates."""
     r = rig("input.images:=false")
     for n in range(14):
         points = scan(se3.exp([0, 0, 0.12 * np.sin(max(n - 3, 0) * np.pi / 6), 0, 0, 0]))
@@ -48,7 +48,7 @@ def test_times_that_the_motion_contradicts_are_said(rig: Callable[..., Rig], dri
 
 
 def test_each_part_of_a_sweep_has_a_pose_and_none_has_failed(rig: Callable[..., Rig], drive: Any) -> None:
-    """Of a driver that sends a sweep in ten parts, before a reset and after it."""
+    """The driver sends a sweep in ten parts, before a reset and after it."""
     r = rig("input.images:=false")
     sent = []
     for n in range(4):
@@ -68,7 +68,7 @@ def test_each_part_of_a_sweep_has_a_pose_and_none_has_failed(rig: Callable[..., 
 
 
 def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None:
-    """Empty, of 50 points, all NaN, all zero, without x, cut short: each gets a pose, and the drive goes on."""
+    """Empty, of 50 points, all NaN, all zero, without x, cut short: each gets a pose, and the drive continues."""
     r = rig()
     r.send_and_wait(*range(5))
     good = decode_points(drive.cloud(5))[0]
@@ -94,7 +94,7 @@ def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None
 def test_a_bug_costs_its_cloud_and_is_a_warning(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bugs of the odometry were counted where nothing warned of them, and each was a page of the log."""
+    """Bugs of the odometry were counted, but nothing warned of them, and each filled a page of the log."""
     r = rig()
     r.send_and_wait(0)
     good = r.node.slam.odometry_step
@@ -112,11 +112,11 @@ def test_a_bug_costs_its_cloud_and_is_a_warning(
 
 
 def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Callable[..., Rig], drive: Any) -> None:
-    """As of a driver that sends millimeters: nothing has begun, and that is no good news."""
+    """As from a driver that sends millimeters: the odometry cannot start, which must be a warning."""
     r = rig()
     for n in range(3):
         points = decode_points(drive.cloud(n))[0] * np.float32(1000)
-        r.lidar.publish(cloud_to_msg(points, time.time_ns(), "lidar"))  # the node's own clock: else that is a warning
+        r.lidar.publish(cloud_to_msg(points, time.time_ns(), "lidar"))  # the node's own clock: others are a warning
         r.wait(lambda n=n: len(r.odom) > n, "the pose of a cloud")
     assert r.processed(3).level == DiagnosticStatus.WARN
 
@@ -124,8 +124,8 @@ def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Calla
 def test_clouds_that_are_not_of_this_drive_leave_it_alone(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In another frame, or unreadable with a stamp from anywhere: rejected, counted by their reason, no restart."""
-    monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 300.0)  # s: with less, after a pause of the machine's own
+    """In another frame, or unreadable with an arbitrary stamp: rejected, counted by reason, without a restart."""
+    monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 300.0)  # s: longer than any pause of the machine
     r = rig()
     r.send_and_wait(*range(3))
     others = [drive.cloud(3) for _ in range(3)]
@@ -146,7 +146,7 @@ def test_clouds_that_are_not_of_this_drive_leave_it_alone(
 
 
 def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None:
-    """As of two robots without namespaces: 0.5 m off, tracking and degraded in turn, and nothing said why."""
+    """As from two robots without namespaces: poses 0.5 m off, alternating states, and no message gave the reason."""
     r = rig()
     r.send_and_wait(0)
     assert "publishers" not in r.processed(1).message
@@ -160,7 +160,7 @@ def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None
 def test_another_lidar_on_the_topic_begins_another_drive(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Turned about and elsewhere on the robot, which goes on: its points were taken for those of the first one."""
+    """The other LiDAR is rotated and elsewhere on the moving robot: its points were taken for the first one's."""
     monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 0.0)
     T_base_rear = se3.exp([0.0, 0.0, np.pi, -1.5, 0.0, 0.0])
     r = rig("ros.base_frame:=base_link")
@@ -190,7 +190,7 @@ def test_stamps_that_repeat_or_go_back(rig: Callable[..., Rig], drive: Any) -> N
 def test_time_that_goes_back_restarts_the_odometry_and_keeps_the_map(
     rig: Callable[..., Rig], drive: Any, back: float
 ) -> None:
-    """Where the robot is in the map is not known then before a loop is found, and not published."""
+    """The robot's pose in the map is then unknown until a loop is found, and it is not published."""
     r = rig("slam.loops.enabled:=false")
     tf = r.harness.hear(TFMessage, "/tf")
     r.send_and_wait(*range(drive.frames))
@@ -208,13 +208,13 @@ def test_time_that_goes_back_restarts_the_odometry_and_keeps_the_map(
     r.wait(lambda: r.keyframes == before + 1, "the keyframe after the jump")
     r.send_and_wait(2, stamp=drive.stamp(2 + drive.frames) - round(back * 1e9) - drive.period)
     assert figures(r.processed(drive.frames + 3))["restarts"] == "1"
-    assert map_to_odom() == drive.frames  # none since
+    assert map_to_odom() == drive.frames  # none since the jump
 
 
 def test_a_clock_that_is_set_back_by_less_than_a_second_costs_nothing(
     rig: Callable[..., Rig], drive: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """By 0.5 s at 8 m/s: the clouds until then were rejected, and the next one was looked for 4 m too early."""
+    """By 0.5 s at 8 m/s: the clouds of that time were rejected, and the next was predicted 4 m too far back."""
     r, half = rig(), drive.frames // 2
     r.send_and_wait(*range(half))
     back = 500_000_000
@@ -249,14 +249,14 @@ def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig], monkeypatch: pyte
     r = rig()
     before = r.status("odometry", saying("no cloud on /kitti/velo/pointcloud yet"))
     assert before.level == DiagnosticStatus.STALE
-    assert "are published on" not in before.message  # the topic itself, whose publisher is there, was named
+    assert "are published on" not in before.message  # the topic itself, whose publisher exists, was named
     r.send_and_wait(0)
     monkeypatch.setattr("dpm2_ros.slam_diagnostics.SILENT", 1.0)
     assert r.status("odometry", saying("no cloud on /kitti/velo/pointcloud for")).level == DiagnosticStatus.STALE
 
 
 def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: Callable[..., Any]) -> None:
-    """It named the very topic as the one to listen to."""
+    """The message suggested to subscribe to the very same topic."""
     harness = ros("input.points_topic:=/points", "input.images:=false", "ros.reliability:=reliable")
     harness.publisher(PointCloud2, "/points", reliable=False)
     harness.add(SlamNode())
@@ -268,7 +268,7 @@ def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: 
 
 
 def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: Callable[..., Any]) -> None:
-    """There was said to be no image and no fix yet, and nothing of an IMU."""
+    """The messages were "no image yet" and "no fix yet", and there was none for an IMU."""
     topics = ("input.image_topic:=/image", "input.imu_topic:=/imu", "input.gnss_topic:=/fix", "ros.odom_topic:=/wheels")
     harness = ros(*topics, "ros.odom_source:=topic", "ros.reliability:=reliable")
     sensors = {"camera": (Image, "/image"), "imu": (Imu, "/imu"), "gnss": (NavSatFix, "/fix")}
@@ -308,7 +308,7 @@ def test_an_overloaded_node_drops_the_oldest_and_counts(rig: Callable[..., Rig],
             r.send(n)
             r.status("odometry", having(received=n + 1))
     finally:
-        going_on.set()  # the node ends after the cloud that it is at
+        going_on.set()  # the node ends after the current cloud
     r.wait(lambda: r.stamps() and r.stamps()[-1] == drive.stamp(7), "the last cloud")
     values = figures(r.processed(len(r.odom)))
     assert int(values["dropped (queue full)"]) == 8 - len(r.odom) > 0

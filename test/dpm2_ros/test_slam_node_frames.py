@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where slam_node finds its base: /tf_static, early, late or never; and clocks that do not fit."""
+"""How slam_node gets its base from /tf_static, early, late or never; and clocks that do not match."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
 
 @pytest.mark.usefixtures("no_earlier_nodes")
 def test_two_publishers_that_place_the_lidar_otherwise_are_told(rig: Callable[..., Rig]) -> None:
-    """As a robot's description and a calibration: before the first cloud the place was that of whichever came last, and
-    with it the pose of the base, without a word."""
+    """As from a robot description and a calibration: before the first cloud, the extrinsics were those received last,
+    and the pose of the base depended on them, without a message."""
     r = rig("ros.base_frame:=base_link")
     log = r.harness.hear(Log, "/rosout")
     r.wait(lambda: r.harness.found_by(r.node, "/rosout"), "the subscription to the log")
@@ -58,7 +58,7 @@ def test_a_namespace_holds_a_robot(rig: Callable[..., Rig]) -> None:
 
 
 def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) -> None:
-    """The pose of base_link, which starts at the origin, although the LiDAR is mounted ahead, above and turned."""
+    """The pose of base_link starts at the origin, although the LiDAR is mounted ahead, above and rotated."""
     T_base_lidar = se3.exp([0.0, 0.05, 0.4, 1.0, 0.2, 1.5])
     r = rig()
     publish_static(r, "base_link", "lidar", T_base_lidar)
@@ -69,7 +69,7 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
 
 @pytest.mark.weights
 def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Rig], drive: Any) -> None:
-    """By the network, which learned from LiDARs that stand: a robot is found in the map of another one."""
+    """The network was trained on upright LiDARs: thus a robot can be localized in the map of another one."""
     T_base_lidar, network = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5]), load_network("small", 1)
     r = rig("slam.loops.descriptors:=true")
     publish_static(r, "base_link", "lidar", T_base_lidar)
@@ -79,14 +79,14 @@ def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Ri
     r.mapped(1)
     seen = r.node.slam.mapper.keyframes[0].descriptors
     assert seen is not None
-    found = network.register(seen, network.describe(Frame(0, standing)))  # T_standing_base: no turn, back by the lever
+    found = network.register(seen, network.describe(Frame(0, standing)))  # T_standing_base: lever arm, no rotation
     assert found.ok
     np.testing.assert_allclose(found.T_target_source, se3.make(np.eye(3), -T_base_lidar[:3, 3]), atol=0.1)
 
 
 @pytest.mark.weights
 def test_the_network_is_told_how_a_lidar_hangs(rig: Callable[..., Rig], drive: Any) -> None:
-    """Where the odometry is the network's alone: with its poses level, the base still begins at the origin."""
+    """The odometry is the network's alone: its poses are level, and the base still starts at the origin."""
     T_base_lidar = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5])
     r = rig("slam.registration:=neural")
     publish_static(r, "base_link", "lidar", T_base_lidar)
@@ -101,7 +101,7 @@ def test_the_network_is_told_how_a_lidar_hangs(rig: Callable[..., Rig], drive: A
 
 @pytest.mark.weights
 def test_the_network_is_not_told_amid_a_drive_how_a_lidar_hangs(rig: Callable[..., Rig], drive: Any) -> None:
-    """Where /tf_static came behind the first cloud, level scans were compared with one upside down: 3.4 m off."""
+    """If /tf_static arrived after the first cloud, level scans were compared with one upside down: 3.4 m off."""
     T_base_lidar = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5])
     r = rig("slam.registration:=neural", "ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     for n in range(6):
@@ -118,7 +118,7 @@ def test_the_network_is_not_told_amid_a_drive_how_a_lidar_hangs(rig: Callable[..
 def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     rig: Callable[..., Rig], drive: Any
 ) -> None:
-    """The driver's part of /tf_static comes first, that of the robot with the base three clouds later."""
+    """The driver's part of /tf_static comes first; the robot's part, with the base, comes three clouds later."""
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
     r.wait(
@@ -146,9 +146,9 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
 def test_poses_kept_for_a_base_are_bounded(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Then the drive begins anew: what is published at last is a whole drive from its first pose on.
+    """Then the drive begins anew: what is finally published is a whole drive from its first pose.
 
-    The log says which preset each of the two takes, and names none before it is known.
+    The log names the preset of each of the two drives, and none before it is known.
     """
     monkeypatch.setattr("dpm2_ros.slam_node.HELD", 3)
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0")
@@ -166,7 +166,7 @@ def test_poses_kept_for_a_base_are_bounded(
 
 
 def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
-    """No base is asked for, and the driver's part of /tf_static comes first. odom and map go on as they are."""
+    """No base is set, and the driver's part of /tf_static comes first. odom and map do not change."""
     r = rig()
     tf = r.harness.hear(TFMessage, "/tf")
     publish_static(r, "os_sensor", "lidar", T_SENSOR_LIDAR)
@@ -194,7 +194,7 @@ def test_the_lidars_own_frame_is_the_base_where_tf_static_does_not_name_it(rig: 
 
 
 def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
-    """A recording without /clock, or a sensor whose clock is not set: a warning with both values."""
+    """A recording without /clock, or a sensor whose clock is not set: a warning shows both values."""
     r = rig()
     r.send_and_wait(0, 1, 2)
     status = r.status("odometry", saying("tracking; clouds are stamped"), since=0)
@@ -209,7 +209,8 @@ def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
 
 @pytest.mark.parametrize("stamp", [None, 0], ids=["with stamps", "without stamps"])
 def test_sim_time_without_a_clock_is_reported(rig: Callable[..., Rig], stamp: int | None) -> None:
-    """Clouds without a stamp get that of the clock, which stands: all but the first are rejected as repeated."""
+    """Clouds without a stamp are stamped by the clock, which stands still: all but the first are rejected as
+    repeats."""
     r = rig("use_sim_time:=true")
     r.send_and_wait(0, stamp=stamp)
     for n in range(1, 4):

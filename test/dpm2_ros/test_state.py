@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the log says of a state that a user must know of: once, and why."""
+"""The log reports a state that the user must know of once, with the reason."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a mapper holds of a drive is bounded, nothing is lost for it, and no single reply makes a robot give up."""
+"""A mapper's memory per drive is bounded, nothing is lost by that, and no single answer makes a robot give up."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_ids_far_ahead_cost_no_memory() -> None:
         stream.put(id % AHEAD, "cloud", CLOUD)
     assert stream.holds < 3 * AHEAD * len(CLOUD[0])
     below, waiting = stream.arrived(written=0)
-    assert (below, len(waiting)) < (1, AHEAD)  # what the robot learns: it sends the rest again
+    assert (below, len(waiting)) < (1, AHEAD)  # this is the robot's answer: it sends the rest again
     put(stream, 0)
     assert taken(stream) == list(range(AHEAD))
 
@@ -54,7 +54,7 @@ def test_what_is_not_in_the_map_file_counts_as_waiting() -> None:
     stream = Stream("5f3a9c01", 0.0)
     for id in (0, 1, 2, 4):
         put(stream, id)
-    for number, id in zip((7, 9, 10), taken(stream), strict=True):  # of the mapper; others have the rest
+    for number, id in zip((7, 9, 10), taken(stream), strict=True):  # the mapper's; 8 is another drive's
         stream.given(id, number)
     assert stream.arrived(written=0) == (0, [0, 1, 2, 4])
     assert stream.arrived(written=9) == (1, [1, 2, 4])
@@ -65,7 +65,7 @@ def test_what_is_not_in_the_map_file_counts_as_waiting() -> None:
 
 
 def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -> None:
-    """One that is merely late is waited for, however often something else is sent under its name at first."""
+    """A keyframe that is merely late is awaited, however often other data is sent under its name at first."""
     stream = Stream("5f3a9c01", 0.0)
     put(stream, 1)
     assert stream.give_up(1000.0) is None
@@ -78,7 +78,7 @@ def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -
 
 @pytest.mark.parametrize("claim", [(9, set()), (2, {5, 6, 7, 8})])
 def test_an_answer_that_claims_too_much_is_outweighed(claim: tuple[int, set[int]]) -> None:
-    """The mapper has 0, 1, 2 and 5; another sender says, hundreds of times per second, that it has more."""
+    """The mapper has 0, 1, 2 and 5; another sender claims, hundreds of times per second, that it has more."""
     results = Acks()
     for tick in range(40):
         now = 0.1 * tick
@@ -95,7 +95,7 @@ def test_acknowledgments_follow_the_mapper() -> None:
     assert results.agreed == (0, frozenset())
     for tick in range(10):
         results.add(tick, {tick + 2}, 0.5 * tick)
-    assert results.agreed[0] >= 8  # the last two
+    assert results.agreed[0] >= 8  # up to the last two
     for tick in range(10, 14):
         results.add(0, set(), 0.5 * tick)  # another mapper has nothing
     assert results.agreed == (0, frozenset())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes in is checked by the topics that are really subscribed to, after remapping; what is absurd is ignored."""
+"""Inputs are checked by the topics that are really subscribed to, after remapping; absurd values are ignored."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CLOUD: Points = np.array([[50, 0, 0, 0.5], [0, 30, 1, 0.5]], np.float32)
 
 @pytest.fixture
 def node(domain: int) -> Iterator[Callable[..., Node]]:
-    """node(*remappings, namespace="")."""
+    """Makes a node: node(*remappings, namespace="")."""
     nodes = list[Node]()
 
     def make(*remappings: str, namespace: str = "") -> Node:
@@ -56,7 +56,7 @@ def raised(inputs: Inputs) -> float:
 
 
 def test_a_remapped_lidar_has_not_the_error_of_kittis(node: Callable[..., Node]) -> None:
-    """The setting still names KITTI's topic, and the clouds come from elsewhere."""
+    """The setting still names KITTI's topic, but the clouds are received on another one."""
     made = inputs(node("/kitti/velo/pointcloud:=/ouster/points"))
     assert made.calibration.points_topic == "/ouster/points"
     assert raised(made) == 0
@@ -114,7 +114,7 @@ def test_image_type_and_calibration_follow_the_remapped_topic(
 
 
 def test_compressed_images_come_on_a_topic_of_any_name(node: Callable[..., Node]) -> None:
-    """Not only where it ends in /compressed: the type is that of the publisher."""
+    """The topic need not end in /compressed: the publisher's type decides."""
     n = node()
     publisher = n.create_publisher(CompressedImage, "/front/image_rect_compressed", LATCHED)
     made = inputs(n, image_topic="/front/image_rect_compressed")
@@ -128,7 +128,7 @@ def test_compressed_images_come_on_a_topic_of_any_name(node: Callable[..., Node]
 
 
 def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node]) -> None:
-    """Its CameraInfo beside where its images really come from, whatever is set for the first one's."""
+    """Its CameraInfo is expected next to the topic that its images really come from, whatever is set for the first."""
     n = node("/rear/image:=/back/image/compressed", namespace="/red")
     made = inputs(n, image_topic="cam/image", camera_info_topic="/info", second_image_topic="/rear/image")
     assert [camera.topic for camera in made.calibration.cameras] == ["/red/cam/image", "/back/image/compressed"]
@@ -142,7 +142,7 @@ def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node])
 
 
 def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
-    """Two topics that change places: what a second application would undo."""
+    """The two topics are exchanged: a second application would undo that."""
     n = node("/a:=/b", "/b:=/a")
     assert inputs(n, points_topic="/a", images=False).calibration.points_topic == "/b"
     assert "/b" in {s.topic_name for s in n.subscriptions}
@@ -150,7 +150,7 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
 
 
 def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> None:
-    """Latched, long before anyone listens."""
+    """It was latched, long before the subscription."""
     n = node()
     n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(INFO)
     made = inputs(n, image_topic="/front/image")
@@ -161,7 +161,7 @@ def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> 
 
 
 def test_a_camera_info_that_cannot_be_used_replaces_none_that_can(node: Callable[..., Node]) -> None:
-    """Nor one that was known before the node was deactivated, as here."""
+    """This includes a CameraInfo from before the node was deactivated, as here."""
     n = node()
     assert isinstance(n, GuardedNode)
     known = Calibration("/points", camera=CameraTopic("/front/image", INFO))
@@ -175,7 +175,7 @@ def test_a_camera_info_that_cannot_be_used_replaces_none_that_can(node: Callable
 
 
 class LastFirst(GuardedNode):
-    """Of what has come on several topics, an executor takes that of its last subscription first."""
+    """If messages wait on several topics, its executor takes that of the last subscription first."""
 
     @property
     def subscriptions(self) -> Iterator[Any]:
@@ -183,8 +183,8 @@ class LastFirst(GuardedNode):
 
 
 def test_a_cloud_has_the_time_of_the_clock_that_was_sent_before_it(domain: int) -> None:
-    """Whichever is taken first. With that of the cloud before, a gap in a replay in lockstep was a clock that was
-    set."""
+    """This is true whichever message is taken first. With the time of the cloud before, a gap in a lockstep replay was
+    taken for a clock that was set."""
     ros_context(["--ros-args", "-p", "use_sim_time:=true"], domain)
     n = LastFirst("listener")
     try:
@@ -205,7 +205,7 @@ def test_a_cloud_has_the_time_of_the_clock_that_was_sent_before_it(domain: int) 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 90.0, -5.1])
 def test_an_absurd_correction_from_the_wire_is_ignored(node: Callable[..., Node], value: float) -> None:
-    """Whoever publishes it, and whatever came before it."""
+    """This is independent of the publisher and of the values before."""
     n = node()
     made = inputs(n)
     publisher = n.create_publisher(Float64, "/kitti/vertical_angle_correction_deg", LATCHED)

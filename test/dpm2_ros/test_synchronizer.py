@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cloud leads; an image joins in time or not at all; nothing is lost uncounted."""
+"""Clouds set the pace; an image is matched in time or not at all; every loss is counted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def camera_of(synchronizer: Synchronizer) -> SensorState:
 
 
 def image_of(bundle: Bundle) -> Any:
-    """The message alone; None without one."""
+    """The matched image of a bundle; None without one."""
     return bundle.beside.get("/image", (0, None))[1]
 
 
@@ -39,7 +39,7 @@ def test_without_a_camera_nothing_waits() -> None:
 
 
 def test_a_cloud_waits_for_all_other_sensors_alike() -> None:
-    """Each with patience of its own: one that is silent does not cost the others."""
+    """Each sensor has its own patience: a silent sensor does not cost the images of the others."""
     topics = ("/image", "/second_image", "/lidar")
     synchronizer = Synchronizer(topics, depth=10, timeout=0.03, tolerance=0.05)
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
@@ -62,14 +62,14 @@ def test_a_cloud_waits_for_all_other_sensors_alike() -> None:
     synchronizer.add("/lidar", 2000 * MS, "second", now=2.01)
     assert not drain(synchronizer, 2.01)
     synchronizer.add("/second_image", 2000 * MS, "other", now=2.02)
-    assert [bundle.cloud for bundle in drain(synchronizer, 2.02)] == ["last"]  # nobody waits for the first any more
+    assert [bundle.cloud for bundle in drain(synchronizer, 2.02)] == ["last"]  # clouds no longer wait for the first
     counts = [(synchronizer.sensors[topic].matched, synchronizer.sensors[topic].missed) for topic in topics]
     assert counts == [(1, PATIENCE + 1), (PATIENCE + 2, 0), (PATIENCE + 2, 0)]
 
 
 @pytest.mark.parametrize(("depth", "behind", "rate"), [(10, 9, 60), (100, 12, 30), (100, 50, 10)])
 def test_clouds_that_wait_for_the_worker_keep_their_images(depth: int, behind: int, rate: int) -> None:
-    """However many images come while it is behind."""
+    """This is true however many images arrive while the worker is behind."""
     synchronizer, out = make(depth=depth), list[Bundle]()
     clouds = [(0.1 * n, True) for n in range(60)]
     for now, is_cloud in sorted([*clouds, *((n / rate, False) for n in range(6 * rate))]):
@@ -80,11 +80,11 @@ def test_clouds_that_wait_for_the_worker_keep_their_images(depth: int, behind: i
         if len(synchronizer) > behind:
             out += filter(None, [synchronizer.pop(now)])
     assert len(out) >= 60 - behind - 1
-    assert all(abs(image_of(bundle) - bundle.cloud) < 1e-3 for bundle in out)  # one at the time of each, but rounding
+    assert all(abs(image_of(bundle) - bundle.cloud) < 1e-3 for bundle in out)  # an image for each, but for rounding
 
 
 def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
-    """Nor is a camera that goes away; what it has delivered is used all the same."""
+    """The same holds for a camera that disappears; images that it has delivered are still used."""
     synchronizer = make()
     camera_of(synchronizer).present = False
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
@@ -99,7 +99,7 @@ def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
     [
         (100, 0.00, True),  # together with the cloud
         (149, 0.02, True),  # at the edge of the tolerance, within the timeout
-        (51, 0.029, True),  # earlier by the tolerance
+        (51, 0.029, True),  # earlier than the cloud by the tolerance
         (151, 0.00, False),  # beyond the tolerance
         (100, 0.04, False),  # too late
     ],
@@ -122,7 +122,7 @@ def test_a_cloud_waits_for_its_image_and_no_longer() -> None:
 
 
 def test_a_later_image_ends_the_wait() -> None:
-    """Once the camera is beyond the cloud, its image will not come any more."""
+    """Once an image is later than the cloud, the cloud's image can no longer arrive."""
     synchronizer = make()
     synchronizer.add_cloud(100 * MS, "cloud", now=0.0)
     synchronizer.add("/image", 200 * MS, "next", now=0.0)
@@ -138,7 +138,7 @@ def test_the_nearest_of_several_images_is_taken() -> None:
 
 
 def test_an_image_that_came_too_late_for_one_cloud_may_be_the_next_ones() -> None:
-    """It is in the tolerance of both; that the first did not wait for it says nothing of the second."""
+    """It is within the tolerance of both; although the first cloud did not wait for it, the second may use it."""
     synchronizer = make()
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
     assert [image_of(bundle) for bundle in drain(synchronizer, 0.03)] == [None]
@@ -149,7 +149,7 @@ def test_an_image_that_came_too_late_for_one_cloud_may_be_the_next_ones() -> Non
 
 
 def test_a_camera_that_comes_late_in_the_drive_is_used_from_then_on() -> None:
-    """Its images arrive a little after the clouds: too late for one that does not wait, in time for one that does."""
+    """Its images arrive shortly after the clouds: too late for clouds that do not wait, in time for those that do."""
     synchronizer = make()
     joined = []
     for n in range(3 * PATIENCE):
@@ -176,7 +176,7 @@ def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
 
 @pytest.mark.parametrize("ahead", [-37, -0.3, 37])
 def test_a_camera_of_another_clock_costs_no_latency_and_is_said(ahead: float) -> None:
-    """By leap seconds, as where its driver counts them, or a little: each of its images let the next clouds wait."""
+    """It may be off by leap seconds, if its driver counts them, or by little: each image made the next clouds wait."""
     synchronizer, waited = make(), list[bool]()
     for n in range(20):
         synchronizer.add("/image", round(100 + 100 * n + 1000 * ahead) * MS, n, 0.1 * n)
@@ -188,7 +188,7 @@ def test_a_camera_of_another_clock_costs_no_latency_and_is_said(ahead: float) ->
 
 
 def test_a_camera_beside_a_slow_lidar_is_waited_for() -> None:
-    """One of both every 2 s, which is no other clock."""
+    """Each sends one message every 2 s, which does not indicate another clock."""
     synchronizer, joined = make(), list[bool]()
     for n in range(20):
         synchronizer.add_cloud((100 + 2000 * n) * MS, n, 2.0 * n)
@@ -200,7 +200,7 @@ def test_a_camera_beside_a_slow_lidar_is_waited_for() -> None:
 
 @pytest.mark.parametrize(("late", "fits"), [(0.0, True), (0.09, False)])
 def test_a_slow_camera_fits_where_its_images_are_used(late: float, fits: bool) -> None:
-    """Of 2 Hz beside 20: most clouds have no image, and all images have a cloud, unless they are too late."""
+    """With 2 Hz and a LiDAR at 20 Hz, most clouds have no image; every image has a cloud, unless it is too late."""
     synchronizer, said = make(), list[bool]()
     for tick in range(2000):  # 10 ms
         now = 0.01 * tick
@@ -236,7 +236,7 @@ def test_a_full_queue_drops_the_oldest_and_counts() -> None:
 
 
 def driven(synchronizer: Synchronizer, takes: float, until: float, image_late: float | None = None) -> list[Bundle]:
-    """What a worker gets that needs so long (s) for each of the clouds that come at 10 Hz, arrival as they went."""
+    """The bundles of a worker that needs `takes` s per cloud, at 10 Hz; their arrival is replaced by the delay."""
     got, free, step = list[Bundle](), 0.0, 0.01
     for tick in range(round(until / step)):
         now = tick * step
@@ -251,8 +251,8 @@ def driven(synchronizer: Synchronizer, takes: float, until: float, image_late: f
 
 
 def test_a_worker_that_is_too_slow_gets_clouds_that_are_not_old() -> None:
-    """Of 10 clouds 8 can be processed: two are lost whatever waits, but after a while they wait FEW periods, not 10,
-    and none of the gaps on the way there is longer than three periods."""
+    """Of 10 clouds 8 can be processed: two are lost in any case, but after a while clouds wait FEW periods, not 10.
+    No gap until then is longer than three periods."""
     synchronizer = make(camera=False)
     got = driven(synchronizer, takes=0.125, until=60)
     assert max(bundle.arrival for bundle in got) <= 1.15  # 10 waiting, and the rest of the one before
@@ -262,7 +262,7 @@ def test_a_worker_that_is_too_slow_gets_clouds_that_are_not_old() -> None:
 
 
 def test_a_worker_that_has_caught_up_may_fall_behind_again_without_loss() -> None:
-    """A second of too much work in an hour costs nothing, also after a time of too much work."""
+    """A second of overload in an hour costs nothing, also after a long overload."""
     synchronizer = make(camera=False)
     driven(synchronizer, takes=0.125, until=60)
     at, dropped = 60.0, synchronizer.dropped
@@ -276,13 +276,13 @@ def test_a_worker_that_has_caught_up_may_fall_behind_again_without_loss() -> Non
 def test_a_worker_that_is_held_up_loses_only_what_does_not_fit() -> None:
     synchronizer = make(camera=False, depth=10)
     drain(synchronizer, 0.0)
-    for n in range(15):  # while it is busy with something else
+    for n in range(15):  # while the worker is busy with something else
         synchronizer.add_cloud(100 * n * MS, n, now=0.1 * n)
     assert [bundle.cloud for bundle in drain(synchronizer, 1.5)] == list(range(5, 15))
 
 
 def test_images_that_come_late_starve_no_worker() -> None:
-    """Each 0.3 s after its cloud, longer than FEW clouds: who waits for them is not behind."""
+    """Each is 0.3 s later than its cloud, longer than FEW clouds: a worker that waits for images is not behind."""
     synchronizer = make(timeout=1.0)
     got = driven(synchronizer, takes=0.12, until=60, image_late=0.3)
     assert len(got) > 0.9 * 60 / 0.12
@@ -313,7 +313,7 @@ def test_stamps_that_repeat_jump_back_or_forward(stamp_ms: int, check: StampChec
 
 @pytest.mark.parametrize(("clock", "stepped"), [((50.0, 53.0), False), ((50.0, 50.1), True), ((0.0, 53.0), True)])
 def test_a_gap_of_a_recording_that_is_played_faster_is_a_pause(clock: tuple[float, float], stepped: bool) -> None:
-    """By /clock, where it tells the time of both clouds; a clock that was set while the recording was made is none."""
+    """The pause is recognized by /clock, if it covers both clouds; a clock set during the recording is not a pause."""
     synchronizer = make(camera=False)
     synchronizer.add_cloud(10_000 * MS, "before", now=0.0, clock=clock[0])
     check = synchronizer.add_cloud(13_000 * MS, "after", now=0.1, clock=clock[1])
@@ -322,7 +322,7 @@ def test_a_gap_of_a_recording_that_is_played_faster_is_a_pause(clock: tuple[floa
 
 
 def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> list[tuple[int, bool]]:
-    """Clouds that arrive at a steady pace; stamp (ms) and `restarted` of those that leave."""
+    """Add clouds at a steady pace; stamp (ms) and `restarted` of those that are released."""
     out = []
     for n, stamp in enumerate(stamps_ms):
         synchronizer.add_cloud(stamp * MS, stamp, now=period * n)
@@ -332,7 +332,7 @@ def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> li
 
 @pytest.mark.parametrize("stray", [10_000 + 86_400_000, 12_000, 10_900, 10_450, 0, 8_000])
 def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
-    """Ahead or behind: what follows goes on from what was before, and nothing starts again."""
+    """Ahead or behind: the following clouds continue the drive before it, and nothing restarts."""
     synchronizer = make(camera=False)
     assert feed(synchronizer, 9_900, 10_000, stray, 10_200, 10_300) == [
         (stamp, False) for stamp in (9_900, 10_000, 10_200, 10_300)
@@ -353,7 +353,7 @@ def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
 
 @pytest.mark.parametrize("back", [150, 250, 350, 500, 900])
 def test_a_clock_that_is_set_back_by_less_than_a_second_loses_nothing(back: int) -> None:
-    """As by an NTP client: the drive goes on, its clouds in the order in which they came."""
+    """As by an NTP client: the drive continues, with its clouds in the order of their arrival."""
     synchronizer = make(camera=False)
     stamps = [9_901, 10_001, *(stamp - back for stamp in range(10_100, 11_600, 100))]
     assert feed(synchronizer, *stamps) == [(stamp, False) for stamp in stamps]
@@ -361,7 +361,7 @@ def test_a_clock_that_is_set_back_by_less_than_a_second_loses_nothing(back: int)
 
 
 def test_three_clouds_that_come_too_late_are_rejected() -> None:
-    """What was kept somewhere on the way, or comes from another publisher too: never more than three in a row."""
+    """These were delayed in transit, or come from a second publisher: never more than three in a row."""
     synchronizer = make(camera=False)
     late = (9_500, 9_600, 9_700, 10_100, 9_800, 9_900, 10_000, 10_200, 10_140, 10_130, 10_120, 10_110, 10_300)
     kept = [10_000, 10_100, 10_200, 10_300]
@@ -370,13 +370,13 @@ def test_three_clouds_that_come_too_late_are_rejected() -> None:
 
 
 def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
-    """A recording with a gap, played without it; or a clock that was set."""
+    """As in a recording with a gap, played without the pause, or after a clock was set."""
     stamps = (9_900, 10_000, 15_000, 15_100)
     assert feed(make(camera=False), *stamps) == [(stamp, False) for stamp in stamps]
 
 
 def test_a_jump_ahead_is_told_from_a_pause() -> None:
-    """By what has passed meanwhile; also where the cloud that jumped had to be dropped."""
+    """The elapsed time decides, also if the cloud that jumped had to be dropped."""
     for arrival, stepped in ((0.1, True), (5.0, False)):
         synchronizer = make(camera=False)
         out = []
@@ -399,7 +399,7 @@ def test_a_jump_ahead_is_told_from_a_pause() -> None:
 def test_a_clock_that_is_set_ahead_is_told_by_the_pace_of_the_clouds(
     ahead: int, arrivals: tuple[float, ...], stepped: bool
 ) -> None:
-    """By less than a second too: 8 to 13 m off after steps of 0.6 and 0.95 s on KITTI 04 and 00, lost and broken."""
+    """Also by less than a second: steps of 0.6 and 0.95 s on KITTI 04 and 00 caused 8 to 13 m, lost and broken."""
     synchronizer, out = make(camera=False), list[Bundle]()
     stamps = (9_900, 10_000, 10_100 + ahead, 10_200 + ahead, 10_300 + ahead)
     for stamp, now in zip(stamps, (0.0, *arrivals), strict=True):
@@ -411,7 +411,7 @@ def test_a_clock_that_is_set_ahead_is_told_by_the_pace_of_the_clouds(
 
 @pytest.mark.parametrize("ahead", [11_000, 10_300, 10_150])
 def test_a_stamp_ahead_costs_no_more_than_what_its_cloud_overtakes(ahead: int) -> None:
-    """Less than three periods ahead nothing tells it from a pause: those until then are lost, all others go."""
+    """Under three periods, it cannot be told from a pause: clouds until then are lost, all others are released."""
     synchronizer = make(camera=False)
     true = range(10_000, 11_600, 100)
     stamps = [ahead if stamp == 10_200 else stamp for stamp in true]
@@ -422,7 +422,7 @@ def test_a_stamp_ahead_costs_no_more_than_what_its_cloud_overtakes(ahead: int) -
 
 
 def test_a_burst_of_which_the_middle_was_lost_loses_nothing_more() -> None:
-    """A link that delivers late what it has kept: the clouds around the hole come at once, and no clock was set."""
+    """A link delivers delayed clouds late: the clouds around the gap arrive at the same time, and no clock was set."""
     stamps, out = [10_000, 10_100, 10_200, 10_900, 11_000, 11_100], []
     synchronizer = make(camera=False, depth=8)
     for stamp, now in zip(stamps, (0.0, 0.1, 1.2, 1.2, 1.2, 1.2), strict=True):
@@ -438,7 +438,7 @@ def test_a_pause_of_the_sensor_is_no_jump() -> None:
 
 
 def test_a_jump_that_nothing_follows_is_believed_after_a_while() -> None:
-    """A sender that waits for the pose of one cloud before it sends the next gets it."""
+    """A sender that waits for the pose of one cloud before it sends the next receives that pose."""
     synchronizer = make(camera=False)
     synchronizer.add_cloud(10_000 * MS, "a", now=0.0)
     drain(synchronizer, 0.0)
@@ -474,7 +474,7 @@ def test_images_join_again_after_a_restart() -> None:
     depth=st.integers(1, 5),
 )
 def test_every_cloud_leaves_once_or_is_counted(events: list[tuple[str, int, float]], depth: int) -> None:
-    """Whatever comes in, in whatever order: accepted clouds leave in order, each once; images stay within tolerance."""
+    """For any input in any order, accepted clouds are released in order, each once; images are within the tolerance."""
     synchronizer, now, given_in, out = make(depth=depth), 0.0, [], []
     for what, stamp, pause in events:
         now += pause

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame on /tf has one node that places it; where there are two, the one of them that is ours says so."""
+"""A frame on /tf must have one publisher; if another node publishes a frame of ours, our node reports it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ..helpers.diagnostics import saying
 def test_another_node_that_places_the_same_frame_is_named(
     rig: Callable[..., Rig], parent: str, child: str, part: str
 ) -> None:
-    """A robot's own odometry without ros.odom_source, or a recorded one: `odom` -> base jumped from one to the other
-    with each message, and neither log nor diagnostics had a word of it. Also where both have the same stamps."""
+    """A robot's own odometry without ros.odom_source, or a recorded one: `odom` -> base jumped between the two with
+    each message, and neither log nor diagnostics reported it. This includes the case that both have the same stamps."""
     r = rig()
     other = r.harness.publisher(TFMessage, "/tf")
     r.wait(lambda: other.get_subscription_count() == 2, "slam_node's ears, of each transform that it sends")
@@ -39,14 +39,14 @@ def test_another_node_that_places_the_same_frame_is_named(
 
 
 def test_frames_of_others_are_theirs(rig: Callable[..., Rig]) -> None:
-    """A frame that another node alone places is none of ours; a transform of our own that a relay sends once more is
-    the same one."""
+    """A frame that only another node publishes is not checked; a transform of ours that a relay sends again is the
+    same one."""
     r = rig()
     tf, other = r.harness.hear(TFMessage, "/tf"), r.harness.publisher(TFMessage, "/tf")
     r.wait(lambda: other.get_subscription_count() == 3 and r.harness.found_by(r.node, "/tf"), "connections")
     r.send_and_wait(0, 1)
     r.mapped(1)
-    r.wait(lambda: len(tf) >= 3, "transforms")  # two of odom -> lidar, and one of map -> odom at least
+    r.wait(lambda: len(tf) >= 3, "transforms")  # at least two of odom -> lidar, and one of map -> odom
     for message in (*tf[:3], TFMessage(transforms=[transform_to_msg(np.eye(4), r.drive.stamp(1), "lidar", "wheel")])):
         other.publish(message)
     begin = len(r.diagnostics)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/topics.md is what the nodes have, and names no topic twice."""
+"""docs/topics.md describes the nodes' topics as they are, and names no topic twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "topics.md"
 
 @pytest.mark.slow
 def test_the_page_is_that_of_the_nodes(ros: Callable[..., Any]) -> None:
-    """`make topics` writes it. Without the network, which adds no topic."""
+    """`make topics` writes it. The network is not loaded, since it adds no topic."""
     ros("slam.registration:=geometric", "slam.loops.descriptors:=false", namespace="")
     found = describe()
     assert page(found) == PAGE.read_text()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moving frames at a stamp: between samples, through static links, never beyond what is known, whatever comes in."""
+"""Moving frames at a stamp: between samples, through static links, never outside the known times, for any input."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_time_that_goes_back_begins_anew_and_samples_out_of_order_are_left_out()
 
 
 def test_a_clock_that_is_set_back_by_less_than_a_second_tells_the_time() -> None:
-    """What was there at the same stamps before it was set is not there now."""
+    """Samples at the same stamps from before it was set are not used afterwards."""
     history, elsewhere = moving(*range(0, SECOND, SECOND // 20)), pose_to_msg(se3.exp([0, 0, 0, 7.0, 0, 0]))
     for k in range(4):
         before = history.lookup("odom", "base", SECOND // 2, TransformTree())[0]
@@ -108,6 +108,6 @@ def test_its_size_is_bounded() -> None:
         history.add("odom", "one_more", 0, still)
     for n in range(20_000):  # 5 kHz
         history.add("odom", "joint_0", 200_000 * n, still)
-    with pytest.raises(UsageError, match="begins"):  # the oldest are forgotten
+    with pytest.raises(UsageError, match="begins"):  # the oldest samples are deleted
         history.lookup("odom", "joint_0", 0, TransformTree())
     history.lookup("odom", "joint_0", 200_000 * 19_999, TransformTree())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes on a robot's disk: whole or not there at all, whatever becomes of the process, the disk or the file."""
+"""Keyframes on a robot's disk are complete or absent, whatever happens to the process, the disk or the file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ signal.pause()
 
 
 def killed_writer(path: Path, most: int = 0) -> None:
-    """A process that adds 50 keyframes and is killed; no file of it can be larger than `most` bytes."""
+    """A process that adds 50 keyframes and is killed; its files cannot be larger than `most` bytes."""
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(path), str(most)], stdout=subprocess.PIPE)
     assert process.stdout is not None
     line = process.stdout.readline()
@@ -79,7 +79,7 @@ def test_a_full_disk_costs_no_keyframe_and_leaves_no_gap(tmp_path: Path) -> None
 def test_a_disk_that_can_only_be_read_by_now_does_not_keep_a_node_from_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As Linux makes one that has errors. What stays is sent again, and the mapper knows it."""
+    """Linux remounts a disk with errors read-only. Remaining keyframes are sent again; the mapper recognizes them."""
     file = KeyframeFile(path := path_of(tmp_path, "", "5f3a9c01"))
     file.append([b"pose", b"descriptors", b"cloud"])
 
@@ -108,7 +108,7 @@ def test_a_file_belongs_to_one_process_and_one_robot(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_closed_meanwhile_is_opened_again(tmp_path: Path) -> None:
-    """For one that another process has had, this is an error."""
+    """If another process has opened it meanwhile, this is an error."""
     path, before = tmp_path / "drive.00000001.unsent", len(os.listdir("/proc/self/fd"))
     file = KeyframeFile(path)
     for _ in range(2):
@@ -133,7 +133,7 @@ def test_a_file_that_is_closed_meanwhile_is_opened_again(tmp_path: Path) -> None
 def test_drives_that_wait_for_the_mapper_hold_no_file_open(ros: Callable[..., Any], tmp_path: Path) -> None:
     """A looped bag, or many resets, with no mapper; then the next start. A drive without a keyframe leaves no file."""
     ros()
-    node, opened = rclpy.create_node("robot", use_global_arguments=False), []  # nothing of it is called back
+    node, opened = rclpy.create_node("robot", use_global_arguments=False), []  # its callbacks are never called
     settings = RosSettings(embed_mapper=False, map_directory=str(tmp_path))
     sender = KeyframeSender(node, "", settings)
     for _ in range(20):
@@ -157,9 +157,9 @@ def test_drives_that_wait_for_the_mapper_hold_no_file_open(ros: Callable[..., An
 def test_a_full_disk_is_said_and_what_ends_with_the_process_is_counted(
     ros: Callable[..., Any], tmp_path: Path, capfd: pytest.CaptureFixture[str], room: bool
 ) -> None:
-    """All were said to be sent at the next start, and while it drove nothing was said.
+    """All were reported as to be sent at the next start, and nothing was reported during the drive.
 
-    `room`: there is some by the end, after the last keyframe; what waited in memory was lost nevertheless.
+    `room`: the disk has room after the last keyframe; keyframes that waited in memory were lost nevertheless.
     """
     ros()
     node = rclpy.create_node("robot", use_global_arguments=False)
@@ -218,7 +218,7 @@ def test_text_in_place_of_a_message_is_an_error_when_it_is_read(tmp_path: Path) 
 
 
 def test_a_full_disk_costs_no_keyframe_without_a_file() -> None:
-    """A process that may write 1 MB of 5; for one with a file see `WRITER`."""
+    """The process may write 1 MB of 5 MB; for one with a file see `WRITER`."""
     program = """
 import os, resource, signal
 from dpm2_ros.unsent import KeyframeFile
@@ -235,7 +235,7 @@ print(sum(file.read(n) == parts for n, parts in enumerate(sent)), len(file))
 
 
 def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) -> None:
-    """It stayed in memory to the end, and was said to be sent at the next start."""
+    """It stayed in memory to the end, but was reported as to be sent at the next start."""
     path = path_of(tmp_path, "", "5f3a9c01")
     file, sent = KeyframeFile(path), [[bytes([n]), b"", os.urandom(50_000)] for n in range(30)]
     with largest_file(600_000):
@@ -254,7 +254,7 @@ def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) ->
 
 
 def test_what_holds_no_keyframe_holds_no_file() -> None:
-    """One is made with every new start of the odometry, also where nothing will be kept."""
+    """One is made with every new start of the odometry, even if nothing will be kept."""
     before = len(os.listdir("/proc/self/fd"))
     files = [KeyframeFile() for _ in range(10)]
     assert len(os.listdir("/proc/self/fd")) == before
