@@ -22,7 +22,7 @@ def test_zscore_rows() -> None:
 
 
 def test_zscore_of_constant_and_of_fully_masked_rows_is_zero() -> None:
-    """No division by a vanishing deviation."""
+    """There is no division by a vanishing deviation."""
     assert (zscore(torch.full((1, 3, 8), 0.7)).abs() < 1e-3).all()
     assert (zscore(torch.rand(1, 3, 8), torch.zeros(1, 1, 8, dtype=torch.bool)) == 0).all()
 
@@ -47,7 +47,7 @@ def test_masked_tokens_are_never_read() -> None:
 
 
 def test_attention_against_the_formula() -> None:
-    """Softmax over tokens of q.k / sqrt(d) + bias, times values, per head: what torch's own kernel computes."""
+    """Softmax over tokens of q.k / sqrt(d) + bias, times values, per head, as torch's own kernel computes it."""
     torch.manual_seed(0)
     attention = Attention(16, 4).double()
     x, tokens = torch.randn(2, 6, 16).double(), torch.randn(2, 9, 16).double()
@@ -84,7 +84,7 @@ def test_attention_gradients() -> None:
 
 
 def test_relative_bias_turns_with_the_sensor() -> None:
-    """Turning points and their axes together leaves the bias as it is: it does not know the heading."""
+    """Rotating points and their axes together does not change the bias: it does not depend on the heading."""
     torch.manual_seed(0)
     relative = RelativeBias(2, 4)
     torch.nn.init.normal_(relative.weight)
@@ -96,7 +96,7 @@ def test_relative_bias_turns_with_the_sensor() -> None:
 
 
 def test_sine_code_of_known_values() -> None:
-    """First pair of each axis is sin and cos of pi x; the width that three axes cannot fill is zero."""
+    """The first pair of each axis is sin and cos of pi x; channels that three axes cannot fill are zero."""
     code = sine_code(torch.tensor([0.5, 0.0, 1.0]), 256)
     assert code.shape == (256,)
     torch.testing.assert_close(code[[0, 1, 84, 85, 168, 169]], torch.tensor([1.0, 0, 0, 1, 0, -1]), atol=1e-6, rtol=0)

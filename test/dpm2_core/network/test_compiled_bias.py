@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Biases as machine code are those of the tensors, under autocast rounded once."""
+"""Biases from machine code equal those from tensors; under autocast they are rounded once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HALF_ULP = 2**-8  # of bfloat16, relative
 
 
 def close(found: torch.Tensor, exact: torch.Tensor, bf16: bool, atol: float) -> None:
-    """Rounded to bfloat16, if asked to, after an error of float32 that grows with the largest term of a sum."""
+    """Equal up to an error of float32 that grows with the largest term of a sum, then rounded to bfloat16 if `bf16`."""
     assert found.dtype == (torch.bfloat16 if bf16 else torch.float32)
     torch.testing.assert_close(found.float(), exact.float(), rtol=HALF_ULP if bf16 else 1e-5, atol=atol)
 
@@ -23,12 +23,12 @@ def close(found: torch.Tensor, exact: torch.Tensor, bf16: bool, atol: float) -> 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 70), st.floats(0.01, 200), st.integers(0, 2**31), st.booleans())
 def test_relative_bias_is_that_of_the_tensors(n: int, spread: float, seed: int, bf16: bool) -> None:
-    """Of any number of points, near or far, in a batch of two."""
+    """This holds for any number of points, near or far, in a batch of two."""
     torch.manual_seed(seed)
     relative = RelativeBias(2, 3)
     torch.nn.init.normal_(relative.weight)
     xyz, axis = torch.randn(2, n, 3) * spread, torch.nn.functional.normalize(torch.randn(2, n, 2), dim=-1)
-    exact = [bias.detach() for bias in relative(xyz, axis)]  # with a gradient, so by tensors
+    exact = [bias.detach() for bias in relative(xyz, axis)]  # gradients are enabled, so tensors are used
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
         found = relative(xyz, axis)
     for a, b in zip(found, exact, strict=True):
@@ -38,7 +38,7 @@ def test_relative_bias_is_that_of_the_tensors(n: int, spread: float, seed: int, 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 70), st.floats(0.01, 300), st.floats(0, 1), st.integers(0, 2**31), st.booleans())
 def test_near_bias_is_the_zscore_of_the_decay(tokens: int, spread: float, hidden: float, seed: int, bf16: bool) -> None:
-    """Also where nothing counts, or all lie so far away that the decay vanishes."""
+    """This includes rows where no token counts, or where all are so far away that the decay vanishes."""
     torch.manual_seed(seed)
     distance, counted = torch.rand(2, 4, tokens) * spread, torch.rand(2, 4, tokens) >= hidden
     alphas = (0.1, 1.0, 6.0)
@@ -60,11 +60,11 @@ def test_training_and_other_devices_keep_to_tensors() -> None:
 @pytest.mark.parametrize("bf16", [True, False])
 @pytest.mark.parametrize("at", [0.0, 1e-3, 0.7, 40.0, 1e4])
 def test_a_single_distance(at: float, bf16: bool) -> None:
-    """The decay alone, by a bias whose only weight is that of one reach: exp(-d / 1 m)."""
+    """Only the decay, from a bias whose only weight is that of one reach: exp(-d / 1 m)."""
     weight = torch.zeros(1, compiled_bias.DIRECTIONS + compiled_bias.DISTANCES)
     weight[0, compiled_bias.DIRECTIONS] = 1
     xyz, axis = torch.tensor([[[0.0, 0, 0], [at, 0, 0]]]), torch.tensor([[[1.0, 0], [1, 0]]])
     with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
         found = compiled_bias.relative_bias(xyz, axis, weight, (1.0, 2.5, 6.0, 15.0, 40.0))[0, 0]
     exact = torch.exp(-torch.cdist(xyz[0], xyz[0]))
-    close(found, exact, bf16, atol=4e-5)  # sqrt(1e-9) of 0 m
+    close(found, exact, bf16, atol=4e-5)  # sqrt(1e-9) at 0 m

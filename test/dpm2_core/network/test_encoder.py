@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder: sizes, masks, invariances, and images that are missing."""
+"""Encoder: sizes, masks, invariances, and missing images."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def frame(cloud: np.ndarray, *images: Image) -> Frame:
 
 
 def parameters(module: torch.nn.Module) -> int:
-    """Number of them."""
+    """Number of parameters."""
     return sum(p.numel() for p in module.parameters())
 
 
@@ -64,7 +64,7 @@ def test_the_shipped_weights_are_of_the_preset_small() -> None:
 
 
 def test_unknown_preset_and_backbone_are_rejected() -> None:
-    """In one line that names the choices."""
+    """The error is one line that names the choices."""
     with pytest.raises(UsageError, match=r"network preset big: want one of small, base, paper, v1"):
         preset("big")
     with pytest.raises(UsageError, match=r"points.backbone: input should be 'pointnext', got 'kpconv'"):
@@ -89,13 +89,13 @@ def test_unknown_preset_and_backbone_are_rejected() -> None:
     ],
 )
 def test_settings_that_do_not_fit_each_other_are_named(changes: dict[str, Any], message: str) -> None:
-    """They ended in tracebacks, some at the first step of a training."""
+    """They ended in tracebacks, some of them at the first step of a training."""
     with pytest.raises(UsageError, match=f"preset small.*{message}"):
         preset("small", changes)
 
 
 def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """A scan of one point a voxel gives the same descriptors in any order of its points."""
+    """A scan with one point per voxel gives the same descriptors for any order of its points."""
     cloud = crop(boxes(noise, 1500), model.settings.points)
     one, other = (model.describe(frame(c)) for c in (cloud, noise.permutation(cloud)))
     assert np.array_equal(one.xyz, other.xyz)
@@ -103,7 +103,7 @@ def test_order_of_points_changes_nothing(model: DeepPointMap2, noise: np.random.
 
 
 def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Turned about the vertical, the same samples get the same features: what `view_aligned` promises."""
+    """If the scan is rotated about the vertical, the same samples get the same features, as `view_aligned` requires."""
     pyramid = build_pyramid(boxes(noise, 1500), model.settings)
     R = se3.exp([0, 0, 2.1, 0, 0, 0])[:3, :3].astype(np.float32)
     turned = replace(pyramid, xyz=pyramid.xyz @ R.T, patches=(pyramid.patches @ R.T).astype(np.float16))
@@ -112,7 +112,7 @@ def test_heading_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
 
 
 def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """A sparse scan encodes alike alone and in a batch with a full one; its padding is masked."""
+    """A sparse scan has the same encoding alone and in a batch with a full one; its padding is masked."""
     settings = model.settings
     sparse, full = build_pyramid(boxes(noise, 100)[:40], settings), build_pyramid(boxes(noise), settings)
     alone = model.encoder(collate([sparse])).tokens
@@ -120,7 +120,7 @@ def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
     assert together.mask.sum(1).tolist() == [48, 40]
     torch.testing.assert_close(together.features[1], alone.features[0], atol=1e-5, rtol=0)
     poisoned = sparse.xyz.copy()
-    poisoned[sparse.count :] = 1e3  # the values of padding are not read either
+    poisoned[sparse.count :] = 1e3  # the values of padding are not read, either
     changed = replace(sparse, xyz=poisoned)
     torch.testing.assert_close(
         model.encoder(collate([changed])).tokens.features[0, :40], alone.features[0, :40], atol=1e-5, rtol=0
@@ -128,7 +128,7 @@ def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
 
 
 def test_a_result_that_is_not_finite_is_an_error(noise: np.random.Generator) -> None:
-    """As of a library that leaves parts of its results unwritten, or of damaged weights."""
+    """As from a library that does not write parts of its results, or from damaged weights."""
     broken = DeepPointMap2(tiny()).eval()
     with torch.no_grad():
         next(broken.encoder.parameters()).fill_(torch.nan)
@@ -138,7 +138,7 @@ def test_a_result_that_is_not_finite_is_an_error(noise: np.random.Generator) -> 
 
 @pytest.mark.parametrize("beams", [16, 32])
 def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams: int) -> None:
-    """Few beams give finite descriptors."""
+    """With few beams, the descriptors are finite."""
     azimuth = np.linspace(-np.pi, np.pi, 100)
     elevation = np.radians(np.linspace(-15, -3, beams))[:, None]
     reach = 1.7 / np.tan(-elevation)
@@ -148,7 +148,7 @@ def test_sparse_sensors(model: DeepPointMap2, noise: np.random.Generator, beams:
 
 @pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((50, 3), np.nan), np.zeros((500, 3)), np.ones((5, 3)) * 9])
 def test_empty_scans_are_rejected(model: DeepPointMap2, cloud: np.ndarray) -> None:
-    """Nothing in range: an error that says how much there was."""
+    """If no points are in range, an error reports how many there were."""
     with pytest.raises(Dpm2Error, match=r"scan has \d+ points within"):
         model.describe(frame(cloud))
 
@@ -161,7 +161,7 @@ def views_of(model: DeepPointMap2, *frames: list[Image]) -> Views:
 
 
 def test_missing_image_equals_no_camera(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Exactly: in a batch whose other frame has an image, the one without gives what the LiDAR alone gives."""
+    """Exactly: in a batch in which only the other frame has an image, the result equals that of the LiDAR alone."""
     pyramid = build_pyramid(boxes(noise), model.settings)
     alone = model.encoder(collate([pyramid])).tokens.features
     both = model.encoder(collate([pyramid, pyramid]), views_of(model, [], [make_image(noise)])).tokens.features
@@ -170,7 +170,7 @@ def test_missing_image_equals_no_camera(model: DeepPointMap2, noise: np.random.G
 
 
 def test_only_reference_points_in_view_read_the_image(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """With one fusion layer, what lies behind the camera does not depend on the pixels."""
+    """With one fusion layer, points behind the camera do not depend on the pixels."""
     pyramid = build_pyramid(boxes(noise), model.settings)
     points = collate([pyramid])
     one, other = (model.encoder(points, views_of(model, [make_image(noise)])).tokens for _ in range(2))
@@ -190,7 +190,7 @@ def test_several_cameras(model: DeepPointMap2, noise: np.random.Generator) -> No
 
 
 def test_two_cameras_do_not_disturb_each_other(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """With one fusion layer: what one shows is described as by that one alone, the rest as by the LiDAR alone."""
+    """With one fusion layer, points in one image are described as with that image alone, others as by LiDAR alone."""
     points = collate([build_pyramid(boxes(noise), model.settings)])
     ahead, other = make_image(noise), make_image(noise)
     turned = np.diag([-1.0, -1, 1, 1]) @ other.camera.T_lidar_cam
@@ -211,7 +211,7 @@ def test_two_cameras_do_not_disturb_each_other(model: DeepPointMap2, noise: np.r
 )
 @pytest.mark.parametrize("reference", ["fps", "uniform", "normal"])
 def test_alternatives_of_the_ablations(noise: np.random.Generator, kind: str, reference: str) -> None:
-    """Every choice of Tables 3 and 4 runs, uses the image, and gives each parameter of its own a gradient."""
+    """Every choice of Tables 3 and 4 runs, uses the image, and gives each of its parameters a gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": kind, "reference": reference}))
     points = collate([build_pyramid(boxes(noise), model.settings)])
@@ -225,8 +225,8 @@ def test_alternatives_of_the_ablations(noise: np.random.Generator, kind: str, re
 
 
 def test_a_painted_cloud_carries_the_color_of_its_pixel(noise: np.random.Generator) -> None:
-    """Points ahead have that of a red image, the others none; untrained, it changes no feature, then it does, and a
-    missing image is as one that shows no point."""
+    """Points ahead have the color of a red image, the others none. Before training it changes no feature, later it
+    does. A missing image is treated as one in which no point is visible."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"kind": "point_painting"})).eval()
     cloud = boxes(noise)
@@ -254,7 +254,7 @@ def test_a_painted_cloud_carries_the_color_of_its_pixel(noise: np.random.Generat
 
 
 def test_argmax_neighbor() -> None:
-    """The index that `amax` would choose, in bf16 and float32, negative values included."""
+    """It equals the index that `amax` would choose, in bf16 and float32, including negative values."""
     torch.manual_seed(0)
     for dtype in (torch.bfloat16, torch.float32):
         sums = (torch.randn(2, 9, 24, 8) - 1).to(dtype)
@@ -264,7 +264,8 @@ def test_argmax_neighbor() -> None:
 
 
 def test_the_feature_of_the_own_pixel_begins_as_nothing(noise: np.random.Generator) -> None:
-    """At first a network with it is the network without, and stays so where no view sees; several are averaged."""
+    """At first the network equals one without it, and always where no view sees the point; several views are
+    averaged."""
     torch.manual_seed(0)
     features = [FeatureMap(torch.randn(2, 8, 4, 6), 8)]
     T = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]).expand(1, 2, 4, 4).clone()
@@ -287,7 +288,7 @@ def test_the_feature_of_the_own_pixel_begins_as_nothing(noise: np.random.Generat
 
 @pytest.mark.parametrize("pool_first", [True, False])
 def test_inference_gives_what_training_gives(noise: np.random.Generator, pool_first: bool) -> None:
-    """The loops over neighbors as machine code equal those in torch to the rounding of float32, for a batch, too."""
+    """The loops over neighbors in machine code equal those in torch to the rounding of float32, also for a batch."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(points={"pool_first": pool_first})).eval()
     points = collate([build_pyramid(boxes(noise), model.settings) for _ in range(2)])
@@ -303,7 +304,7 @@ def test_inference_gives_what_training_gives(noise: np.random.Generator, pool_fi
 @pytest.mark.parametrize("cameras", [1, 2])
 @pytest.mark.parametrize("image_mask", ["view", "front"])
 def test_only_what_an_image_shows_is_asked_about_it(noise: np.random.Generator, cameras: int, image_mask: str) -> None:
-    """At inference; the descriptors are those of asking all, also where no point is seen."""
+    """At inference, only points in view query the image; the descriptors equal those of querying with all points."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(fusion={"image_mask": image_mask})).eval()
     points = collate([build_pyramid(boxes(noise), model.settings)])

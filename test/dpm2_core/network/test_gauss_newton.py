@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled solve of inference beside that of torch, which has gradients."""
+"""The compiled solver for inference compared with the one in torch, which has gradients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def noisy(noise: np.random.Generator) -> tuple[Correspondences, torch.Tensor]:
 
 
 def test_equals_the_solve_in_torch_to_rounding(noise: np.random.Generator) -> None:
-    """Both in double precision, so that only the order of sums differs; 8 steps and the conditioning multiply that."""
+    """Both use double precision, so only the order of sums differs; 8 steps and the conditioning amplify the
+    difference."""
     for _ in range(20):
         pairs, start = noisy(noise)
         T, information = weighted_gauss_newton(start, pairs)

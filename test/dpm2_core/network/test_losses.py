@@ -20,7 +20,7 @@ from dpm2_core.network.losses import (
 
 
 def test_labels_of_a_hand_made_case() -> None:
-    """Nearest within 1 m is positive, others within are near, padding is infinitely far; both directions."""
+    """The nearest within 1 m is positive, others within 1 m are near, padding is infinitely far; in both directions."""
     source = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [9, 9, 9]]])
     target = torch.tensor([[[0.0, 0.4, 1], [0, 0.9, 1], [5, 3, 1], [9, 9, 10]]])
     up = torch.eye(4)[None].clone()
@@ -40,12 +40,12 @@ def test_info_nce_value(neutral_is_negative: bool) -> None:
     scores = torch.tensor([[[2.0, 1.0, 0.0]]])
     e = math.exp
     forward = -math.log(e(2) / (e(2) + (e(1) if neutral_is_negative else 0) + 1))
-    # back: the first two targets have the only source as positive, and no competitor
+    # backward: the first two targets have the only source as positive, and no competitor
     assert info_nce(scores, labels, neutral_is_negative).item() == pytest.approx(forward / 2, rel=1e-5)
 
 
 def test_losses_without_positives_are_zero_and_differentiable() -> None:
-    """Nothing in common: zero, and finite gradients."""
+    """Without any common points the loss is zero, with finite gradients."""
     labels = label_distances(torch.full((2, 3, 4), 9.0), 1.0)
     scores = torch.randn(2, 3, 4, requires_grad=True)
     residual = torch.zeros(5, 3, requires_grad=True)
@@ -59,17 +59,17 @@ def test_losses_without_positives_are_zero_and_differentiable() -> None:
 
 
 def test_mahalanobis_weighs_by_the_spread_of_the_batch() -> None:
-    """Below 4 residuals it is the mean length; else every direction counts by its spread in the batch."""
+    """Below 4 residuals it is the mean length; otherwise every direction is weighted by its spread in the batch."""
     few = torch.tensor([[3.0, 4, 0], [0, 0, 1]])
     assert mahalanobis_offset(few, torch.ones(2)).item() == pytest.approx(3, rel=1e-4)
     torch.manual_seed(0)
     many = torch.randn(4000, 3) * torch.tensor([0.1, 1.0, 5.0])
-    # the mean of the chi distribution with 3 degrees of freedom is 1.596; 4000 draws give it to 2 %
+    # the mean of the chi distribution with 3 degrees of freedom is 1.596; 4000 samples give it to 2 %
     assert mahalanobis_offset(many, torch.ones(4000)).item() == pytest.approx(1.596, rel=0.02)
 
 
 def test_student_loss_is_least_at_the_true_precision() -> None:
-    """Over a scale of predicted precision the loss has its minimum where the residuals were drawn."""
+    """As a function of the scale of the precision, the loss is least at the scale from which residuals were drawn."""
     torch.manual_seed(0)
     sigma = torch.tensor([0.1, 1.0, 0.5])
     chi = torch.distributions.Chi2(3.0).sample((20000, 1))
@@ -94,7 +94,7 @@ def test_loss_gradients() -> None:
 
 
 def test_overlap_label_is_twenty_meters() -> None:
-    """A certain and right prediction costs nothing, a certain and wrong one its logit."""
+    """A confident correct prediction costs nothing, a confident wrong one its logit."""
     distance = torch.tensor([20.0, 20.1])
     assert overlap_loss(torch.tensor([9.0, -9.0]), distance, OVERLAP).item() < 1e-3
     assert overlap_loss(torch.tensor([-9.0, 9.0]), distance, OVERLAP).item() == pytest.approx(9, abs=1e-3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packed drives and networks of another crop or image size: cropped anew where that is less, else an error."""
+"""Packed drives and networks with another crop or image size: cropped again if that keeps less, otherwise an error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def raw_cloud() -> np.ndarray:
 
 @pytest.mark.parametrize("change", [{"voxel": 0.7}, {"near": 6.0}, {"far": 15.0}], ids=["voxel", "near", "far"])
 def test_a_cloud_cropped_anew_is_like_one_that_was_never_packed(change: dict[str, float]) -> None:
-    """As many points within 3 %, the same bounds, and no side of a voxel preferred: 2 cm of a mean are chance."""
+    """The number of points is equal within 3 %, the bounds are equal, and no side of a voxel is preferred (2 cm:
+    noise)."""
     cloud = raw_cloud()
     points = PointsSettings(**change)
     anew, direct = cropped_anew(crop(cloud, PointsSettings()), points), crop(cloud, points)
@@ -50,8 +51,8 @@ def test_a_cloud_cropped_anew_is_like_one_that_was_never_packed(change: dict[str
 
 
 def test_a_network_with_a_coarser_grid_learns_and_is_measured_on_it(packed: Path) -> None:
-    """What it sees in use: it learned and was measured on the grid of the packed drive, so that no grid made any
-    difference before it drove."""
+    """That is the grid in use. Before, it was trained and evaluated on the grid of the packed drive, so that no grid
+    made a difference until the network drove."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, workers=0)
     coarse = tiny(points={"voxel": 6.0})
     learned, measured = [], []
@@ -89,7 +90,7 @@ def test_a_network_that_wants_more_than_was_packed_is_an_error(packed: Path, cha
 
 
 def test_a_drive_says_how_it_was_cropped(samples: list[Sample], tmp_path: Path) -> None:
-    """One that was packed for a coarser network lacks points of the usual one."""
+    """A drive that was packed for a coarser network lacks points for the usual one."""
     write_packed(tmp_path / "world", samples, {"crop": {"near": 1.0, "far": 60.0, "voxel": 0.6}})
     settings = DataSettings(packed={str(tmp_path): 1.0})
     with pytest.raises(UsageError, match=r"world: packed with points\.voxel 0\.6, the network has 0\.3"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From correspondences to a pose, and the decoder around it."""
+"""The pose from correspondences, and the decoder around it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ...helpers.networks import described
 
 
 def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tuple[Correspondences, torch.Tensor]:
-    """Matches without error, and the pose."""
+    """Matches without error, and their pose."""
     T = torch.from_numpy(se3.exp(noise.normal(0, 1, (batch, 6)) * [0.3, 0.3, 2, 5, 5, 1]))
     source = torch.from_numpy(noise.normal(0, 15, (batch, 2 * pairs, 3)))
     root = torch.from_numpy(noise.normal(0, 1, (batch, 2 * pairs, 3, 3))).tril()
@@ -40,7 +40,8 @@ def perfect(noise: np.random.Generator, batch: int = 2, pairs: int = 60) -> tupl
 
 
 def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None:
-    """Weighted SVD to rounding; the precision-weighted solve stays there and gets there from 0.3 rad and 2 m off."""
+    """Weighted SVD to rounding; the precision-weighted solver stays there and converges to it from 0.3 rad and 2 m
+    off."""
     pairs, T = perfect(noise)
     found, _ = robust_kabsch(pairs, supporting(pairs, first_pose(pairs)))
     torch.testing.assert_close(found, T, atol=1e-6, rtol=0)
@@ -49,7 +50,7 @@ def test_perfect_matches_give_the_exact_pose(noise: np.random.Generator) -> None
 
 
 def test_outliers_are_left_out(noise: np.random.Generator) -> None:
-    """A fifth of the matches off by tens of meters, with low confidence, moves neither solution by a millimeter."""
+    """A fifth of the matches is off by tens of meters, with low confidence: neither solution moves by a millimeter."""
     pairs, T = perfect(noise)
     wrong = torch.arange(pairs.source.shape[1]) % 5 == 0
     target = torch.where(
@@ -62,7 +63,7 @@ def test_outliers_are_left_out(noise: np.random.Generator) -> None:
 
 
 def test_the_papers_start_trusts_the_most_confident(noise: np.random.Generator) -> None:
-    """Right while those are right, however wrong the rest is; and lost where they are wrong, as a consensus is not."""
+    """It is correct if those are, however wrong the rest is. It fails if they are wrong, where a consensus does not."""
     pairs, T = perfect(noise)
     right = torch.arange(pairs.source.shape[1]) % 12 < 7  # 70 of 120, in both halves
     target = torch.where(
@@ -78,12 +79,12 @@ def test_the_papers_start_trusts_the_most_confident(noise: np.random.Generator) 
     assert ((lost - T)[:, :3, 3].norm(dim=1) > 1).all()
     torch.testing.assert_close(first_pose(misled), T, atol=1e-3, rtol=0)
     few = Correspondences(*(field[:, :40] for field in pairs))
-    assert most_confident(few).all()  # fewer than it would start from
+    assert most_confident(few).all()  # fewer than it would start with
 
 
 @pytest.mark.parametrize("wrong", [0.5, 0.7])
 def test_consensus_survives_a_majority_of_wrong_matches(noise: np.random.Generator, wrong: float) -> None:
-    """Wrong matches as confident as the right ones, to anywhere in the scene: right ones within 0.2 m decide."""
+    """Wrong matches are as confident as the right ones, to anywhere in the scene: right ones within 0.2 m decide."""
     pairs, T = perfect(noise, batch=4, pairs=100)
     bad = torch.from_numpy(noise.random(pairs.weight.shape) < wrong)
     anywhere = transform(T, torch.from_numpy(noise.normal(0, 15, pairs.target.shape)))
@@ -93,13 +94,14 @@ def test_consensus_survives_a_majority_of_wrong_matches(noise: np.random.Generat
     result = first_pose(pairs._replace(target=target))
     for estimate, truth in zip(result.numpy(), T.numpy(), strict=True):
         error = se3.way(truth, estimate)
-        assert np.linalg.norm(error[3:]) < 0.3  # 0.1 m of noise a point, some thirty right matches
+        assert np.linalg.norm(error[3:]) < 0.3  # 0.1 m of noise per point, some thirty correct matches
         assert np.linalg.norm(error[:3]) < 0.03
 
 
 def test_alternatives_are_other_poses_with_the_most_matches_first(noise: np.random.Generator) -> None:
-    """Of two motions that agree, the one of the fewer and more confident matches is the consensus, the other one the
-    first alternative; none is given twice, and where no other motion is agreed on for long, the known one fills up."""
+    """Of two consistent motions, the consensus is the one with fewer, more confident matches, and the other is the
+    first alternative. No motion is given twice; if no other motion has enough matches, the known one fills up the
+    rest."""
     pairs, T = perfect(noise, pairs=100)
     other = torch.from_numpy(se3.exp([0, 0, 2.5, 12, -7, 0.4]))
     source, target, weight = pairs.source[:, :100].clone(), pairs.target[:, :100].clone(), torch.full((2, 100), 0.1)
@@ -122,7 +124,7 @@ def test_alternatives_of_matches_without_weight_are_the_known_pose(noise: np.ran
 
 
 def test_guidance_leaves_what_the_pose_brings_together() -> None:
-    """Descriptors that come to lie far apart cannot match; among the near ones the scores decide, as before."""
+    """Descriptors that the pose moves far apart cannot match; among near ones the scores decide, as before."""
     xyz = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]])
     tokens = Tokens(xyz, torch.zeros(1, 3, 4), torch.zeros(1, 3, 2), torch.ones(1, 3, dtype=torch.bool))
     scores = torch.rand(1, 3, 3)
@@ -133,7 +135,8 @@ def test_guidance_leaves_what_the_pose_brings_together() -> None:
 
 
 def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) -> None:
-    """Points on planes, matched anywhere along them: useless to the SVD, exact with precision across the planes."""
+    """Points on planes are matched anywhere along them: unusable for the SVD, exact with the precision across the
+    planes."""
     pairs, T = perfect(noise, batch=1, pairs=150)
     n = pairs.source.shape[1]
     normal = torch.nn.functional.normalize(torch.from_numpy(noise.normal(0, 1, (n, 3))), dim=-1)
@@ -158,8 +161,9 @@ def test_precision_tells_which_direction_to_trust(noise: np.random.Generator) ->
 
 
 def test_a_majority_that_errs_together_does_not_pull_the_solve_away(noise: np.random.Generator) -> None:
-    """As in a tunnel: three quarters of the pairs agree on 2 m less along it, all as sure as the others. From the pose
-    of the others the solve moves by less than their deviation of 0.3 m over the root of their number."""
+    """As in a tunnel: three quarters of the pairs agree on 2 m less along it, with the same precision as the others.
+    From the pose of the others, the solution moves by less than their deviation of 0.3 m over the root of their
+    number."""
     pairs, T = perfect(noise, batch=1, pairs=160)
     together = torch.arange(pairs.source.shape[1]) % 4 != 0
     target = torch.where(together[:, None], pairs.target + torch.tensor([2.0, 0, 0]).double(), pairs.target)
@@ -183,7 +187,7 @@ def test_jacobian_of_the_residuals(noise: np.random.Generator) -> None:
 
 
 def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None:
-    """T' = A T B^-1 when the target moves by A and the source by B, to 1e-4."""
+    """T' = A T B^-1 if A moves the target and B moves the source, to 1e-4."""
     pairs, _ = perfect(noise)
     pairs = pairs._replace(
         target=pairs.target + torch.from_numpy(noise.normal(0, 0.2, pairs.target.shape)),
@@ -202,7 +206,7 @@ def test_moving_both_clouds_moves_the_answer(noise: np.random.Generator) -> None
 
 @pytest.mark.parametrize(("n", "m", "k"), [(256, 256, 128), (256, 512, 192), (3, 2, 1), (1, 1, 0)])
 def test_number_of_pairs(n: int, m: int, k: int) -> None:
-    """floor(0.5 (M + N)) // 2 of the most probable, in descending order; beside a larger set as many as alone."""
+    """floor(0.5 (M + N)) // 2 of the most probable, in descending order; next to a larger set, as many as alone."""
     probability, masks = torch.rand(2, n, m), (torch.ones(2, n, dtype=torch.bool), torch.ones(2, m, dtype=torch.bool))
     value, row, column = best_pairs(probability, *masks, 0.5)
     assert value.shape == (2, k)
@@ -228,7 +232,7 @@ def test_dual_softmax_at_padding_is_zero() -> None:
 
 
 def test_view_frames_are_inverse() -> None:
-    """Offsets and precisions go into the set's frame and back; R L has the covariance R C R^T."""
+    """Offsets and precisions are transformed into the set's frame and back; R L has the covariance R C R^T."""
     axis = torch.nn.functional.normalize(torch.randn(7, 2), dim=-1)
     vectors = torch.randn(7, 3)
     torch.testing.assert_close(to_view(from_view(vectors, axis), axis), vectors)
@@ -244,7 +248,7 @@ def test_view_frames_are_inverse() -> None:
 
 
 def test_offset_head_starts_without_offset() -> None:
-    """Zero offset and a deviation of half a meter, whatever the features; a valid triangle always."""
+    """The offset is zero and its deviation half a meter, for any features; the triangle is always valid."""
     head = OffsetHead(32, precision=True)
     offset, L = head(torch.randn(5, 32), torch.randn(5, 32))
     assert (offset == 0).all()
@@ -256,7 +260,8 @@ def test_offset_head_starts_without_offset() -> None:
 def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
     model: DeepPointMap2, noise: np.random.Generator
 ) -> None:
-    """Before the decoder has seen them: also where half of them are others; sets of one descriptor agree on nothing."""
+    """This holds before the decoder is applied, also if half of them differ; sets of one descriptor have no
+    agreement."""
     here, elsewhere, one = described(model, noise, 60), described(model, noise, 60), described(model, noise, 1)
     moved = here.moved(se3.exp([0, 0, 2.0, 9, -4, 0.2]))
     half = Descriptors.of(
@@ -265,14 +270,14 @@ def test_descriptors_of_one_place_agree_on_a_motion_and_others_do_not(
     )
     same, partly, other = model.agreement(here, [moved, half, elsewhere])
     assert same == 1
-    assert partly >= 0.9  # the pairs are half as many as the descriptors, the best first
+    assert partly >= 0.9  # only half as many pairs as descriptors are used, the best first
     assert other < 0.3
     assert model.agreement(one, [one]) == [0]
     assert model.agreement(here, []) == []
 
 
 def test_swapping_the_heading_frame_of_a_set_changes_nothing(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Correlated descriptors do not depend on the frame that a set is given in: no prior pose is needed."""
+    """Correlated descriptors do not depend on the frame in which a set is given: no prior pose is needed."""
     a, b = described(model, noise, 48), described(model, noise, 48)
     moved = b.moved(se3.exp([0, 0, 2.5, 12, -7, 0.4]))
     tokens = to_tokens([a], True)

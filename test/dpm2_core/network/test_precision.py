@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""bf16 where the processor multiplies it, float32 elsewhere, and both give the same poses."""
+"""bf16 if the processor can multiply it, otherwise float32; both give the same poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(autouse=True)
 def forgotten() -> Any:
-    """What the processor has is asked once per process."""
+    """The processor's features are read once per process; forget them around each test."""
     precision.multiplies_bf16.cache_clear()
     yield
     precision.multiplies_bf16.cache_clear()
@@ -33,7 +33,7 @@ def processor(monkeypatch: pytest.MonkeyPatch, *features: str) -> None:
 
 @pytest.mark.parametrize("features", [("avx512f", "avx512bf16"), ("amx-bf16",), ("neon", "bf16")])
 def test_bf16_is_used_where_the_processor_has_it(monkeypatch: pytest.MonkeyPatch, features: tuple[str, ...]) -> None:
-    """And training may still ask for float32."""
+    """Training can still request float32."""
     processor(monkeypatch, *features)
     with precision.mixed_precision(CPU):
         assert torch.is_autocast_enabled("cpu")
@@ -43,14 +43,15 @@ def test_bf16_is_used_where_the_processor_has_it(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("features", [("avx2",), ("avx2", "avx512f", "avx512bw"), ("neon",)])
 def test_elsewhere_float32(monkeypatch: pytest.MonkeyPatch, features: tuple[str, ...]) -> None:
-    """Desktop processors, and servers from before 2020."""
+    """These are desktop processors, and servers from before 2020."""
     processor(monkeypatch, *features)
     with precision.mixed_precision(CPU):
         assert not torch.is_autocast_enabled("cpu")
 
 
 def test_both_give_the_same_poses(monkeypatch: pytest.MonkeyPatch, recording: Path) -> None:
-    """The shipped weights on frames 5 m apart, as learned in bf16; a map described in one is used by the other."""
+    """The shipped weights on frames 5 m apart, trained in bf16: maps described in one format are usable in the
+    other."""
     network, frames = load_network("small", 1), list(KittiSource(recording / "sequences" / "00").frames())[:12:6]
     described, poses = {}, {}
     for name in ("avx2", "avx512bf16"):
@@ -62,5 +63,5 @@ def test_both_give_the_same_poses(monkeypatch: pytest.MonkeyPatch, recording: Pa
         assert result.ok
         poses[target] = result.T_target_source
     difference = se3.way(poses["avx2"], poses["avx512bf16"])
-    assert np.linalg.norm(difference[3:]) < 0.02  # m; the error of a pose is about as large
+    assert np.linalg.norm(difference[3:]) < 0.02  # m; similar to the error of a pose
     assert np.degrees(np.linalg.norm(difference[:3])) < 0.1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weights of one file are in the memory of a process once, however many parts of the SLAM use them."""
+"""The weights of a file are in the memory of a process once, however many parts of the SLAM use them."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
 
 
 def test_a_file_that_changed_is_loaded_again(network_file: Path, model: DeepPointMap2, opened: Counter[str]) -> None:
-    """And the networks that are in use stay as they are."""
+    """Networks that are already in use do not change."""
     one, same = load_network(str(network_file), 1), load_network(str(network_file), 1)
     with torch.no_grad():
         next(model.parameters()).add_(1)
@@ -100,14 +100,14 @@ def test_a_link_to_the_file_and_a_relative_path_are_the_same_file(
 
 
 def test_what_one_user_registered_to_is_not_given_to_another(network_file: Path, noise: np.random.Generator) -> None:
-    """A network keeps its part of the work on the last target; the SLAM has one per thread."""
+    """A network caches its part of the work on the last target; the SLAM has one network per thread."""
     one, other = load_network(str(network_file), 1), load_network(str(network_file), 1)
     assert one is not other
     assert next(one.parameters()) is next(other.parameters())
 
 
 def test_weights_of_another_network_are_rejected_though_the_file_is_loaded(network_file: Path) -> None:
-    """What one loader has loaded is not given to another one."""
+    """A network from one loader is not returned by another loader."""
     load_network(str(network_file), 1)
     with pytest.raises(UsageError, match="not of movers"):
         load_once(network_file, 1, dynamic_objects.load)
@@ -118,7 +118,7 @@ def test_weights_of_another_network_are_rejected_though_the_file_is_loaded(netwo
 @pytest.mark.slow
 @pytest.mark.skipif(torch.__version__.startswith("2.6."), reason="that version imports them for any weights")
 def test_loading_does_not_import_the_compiler_of_torch() -> None:
-    """torch._dynamo and sympy take 2 s at the start of every node and command that has a network."""
+    """torch._dynamo and sympy would add 2 s to the start of every node and command with a network."""
     program = (
         "import sys; from dpm2_core.network.pretrained import load_network; load_network('small', 1); "
         "sys.exit(', '.join({'torch._dynamo', 'sympy'} & set(sys.modules)) or 0)"
@@ -128,7 +128,7 @@ def test_loading_does_not_import_the_compiler_of_torch() -> None:
 
 
 def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPointMap2, tmp_path: Path) -> None:
-    """Of a new decoder the descriptors are the same; maps with them had been those of other weights."""
+    """With a new decoder the descriptors are the same, but their maps were treated as made with other weights."""
     file = tmp_path / "tiny.safetensors"
     save_weights(model, file, {})
     before = weights_id(str(file))
@@ -141,7 +141,7 @@ def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPoint
 
 
 def test_the_encoder_of_another_network_is_another_one(tmp_path: Path) -> None:
-    """The same tensors, and other settings of what is made of a scan."""
+    """The tensors are the same, but the settings for processing a scan differ."""
     torch.manual_seed(0)
     network, file = DeepPointMap2(tiny()), tmp_path / "tiny.safetensors"
     save_weights(network, file, {})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pyramid of a scan with images: corners of them among its reference points, each with its texture."""
+"""The pyramid of a scan with images: image corners among its reference points, each with its texture."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def network(corners: float) -> NetworkSettings:
 
 
 def test_corners_are_spread_among_the_reference_points() -> None:
-    """A half of them here, in every prefix, and each with a texture of unit length; the others have none."""
+    """They are half of them here, in every prefix, each with a texture of unit length; the others have none."""
     settings = network(0.5)
     pyramid = build_pyramid(scan(2.0, 0), settings, [image(PAINT, 2.0)])
     length = np.linalg.norm(pyramid.texture.astype(float), axis=1)
@@ -34,7 +34,7 @@ def test_corners_are_spread_among_the_reference_points() -> None:
 
 
 def test_they_are_where_two_scans_see_the_same() -> None:
-    """1 m farther on a wall without a shape, corners meet again, and the other reference points do not."""
+    """1 m farther along a wall without structure, corners are found again; the other reference points are not."""
     here, there = (build_pyramid(scan(x, round(x)), network(0.5), [image(PAINT, x)]) for x in (2.0, 3.0))
     n = len(here.texture)
     apart = np.linalg.norm((here.xyz[:n] - np.float32([1, 0, 0]))[:, None] - there.xyz[None, :n], axis=-1).min(1)
@@ -53,14 +53,14 @@ def test_without_an_image_or_the_setting_or_a_camera_there_are_none() -> None:
 
 
 def test_two_cameras_share_them() -> None:
-    """Each gives half as many; their order does not matter for how many."""
+    """Each gives half of the corners; the order of the cameras does not change the number."""
     both = [image(PAINT, 2.0), image(paint(1), 2.0)]
     texture = build_pyramid(scan(2.0, 0), network(0.5), both).texture
     assert texture.any(1).sum() == network(0.5).fusion.points // 2
 
 
 def test_a_scan_of_fewer_points_than_references() -> None:
-    """Its corners are a half of what it has."""
+    """At most half of its points are corners."""
     cloud = scan(2.0, 0)
     nearest = cloud[np.argsort(np.linalg.norm(cloud - np.float32([8, 6, 0]), axis=1))[:40]]
     pyramid = build_pyramid(nearest, network(0.5), [image(PAINT, 2.0)])
@@ -70,7 +70,7 @@ def test_a_scan_of_fewer_points_than_references() -> None:
 
 
 def test_the_texture_is_in_the_descriptor() -> None:
-    """Of a corner, and of no other reference point: with the same points, another texture changes its row alone."""
+    """Only a corner has one: with the same points, another texture changes only that corner's row."""
     torch.manual_seed(0)
     settings = network(0.5)
     encoder = Encoder(settings).eval()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From solved poses to registrations: what is a result, and how probable it is."""
+"""From solved poses to registrations: which are accepted, and their probability."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ...helpers.networks import described, tiny
 
 
 def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """A batch gives what its members alone give: frames, merged maps and sparse scans together."""
+    """A batch gives the same results as its members alone: frames, merged maps and sparse scans together."""
     T = se3.exp(noise.normal(0, 1, 6))
     frames = [described(model, noise, 48) for _ in range(3)]
     part = replace(frames[2], **{name: getattr(frames[2], name)[:30] for name in ("xyz", "features", "step")})
@@ -35,13 +35,13 @@ def test_registration_of_sets_of_different_sizes(model: DeepPointMap2, noise: np
         assert 0 <= result.confidence <= 1
         assert result.method == "neural"
         alone = model.register(source, target)
-        # padding adds columns to products, in bf16 with rounding
+        # padding adds columns to products, which bf16 rounds differently
         np.testing.assert_allclose(alone.T_target_source, result.T_target_source, atol=0.02)
         assert alone.confidence == pytest.approx(result.confidence, abs=0.05)
 
 
 def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Also where nothing fits and the solver has gone far diverged: a map keeps rejected loops, too."""
+    """This includes cases where nothing matches and the solver has diverged far: a map keeps rejected loops, too."""
     for scale in (1, 10, 100):
         sets = [described(model, noise, 90) for _ in range(12)]
         sets = [replace(d, xyz=d.xyz * np.float32(scale)) for d in sets]
@@ -55,7 +55,8 @@ def test_every_pose_is_rigid_to_float64(model: DeepPointMap2, noise: np.random.G
 def test_other_places_are_no_registration_and_the_same_place_is_one(
     model: DeepPointMap2, noise: np.random.Generator
 ) -> None:
-    """By how many of the matched descriptors fit one motion; the pose that fits best is given in any case."""
+    """The fraction of matched descriptors that fit one motion decides; the pose that fits best is returned in any
+    case."""
     here = described(model, noise, 60)
     T = se3.exp([0, 0, 2.0, 9, -4, 0.2])
     same, other = model.register_many([here, here], [here.moved(T), described(model, noise, 60)])
@@ -68,7 +69,7 @@ def test_other_places_are_no_registration_and_the_same_place_is_one(
 
 
 def test_an_improbable_pose_is_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """However many pairs fit."""
+    """It is rejected however many pairs fit."""
     here = described(model, noise, 60)
     with torch.no_grad():
         model.decoder.confidence.bias.fill_(-100)
@@ -79,7 +80,7 @@ def test_an_improbable_pose_is_no_registration(model: DeepPointMap2, noise: np.r
 
 
 def test_the_papers_solver_wants_probable_matches(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Its robust SVD makes most pairs fit, whatever they are: how many do says nothing."""
+    """After its robust SVD most pairs fit, whatever they are: their number shows nothing."""
     model.solver = "confident"
     here = described(model, noise, 60)
     same, other = model.register_many([here, here], [here, described(model, noise, 60)])
@@ -89,7 +90,7 @@ def test_the_papers_solver_wants_probable_matches(model: DeepPointMap2, noise: n
 
 
 def test_the_overlap_head_is_told_how_much_of_a_pair_fits(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """All of a set and itself 10 m away, less than half of two others; as much in a batch with a larger set."""
+    """All of a set and itself 10 m away, less than half of two different sets; equally in a batch with a larger set."""
     here, larger = described(model, noise, 60), described(model, noise, 90)
     away = here.moved(se3.exp([0, 0, 0.4, 10, 0, 0]))
     sources, targets = [here, here, larger], [away, described(model, noise, 60), larger]
@@ -109,7 +110,7 @@ def test_the_overlap_head_is_told_how_much_of_a_pair_fits(model: DeepPointMap2, 
 
 
 def test_too_few_descriptors_are_no_registration(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """Not ok, with a reason, and no exception."""
+    """The result is not ok, with a reason, and without an exception."""
     result = model.register(described(model, noise, 1), described(model, noise, 1))
     assert not result.ok
     assert result.confidence == 0
@@ -133,7 +134,7 @@ def test_a_pose_is_the_surer_the_better_its_pairs_fit() -> None:
 
 
 def test_sets_that_stay_give_the_same_answer_again(model: DeepPointMap2, noise: np.random.Generator) -> None:
-    """What is kept of a set between calls changes nothing, and no other one is mistaken for it."""
+    """What is cached of a set between calls does not change results, and no other set is mistaken for it."""
 
     def some(n: int) -> Descriptors:
         features = noise.standard_normal((n, model.settings.channels))
@@ -145,6 +146,6 @@ def test_sets_that_stay_give_the_same_answer_again(model: DeepPointMap2, noise: 
     for a, b in zip(together, one_by_one, strict=True):
         np.testing.assert_allclose(a.confidence, b.confidence, rtol=0.05)  # bf16: batches round differently
     assert model.register(sources[0], target).confidence == one_by_one[0].confidence
-    for _ in range(3):  # more sets than are kept, and the source of one call as the target of the next
+    for _ in range(3):  # more sets than are cached, and the source of one call as the target of the next
         model.register(some(20), sources[0])
     assert model.register(sources[0], target).confidence == one_by_one[0].confidence

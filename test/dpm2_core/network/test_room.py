@@ -35,7 +35,7 @@ def enlarged(frame: Frame) -> Frame:
 def test_a_room_is_registered_to_centimeters(network: DeepPointMap2) -> None:
     target, source = (network.describe(frame) for frame in frames(np.stack([FIRST, SECOND])))
     assert target.scale == source.scale == ROOM_SCALE
-    assert np.abs(target.xyz).max() < 4  # m: in the room
+    assert np.abs(target.xyz).max() < 4  # m: in the size of the room
     found = network.register(source, target)
     meters, degrees = se3.magnitude(found.T_target_source @ se3.inverse(SECOND) @ FIRST)
     assert found.ok
@@ -45,7 +45,7 @@ def test_a_room_is_registered_to_centimeters(network: DeepPointMap2) -> None:
 
 @pytest.mark.weights
 def test_what_is_said_of_a_room_is_what_is_said_of_the_street_that_it_resembles(network: DeepPointMap2) -> None:
-    """Rotation alike, lengths and what they are uncertain by a fifth."""
+    """Rotations are equal; lengths and their uncertainty are a fifth."""
     room = frames(np.stack([FIRST, SECOND]))
     street = [enlarged(frame) for frame in room]
     assert not any(is_room(frame.points) for frame in street)

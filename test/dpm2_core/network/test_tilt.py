@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LiDAR that is mounted at an angle is registered like a level one, and meets itself from the other heading."""
+"""A LiDAR that is mounted at an angle is registered like a level one, also from the opposite heading."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def mounted(frame: Frame, T: Array) -> Frame:
 
 
 def pair_errors(root: Path, number: int, T_first: Array, T_second: Array) -> list[tuple[float, float]]:
-    """m and degrees of scans `number` apart, by the shipped network."""
+    """Errors in m and degrees of scans `number` apart, with the shipped network."""
     source, network = open_source(root), load_network("small", 1)
     frames, poses = list(source.frames(0, 25)), source.poses
     assert poses is not None
@@ -77,7 +77,7 @@ def test_the_uncertainty_of_a_tilted_pair_is_that_of_the_level_one_in_its_own_ax
     level, tilted = results
     A = se3.adjoint(se3.inverse(T))
     back = A @ tilted.covariance @ A.T
-    # Other reference points, so not the same: within a factor of 1.5, where it differs between directions by more.
+    # Other reference points, so not equal: within a factor of 1.5, while directions differ by more than that.
     np.testing.assert_allclose(np.sqrt(np.diag(back) / np.diag(level.covariance)), 1, atol=0.5)
     assert np.abs(np.linalg.slogdet(back)[1] - np.linalg.slogdet(level.covariance)[1]) < 6 * 2 * np.log(1.5)
 
@@ -88,7 +88,7 @@ def model() -> DeepPointMap2:
 
 
 def street(noise: np.random.Generator) -> np.ndarray:
-    """(N, 3) level ground and boxes on it."""
+    """(N, 3) points: level ground and boxes on it."""
     points = boxes(noise, 8000)
     return points[points[:, 2] >= -1.7]
 
@@ -114,9 +114,9 @@ def test_where_there_is_nothing_to_level_the_descriptors_are_those_of_the_scan_a
 
 
 def test_what_hangs_or_lies_by_its_mounting_is_described_as_if_it_stood(noise: np.random.Generator) -> None:
-    """By the mounting alone where no ground shows it, and by both where one does."""
+    """The mounting alone defines the level if no ground is visible, and both do if ground is visible."""
     network, standing = model(), street(noise)
-    R = np.diag([1.0, -1, -1])  # exact, so that the turned scan is the same
+    R = np.diag([1.0, -1, -1])  # exact, so that the rotated scan is the same
     plain, found = network.describe(frame(standing)), network.describe(replace(frame(standing @ R), up=(0.0, 0.0, -1)))
     np.testing.assert_array_equal(found.features, plain.features)
     np.testing.assert_array_equal(found.xyz @ R, plain.xyz)
@@ -125,7 +125,7 @@ def test_what_hangs_or_lies_by_its_mounting_is_described_as_if_it_stood(noise: n
     leaves, up = noise.normal(size=(3000, 3)) * 9, (0.6, 0.0, 0.8)
     by_mount = network.describe(replace(frame(leaves), up=up)).up
     np.testing.assert_array_equal(by_mount, np.array(up, np.float32))
-    lean = se3.exp([0.3, 0, 0, 0, 0, 0])[:3, :3]  # of the ground, such as a ramp
+    lean = se3.exp([0.3, 0, 0, 0, 0, 0])[:3, :3]  # inclination of the ground, such as a ramp
     on_a_ramp = network.describe(replace(frame(standing @ (lean @ R).T), up=(0.0, 0.0, -1))).up
     np.testing.assert_allclose(on_a_ramp, lean @ R[2], atol=0.02)
 
@@ -137,4 +137,4 @@ def test_descriptors_of_a_tilted_scan_lie_in_its_own_frame(noise: np.random.Gene
     assert found.up is not None
     np.testing.assert_allclose(found.up, lean[:, 2], atol=0.02)
     nearest = np.linalg.norm(points[None] - found.xyz[:, None], axis=2).min(1)
-    assert np.quantile(nearest, 0.4) < 1e-4  # half are points of the scan, those of its vertical edges are means
+    assert np.quantile(nearest, 0.4) < 1e-4  # half are points of the scan; those of its vertical edges are means

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images as the network reads them: at its size, without distortion, and the same when they are so already."""
+"""Images as the network reads them: at its size and undistorted; unchanged if they already are."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BARREL = (-0.3, 0.08, 0.001, -0.002)
 
 
 def test_a_distorted_image_shows_a_point_where_the_camera_says() -> None:
-    """A dot near the border, 9 pixels from where a pinhole would see it, is within half a pixel after."""
+    """A dot near the border, 9 pixels from its pinhole projection, is within half a pixel of it afterwards."""
     K = np.array([[150.0, 0, 159.5], [0, 150.0, 119.5], [0, 0, 1]])
     point = np.array([0.8, 0.5, 1.0])
     at = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), K, np.array(BARREL))[0].ravel()

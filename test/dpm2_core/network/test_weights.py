@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights: round trip, and everything that must not be loaded."""
+"""Weights: saving and loading, and everything that must not be loaded."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def saved(model: DeepPointMap2, tmp_path: Path) -> Path:
 
 
 def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
-    """A file describes its network and holds every tensor, to fp16."""
+    """A file describes its network and contains every tensor, to fp16."""
     loaded = load_model(saved)
     assert loaded.settings == model.settings
     for name, value in model.state_dict().items():
@@ -43,11 +43,11 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
 
 
 def test_the_same_weights_are_the_same_file(model: DeepPointMap2, tmp_path: Path) -> None:
-    """What is known of them stood in any order, so that equal trainings were of other weights to a map."""
+    """The metadata was written in any order, so that equal trainings counted as other weights for a map."""
     path = tmp_path / "equal.safetensors"
     about = {key: f"{key} \u00e4\n" for key in "abcdefgh"}
     files = set()
-    for keys in (about, reversed(about)):  # 10! orders: chance does not pass
+    for keys in (about, reversed(about)):  # 10! orders: a test without sorting cannot pass by chance
         save_weights(model, path, {key: about[key] for key in keys})
         files.add(path.read_bytes())
     assert len(files) == 1
@@ -56,7 +56,7 @@ def test_the_same_weights_are_the_same_file(model: DeepPointMap2, tmp_path: Path
 
 
 def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Path, tmp_path: Path) -> None:
-    """An untrained head says NaN, never a figure that would pass a gate."""
+    """An untrained head returns NaN, never a figure that would pass a gate."""
     noise = np.random.default_rng(0)
     descriptors = Descriptors.of(noise.uniform(-9, 9, (40, 3)).astype(np.float32), noise.normal(size=(40, 32)))
     save_weights(model, tmp_path / "two.safetensors", {"phase": "2"})
@@ -69,14 +69,14 @@ def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Pat
 
 
 def test_wrong_preset_is_rejected(saved: Path) -> None:
-    """With both names."""
+    """The error names both."""
     other = DeepPointMap2(tiny().model_copy(update={"preset": "huge"}))
     with pytest.raises(UsageError, match="weights of preset tiny, the network is preset huge"):
         load_weights(other, saved)
 
 
 def test_wrong_shape_under_the_right_name_is_rejected(saved: Path) -> None:
-    """Also when a whole layer is missing; nothing is loaded then."""
+    """This includes a missing layer; nothing is loaded then."""
     other = DeepPointMap2(tiny(decoder={"layers": 2}))
     before = {name: value.clone() for name, value in other.state_dict().items()}
     with pytest.raises(UsageError, match=r"does not fit preset tiny: \d+ tensors differ, such as decoder"):
@@ -90,7 +90,7 @@ class _Bomb:
 
 
 def test_a_pickle_is_rejected_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither a bare pickle nor one in torch's format."""
+    """Both a bare pickle and one in torch's format are rejected."""
     monkeypatch.chdir(tmp_path)
     Path("bare.safetensors").write_bytes(pickle.dumps(_Bomb()))
     torch.save({"x": _Bomb()}, "torch.safetensors")
@@ -101,7 +101,7 @@ def test_a_pickle_is_rejected_and_not_run(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_missing_truncated_and_foreign_files(saved: Path, tmp_path: Path) -> None:
-    """Each in one line with the path."""
+    """Each error is one line with the path."""
     with pytest.raises(UsageError, match="no such weights"):
         load_model(tmp_path / "none.safetensors")
     saved.write_bytes(saved.read_bytes()[:1000])
@@ -113,7 +113,7 @@ def test_missing_truncated_and_foreign_files(saved: Path, tmp_path: Path) -> Non
 
 
 def test_weights_that_fit_in_part(tmp_path: Path) -> None:
-    """What has the same name and shape is taken, the rest stays and is named; nothing that fits is an error."""
+    """Tensors of the same name and shape are loaded, the rest is kept and named; if nothing fits, that is an error."""
     torch.manual_seed(0)
     path = tmp_path / "a.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {}, half=False)

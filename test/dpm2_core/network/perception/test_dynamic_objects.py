@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamic objects' network: its grid against counting by hand, its size, and what it does with what is off the
-grid."""
+"""The dynamic objects' network: its grid compared with counts by hand, its size, and points outside the grid."""
 
 from __future__ import annotations
 
@@ -45,7 +44,7 @@ def test_the_height_of_the_sensor_and_the_order_of_the_points_do_not_matter() ->
     torch.manual_seed(0)
     net, points = DynamicObjectNet(SMALL).eval(), scene(np.random.default_rng(1))
     found = net.probability(points)
-    higher = points - np.float32([0, 0, 0.5, 0])  # a float's last digit may still move a point over a bound
+    higher = points - np.float32([0, 0, 0.5, 0])  # a float's last digit may still move a point over a cell's border
     assert np.mean(np.abs(net.probability(higher) - found) < 1e-5) > 0.99
     np.testing.assert_allclose(net.probability(points[::-1]), found[::-1], atol=1e-6)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GndNet: its size, its grid, labels and metrics by hand, the soft threshold, and that it learns a slope."""
+"""GndNet: its size, its grid, labels and metrics by hand, the soft threshold, and learning a slope."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SMALL = GroundSettings(cells=16, channels=8)
 
 
 def scene(seed: int = 0, slope: float = 0.05) -> tuple[Tensor, Tensor]:
-    """(600, 4) points and (600,) whether they are of the ground, which rises along x; a tenth stand up to 2 m above."""
+    """(600, 4) points and (600,) whether each is on the ground, which rises along x; a tenth is up to 2 m above it."""
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(600, 4, generator=generator) * torch.tensor([16.0, 16.0, 0.0, 1.0]) - torch.tensor(
         [8.0, 8, 0, 0]
@@ -45,7 +45,7 @@ def test_size_is_that_of_the_paper() -> None:
 
 
 def test_points_off_the_grid_or_not_finite_change_nothing() -> None:
-    """Nor does their order; a scan without points gives a finite ground."""
+    """Their order does not change it, either; a scan without points gives a finite ground."""
     torch.manual_seed(0)
     net = GroundNet(SMALL).eval()
     points, _ = scene()
@@ -72,7 +72,7 @@ def test_labels_are_means_of_the_ground_of_a_cell() -> None:
 
 
 def test_height_above_a_slope_is_exact_between_the_cells() -> None:
-    """Bilinear: a plane is a plane, with x and y in their places."""
+    """The interpolation is bilinear: a plane stays a plane, and x and y are not exchanged."""
     center = (torch.arange(16) + 0.5 - 8).double()
     elevation = 0.1 * center[:, None] - 0.2 * center[None, :]
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 14 - 7
@@ -81,12 +81,12 @@ def test_height_above_a_slope_is_exact_between_the_cells() -> None:
 
 
 def test_loss_by_hand() -> None:
-    """2 m off in known cells: smooth L1 of 1.5; unknown cells do not count; curvature alone if none is known."""
+    """2 m off in known cells: smooth L1 of 1.5; unknown cells do not count; without known cells, curvature only."""
     elevation, labels = torch.full((1, 16, 16), 2.0), torch.zeros(1, 16, 16)
     known = torch.zeros(1, 16, 16, dtype=torch.bool)
     assert float(ground_loss(elevation, labels, known, SMALL)) == 0.0
     known[0, :3] = True
-    labels[0, 5:] = torch.nan  # what is not known may be anything
+    labels[0, 5:] = torch.nan  # unknown cells may have any value
     assert float(ground_loss(elevation, labels, known, SMALL)) == pytest.approx(0.9 * 1.5)
     bent = elevation.clone()
     bent[0, 8, 8] += 1.0  # second differences 1, -2, 1 along each axis, of 14 * 16 of them
@@ -94,7 +94,8 @@ def test_loss_by_hand() -> None:
 
 
 def test_metrics_by_hand() -> None:
-    """A flat ground known exactly is perfect; 30 cm too low, all of it is obstacle; without a class, not counted."""
+    """A flat ground known exactly is perfect; 30 cm too low, all of it is an obstacle; points without a class do not
+    count."""
     points, ground = scene(slope=0.0)
     everything = torch.ones(600, dtype=torch.bool)
     flat = torch.full((16, 16), -1.733)
@@ -111,8 +112,8 @@ def test_metrics_by_hand() -> None:
 
 
 def test_the_authors_figures_are_of_the_ground_and_count_points_from_one() -> None:
-    """Four points of ground 0.5 m above the car's level in one cell: their mean is 0.5 m, the authors' 2 / 5 m. Ground
-    that is found 0.3 m too low makes obstacles of all of it: recall of the ground 0 of 4, no precision."""
+    """Four points of ground 0.5 m above the car's level in one cell: their mean is 0.5 m, the authors' 2 / 5 m. A
+    ground estimated 0.3 m too low makes all of it an obstacle: recall of the ground 0 of 4, no precision."""
     points = torch.tensor([[0.5, 0.5, 0.5 - 1.733, 0.0]] * 4 + [[0.5, 0.5, 1.0, 0.0]] * 2)
     ground = torch.tensor([True] * 4 + [False] * 2)
     everything, true = torch.ones(6, dtype=torch.bool), torch.full((16, 16), 0.5 - 1.733)
@@ -122,14 +123,15 @@ def test_the_authors_figures_are_of_the_ground_and_count_points_from_one() -> No
     low = ground_metrics(points, ground, everything, true - 0.3, SMALL)
     assert [low[f"ground_{name}"] for name in ("iou", "recall")] == [0, 0]
     assert math.isnan(low["ground_precision"])
-    high = ground_metrics(points, ground, everything, true + 5, SMALL)  # nothing stands on it
+    high = ground_metrics(points, ground, everything, true + 5, SMALL)  # nothing is above it
     assert [high[f"ground_{name}"] for name in ("iou", "precision", "recall")] == pytest.approx([4 / 6, 4 / 6, 1])
     none = ground_metrics(points, ~everything, everything, true, SMALL)
     assert none["mse_authors"] != none["mse_authors"]  # NaN: no ground to compare with
 
 
 def test_the_authors_curvature_is_absolute_and_has_the_mixed_differences() -> None:
-    """One cell 0.1 m up: 1, 2, 1 times that along an axis, four cells in each mixed difference, over their numbers."""
+    """One cell 0.1 m up: 1, 2, 1 times 0.1 m along an axis, four cells in each mixed difference, divided by their
+    number."""
     bump = torch.zeros(1, 16, 16)
     bump[0, 8, 8] = 0.1
     nothing = torch.zeros(1, 16, 16)
@@ -141,7 +143,7 @@ def test_the_authors_curvature_is_absolute_and_has_the_mixed_differences() -> No
 
 
 def test_soft_threshold_is_the_threshold_with_a_slope() -> None:
-    """Half at 0.2 m, rising, zero off the grid; a higher ground lowers it."""
+    """Half at 0.2 m, rising, zero outside the grid; a higher ground lowers it."""
     height = torch.tensor([0.0, 0.1, 0.2, 0.3, 1.0, 1.0])
     points = torch.stack([torch.zeros(6), torch.zeros(6), height - 1.733], 1)
     points[5, 0] = 50.0
@@ -154,7 +156,8 @@ def test_soft_threshold_is_the_threshold_with_a_slope() -> None:
 
 
 def test_the_slam_loss_reaches_the_network(scans: list[Tensor]) -> None:
-    """Through weights and elevation into the pillars: the mask of the paper would have no gradient."""
+    """The gradient passes through weights and elevation into the pillars; the mask of the paper would have no
+    gradient."""
     torch.manual_seed(0)
     settings = GroundSettings(cells=80, channels=4, sensor_height=1.7)
     net = GroundNet(settings)
@@ -171,7 +174,7 @@ def test_the_slam_loss_reaches_the_network(scans: list[Tensor]) -> None:
 
 @pytest.mark.long
 def test_it_learns_slopes() -> None:
-    """Up to 20 %, in 200 steps; of others 95 % of the variance are explained, and what stands on them is found."""
+    """Slopes up to 20 %, in 200 steps. On new ones 95 % of the variance is explained, and obstacles are found."""
     torch.manual_seed(0)
     net = GroundNet(SMALL)
     optimizer = torch.optim.Adam(net.parameters(), 1e-2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Range images: where points go, what fills the gaps, and the way back, with gradient."""
+"""Range images: the slots of points, the filling of gaps, and the conversion back to points, with its gradient."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VLP16 = RangeImageSettings(beams=((15.0, -15.0, 16),), first=0, rows=16, columns
 
 
 def points_of_beams(settings: RangeImageSettings, distance: float = 20.0) -> Tensor:
-    """(rows * columns, 3): one point in the middle of each slot, at a distance over ground of its own."""
+    """(rows * columns, 3): one point in the middle of each slot, each with a different horizontal distance."""
     elevation, azimuth = elevations(settings)[:, None], azimuths(settings.columns)[None]
     d = distance + torch.arange(settings.rows * settings.columns).view(settings.rows, -1) * 1e-3
     return torch.stack([d * azimuth.cos(), d * azimuth.sin(), d * elevation.tan()], -1).flatten(0, 1)
@@ -27,7 +27,8 @@ def points_of_beams(settings: RangeImageSettings, distance: float = 20.0) -> Ten
 
 @pytest.mark.parametrize("settings", [SETTINGS, VLP16])
 def test_there_and_back_is_exact_for_points_on_the_beams(settings: RangeImageSettings) -> None:
-    """One point a slot in the middle of its column: every slot is full and the points come back, to float rounding."""
+    """With one point per slot in the middle of its column, every slot is full and the points are restored to
+    rounding."""
     points = points_of_beams(settings)
     image, mask = project(points, settings)
     assert image.shape == (2, settings.rows, settings.columns)
@@ -50,7 +51,7 @@ def test_points_of_a_slot_are_averaged() -> None:
 
 
 def test_what_does_not_belong_is_left_out() -> None:
-    """Not finite, too near, too far, above the top row and below the bottom one; and an intensity column is ignored."""
+    """Not finite, too near, too far, above the top row or below the bottom one; an intensity column is ignored."""
     bad = torch.tensor(
         [[math.nan, 1, 0, 0], [math.inf, 0, 0, 0], [1.0, 1, 0, 0], [121.0, 0, 0, 0], [20, 0, 2.0, 0], [20, 0, -9, 0]]
     )
@@ -60,7 +61,7 @@ def test_what_does_not_belong_is_left_out() -> None:
 
 
 def test_columns_begin_ahead_and_go_to_the_left() -> None:
-    """Just left of ahead is column 0, just right of it the last."""
+    """A point just left of straight ahead is in column 0, one just right of it in the last column."""
     points = torch.tensor([[20.0, 0.01, -1], [20.0, -0.01, -1]])
     mask = project(points, SETTINGS)[1]
     assert mask.any(0).nonzero()[:, 0].tolist() == [0, 255]
@@ -73,14 +74,14 @@ def test_fill_takes_the_farthest_around_with_its_own_height_and_wraps() -> None:
         image[:, row, column] = torch.tensor([d, z])
         mask[row, column] = True
     out = fill(image, mask)
-    assert out[:, 2, 2].tolist() == pytest.approx([0.7, -0.3])  # d and z of one and the same point
+    assert out[:, 2, 2].tolist() == pytest.approx([0.7, -0.3])  # d and z of the same point
     assert out[:, 2, 62].tolist() == pytest.approx([0.5, 0.9])  # two columns to the right of 0, around the circle
     assert out[:, 2, 0].tolist() == pytest.approx([0.5, 0.9])  # known: kept
     assert (out[0] > 0).all()
 
 
 def test_fill_of_a_batch_is_that_of_each_and_an_empty_image_stays() -> None:
-    """A batch ends although one of its images can never be filled."""
+    """The filling of a batch ends, although one of its images can never be filled."""
     image, mask = project(points_of_beams(SETTINGS)[::7], SETTINGS)
     both = fill(torch.stack([image, 0 * image]), torch.stack([mask, torch.zeros_like(mask)]))
     torch.testing.assert_close(both[0], fill(image, mask))
@@ -88,13 +89,13 @@ def test_fill_of_a_batch_is_that_of_each_and_an_empty_image_stays() -> None:
 
 
 def test_gradient_of_the_points_reaches_d_and_z() -> None:
-    """x and y by d alone, z by z alone; against finite differences in double."""
+    """x and y depend on d only, z on z only; compared with finite differences in double."""
     image = torch.rand(1, 2, 2, 64, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: to_points(x, 120.0), image)
 
 
 def test_settings_that_cannot_be_are_rejected() -> None:
-    """More rows than beams, beams out of order, columns that the networks cannot halve."""
+    """More rows than beams, beams out of order, or columns that the networks cannot halve."""
     with pytest.raises(UsageError, match=r"rows 40 to 79 of a sensor with 64 beams"):
         project(torch.zeros(1, 3), RangeImageSettings(first=40))
     with pytest.raises(ValueError, match="below the one before"):
