@@ -111,7 +111,7 @@ def test_where_the_geometry_is_silent_the_figures_are_those_of_the_records() -> 
         seen.append(cells[0])
     assert len(seen) == len(pairs)
     roads = record("relocalise.json")["open_roads"]
-    found = re.findall(r"with a picture (\d+) of (\d+) in the tunnel and (\d+) of (\d+) on the highway", text(MEASURED))
+    found = re.findall(r"with an image (\d+) of (\d+) in the tunnel and (\d+) of (\d+) on the highway", text(MEASURED))
     of = [roads[road]["with images"] for road in ("tunnel", "highway")]
     assert [int(n) for n in found[0]] == [n for r in of for n in (round(r["right"] * r["visits"]), r["visits"])]
     assert [case["wrong"] for road in roads.values() for case in road.values() if isinstance(case, dict)] == [0] * 4
@@ -186,7 +186,7 @@ def test_the_card_has_the_figures_of_the_odometry() -> None:
 
 
 def test_what_refined_adds_on_these_drives_is_said() -> None:
-    said = r"`refined` is the points: its errors (?:equal|are) those of `geometric` to ([\d.]+) %"
+    said = r"`refined` gives the poses of the points: its errors (?:equal|are) those of `geometric` to ([\d.]+) %"
     (within,) = {float(number) for path in (MEASURED, CARD) for number in re.findall(said, text(path))}
     assert within <= 0.5
     for methods in record("neural.json")["parts"]["odometry"]["drives"].values():

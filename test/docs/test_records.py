@@ -45,7 +45,7 @@ def test_what_is_said_of_the_papers_ways_is_in_the_record() -> None:
     suburb, paper = drives["suburb"], "the paper's"
     assert [key for key, count in failed.items() if count] == [("suburb", paper)]
     counts = f"{suburb[paper]['failed_frames']} of the {suburb[paper]['frames']} of the suburb"
-    assert f"Every frame is registered, except {counts} with all of the paper's ways" in said
+    assert f"Every frame is registered, except {counts} with all of the paper's methods" in said
     loops = {method: of["loops"] for method, of in suburb.items()}
     tried = loops["start: most confident pairs"]
     assert f"none of the {tried['tried']} loops that are tried in the suburb is accepted" in said
@@ -53,7 +53,7 @@ def test_what_is_said_of_the_papers_ways_is_in_the_record() -> None:
     assert sum(of["loops"]["wrong"] for drive in drives.values() for of in drive.values()) == 0
     (written,) = re.findall(
         r"alone are off by ([\d.]+) m \(median\), those that the points verify by ([\d.]+) to ([\d.]+) m, "
-        r"those with all of the paper's ways by ([\d.]+) m",
+        r"those with all of the paper's methods by ([\d.]+) m",
         said,
     )
     medians = {method: of["error_m"]["median"] for method, of in loops.items() if of["error_m"]}
@@ -131,7 +131,7 @@ def test_the_share_of_far_pairs_that_are_found_is_that_of_the_record() -> None:
         words = distance.replace("-", " to ")
         assert found[f"real KITTI, {words} apart (00 / 04)"] == [neural, refined, "0 %"]
         assert kiss == gicp == "0 / 0 %"
-        assert found[f"the same {words} against poses that the scans have fitted"][0] == fitted
+        assert found[f"the same {words} against poses fitted to the scans"][0] == fitted
 
 
 def test_the_figures_in_dense_traffic_are_those_of_the_record() -> None:
