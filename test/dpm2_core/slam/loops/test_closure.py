@@ -168,7 +168,7 @@ def test_a_place_never_seen_closes_no_loop_and_each_candidate_has_its_reason() -
 @pytest.mark.weights
 @pytest.mark.parametrize(("away", "closed"), [(500.0, False), (0.0, True)], ids=["two places", "one place"])
 def test_a_loop_is_clear_among_all_stretches_of_a_broken_drive(away: float, closed: bool) -> None:
-    """The street is in the map twice, from two stretches between which the odometry was lost. Then two visits follow.
+    """The street is in the map twice: the odometry was lost between its two stretches. Then two visits follow.
 
     Previously, places of another stretch were not compared: in a warehouse wrong aisles fitted to 92 %, as did the
     right one.
@@ -260,8 +260,7 @@ def test_disabled_it_closes_nothing_and_a_cloud_too_small_for_descriptors_is_no_
 @pytest.mark.slow
 @pytest.mark.weights
 def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loop whose overlap is unlikely is rejected with this reason, even if its descriptors match. An overlap head
-    that returns NaN rejects nothing."""
+    """A loop with an unlikely overlap is rejected with this reason, even if its descriptors match. NaN rejects none."""
     places = [(s, 2.5, 0.0) for s in (62.0, 67.0)]
     jump = se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))  # the nearest keyframe by pose does not help
 
@@ -285,8 +284,7 @@ def test_places_that_hardly_overlap_are_left_to_no_one(monkeypatch: pytest.Monke
 @pytest.mark.slow
 @pytest.mark.weights
 def test_the_overlap_head_alone_accepts_the_best_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in the paper: neither the points nor a second loop are checked. An overlap head that is not trained accepts
-    nothing."""
+    """As in the paper: neither the points nor a second loop are checked. An untrained overlap head accepts nothing."""
     places, jump = [(62.0, 2.5, 0.0)], se3.exp(np.array([0, 0, 0, 12.0, 0, 0]))
     monkeypatch.setattr(Verifier, "verify", lambda *_: pytest.fail("the points were asked"))
     loops, truth = drive(places, jump, gap=30.0, decided_by="overlap", min_overlap=0.7)

@@ -214,6 +214,6 @@ def test_a_loop_does_not_wait_forever() -> None:
     for waits in (199, 200):
         consistency, rng = knowing(path, [0] * 20 + [1] * 20), np.random.default_rng(0)
         checked_by(consistency, loop(3, 23, pose(0.5)))
-        for number in range(waits):  # each says something else, 20 to 220 m away
+        for number in range(waits):  # each disagrees with the others, 20 to 220 m away
             checked_by(consistency, loop(5, 25, pose(20.0 + number, rng.uniform(-50, 50))))
         assert len(checked_by(consistency, loop(4, 24, pose(0.5)))) == (2 if waits == 199 else 1)

@@ -69,15 +69,15 @@ def test_a_right_pose_is_accepted_and_improved(suburb_scans: tuple[list[Points],
     found = v.verify(clouds[6], around, T_proposed)
     assert found.ok, found.reason
     off = se3.way(T, found.T_target_source)
-    assert np.linalg.norm(off[3:]) < 0.05  # twice the noise of the range
-    assert found.confidence > 0.8  # the share of what stands above the ground, if that is less than of all points
+    assert np.linalg.norm(off[3:]) < 0.05  # twice the range noise
+    assert found.confidence > 0.8  # the smaller of the fraction above the ground and the fraction of all points
     assert 0.3 < se3.apart(T_proposed, found.T_target_source)[0] < 0.8
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("meters", [-15.0, 12.0, 25.0])
 def test_a_wrong_place_in_the_same_street_is_rejected(suburb_scans: tuple[list[Points], Array], meters: float) -> None:
-    """The road fits wherever one is put on it; what stands beside it does not."""
+    """The road fits wherever a pose is on it; the objects next to it do not."""
     clouds, poses = suburb_scans
     v = verifier()
     around = v.surroundings(clouds[:6], se3.inverse(poses[3]) @ poses[:6])
@@ -109,12 +109,12 @@ def test_along_a_tunnel_no_pose_is_accepted() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "i", "meters"), [("city", 5, 1.5), ("suburb", 8, -2.5), ("suburb", 4, 2.5)])
 def test_a_proposal_that_is_off_along_a_street_is_moved_to_its_place(preset: PresetName, i: int, meters: float) -> None:
-    """It would stay beside it, where the covariance leaves the street open, or where half of what stands there fits:
-    each is a reason to look 1 m to either side."""
+    """A proposal would stay where the covariance leaves the street open, or where half of the points above the ground
+    fit. Both are reasons to search 1 m to either side."""
     clouds, poses = scans_along(preset)
     v = Verifier(VerificationSettings(max_moved=3.0), GeometricSettings(), PreprocessSettings())
     others = [k for k in range(i - 3, min(i + 4, len(clouds))) if k != i]
     around = v.surroundings([clouds[k] for k in others], se3.inverse(poses[i]) @ poses[others])
     found = v.verify(clouds[i], around, se3.exp(np.array([0, 0, 0, meters, 0, 0])))
     assert found.ok, found.reason
-    assert np.linalg.norm(found.T_target_source[:3, 3]) < 0.05  # twice the noise of the range
+    assert np.linalg.norm(found.T_target_source[:3, 3]) < 0.05  # twice the range noise

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What would spoil a map is rejected before it touches anything; the map then goes on as if nothing had come."""
+"""A keyframe that would spoil a map is rejected before it changes anything. The map then continues as if nothing had
+arrived."""
 
 from __future__ import annotations
 
@@ -107,7 +108,7 @@ def test_an_unsound_keyframe_is_rejected_with_its_reason_and_the_map_goes_on(nam
 
 
 def test_a_cloud_that_reaches_far_takes_no_memory() -> None:
-    """Three points 6 km apart, 37 bytes on the wire, are no cause for 500 MB."""
+    """Three points 6 km apart, 37 bytes in a message, must not take 500 MB."""
     mapper, few = make_mapper(SETTINGS), np.float32([[3000, 3000, 0, 0], [-3000, -3000, 1, 0], [1, 0, 0, 0]])
     tracemalloc.start()
     mapper.add(replace(keyframe(0), cloud=few))
@@ -115,7 +116,7 @@ def test_a_cloud_that_reaches_far_takes_no_memory() -> None:
     mapper.finish()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 60e6  # cells of 1 m as far as a LiDAR sees
+    assert peak < 60e6  # cells of 1 m within the range of a LiDAR
 
 
 def test_descriptors_of_another_network_never_reach_the_search() -> None:
@@ -126,7 +127,7 @@ def test_descriptors_of_another_network_never_reach_the_search() -> None:
 
 
 def test_a_step_that_fails_leaves_no_node_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever it is; and where it fails in the search for loops, the keyframe is in the map as a whole."""
+    """Any step and error. If the search for loops fails, the keyframe is completely in the map."""
     mapper: Mapper = make_mapper(SETTINGS)
     mapper.add(keyframe(0))
 

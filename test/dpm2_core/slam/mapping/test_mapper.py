@@ -29,7 +29,7 @@ from dpm2_core.slam.store.map_data import load_map, save_as, subset
 from dpm2_core.slam.store.map_store import MapStore
 from test.helpers.fleets import fleet_maps
 
-# Loops by descriptors have tests of their own; here the pose leads to the candidates, which is faster.
+# Loops by descriptors have their own tests. Here the poses select the candidates, which is faster.
 BY_POSE = SlamSettings.model_validate({"loops": {"descriptors": False}})
 SIGMA = np.diag([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02]) ** 2
 
@@ -39,7 +39,7 @@ def found(T: Array, ok: bool = True) -> Registration:
 
 
 def drifting(poses: Array, drift: Array, cloud: np.ndarray) -> list[Keyframe]:
-    """Keyframes whose odometry errs by the tangent `drift` (6,) at each step, all with the same cloud."""
+    """Keyframes whose odometry has an error of the tangent `drift` (6,) per step, all with the same cloud."""
     T_odom, keyframes = np.eye(4), []
     for i in range(len(poses)):
         edge = None
@@ -58,7 +58,7 @@ def circle(count: int, radius: float = 20.0) -> Array:
 
 @pytest.fixture(scope="module")
 def lap() -> tuple[list[Keyframe], Array]:
-    """Keyframes of a lap through a suburb that ends 15 m beyond its start, with odometry that drifts by 2 m."""
+    """Keyframes of a lap through a suburb that ends 15 m beyond its start, with an odometry that drifts by 2 m."""
     world = build_world("loop", "suburb", seed=4, length=220.0)
     lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(0)
     at = np.arange(0.0, world.road.drive.length + 15, 5.0)
@@ -71,7 +71,8 @@ def lap() -> tuple[list[Keyframe], Array]:
 
 @pytest.mark.slow
 def test_an_odometry_that_starts_again_is_no_witness_of_what_moved(lap: tuple[list[Keyframe], Array]) -> None:
-    """The clouds before and after lay over each other anywhere, and took up to 15 % of what stands for moving."""
+    """Previously, the clouds before and after were superimposed at arbitrary poses, and up to 15 % of the static points
+    counted as moving."""
 
     def moving(keyframes: list[Keyframe]) -> list[int]:
         mapper = make_mapper(BY_POSE)
@@ -100,13 +101,13 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
     assert open_ended.loops == []
     accepted = [loop for loop in mapper.loops if loop.ok]
     assert accepted
-    for loop in accepted:  # each is the true relative pose
+    for loop in accepted:  # each has the true relative pose
         true = se3.inverse(truth[loop.from_node]) @ truth[loop.to_node]
         assert se3.apart(true, loop.T_from_to)[0] < 0.1
     end, open_end = (np.linalg.norm((m.poses[-1] - truth[-1])[:3, 3]) for m in (mapper, open_ended))
     assert end < 0.1 * open_end
-    assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift bends each step alike
-    # the odometry was not touched: T_map_odom carries the correction
+    assert ape_rmse(truth, mapper.poses) < 0.8 * ape_rmse(truth, open_ended.poses)  # the drift is the same in each step
+    # The odometry is not changed: T_map_odom contains the correction.
     assert mapper.T_map_odom is not None
     last = mapper.T_map_odom @ keyframes[-1].T_odom_kf
     np.testing.assert_allclose(last, mapper.poses[-1], atol=1e-6)
@@ -135,7 +136,7 @@ def test_map_is_one_point_a_voxel_in_the_map_frame(lap: tuple[list[Keyframe], Ar
     cloud = mapper.cloud(1.0)
     assert len(np.unique(np.floor(cloud[:, :3]).astype(int), axis=0)) == len(cloud)
     assert len(mapper.cloud(2.0)) < len(cloud)
-    assert cloud[:, 0].max() > lap[0][0].cloud[:, 0].max() + 4  # the later keyframes reach farther
+    assert cloud[:, 0].max() > lap[0][0].cloud[:, 0].max() + 4  # the later keyframes reach further
 
 
 @pytest.mark.slow
@@ -154,7 +155,8 @@ def test_saved_map_holds_all_of_it(tmp_path: Path, lap: tuple[list[Keyframe], Ar
 
 
 def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
-    """Interleaved keyframes of two robots and a restart of one: edges lead within a drive, ids count on."""
+    """Interleaved keyframes of two robots and a restart of one. Edges connect keyframes of the same drive, and ids
+    continue."""
     mapper = make_mapper(BY_POSE)
     poses, cloud = circle(6), np.zeros((0, 4), np.float32)
     for one in drifting(poses, np.zeros(6), cloud):
@@ -162,7 +164,7 @@ def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
             mapper.add(replace(one, robot=robot))
     assert [(e.from_node, e.to_node) for e in mapper.edges] == [(n, n + 2) for n in range(10)]
     np.testing.assert_allclose(mapper.T_map_odom_of("red"), np.eye(4), atol=1e-9)
-    assert mapper.T_map_odom_of("blue") is None  # nothing says where it is in red's map
+    assert mapper.T_map_odom_of("blue") is None  # its position in red's map is not known
     assert mapper.T_map_odom_of("green") is None
     for one in drifting(poses, np.zeros(6), cloud)[:2]:  # red again
         mapper.add(replace(one, robot="red"))
@@ -172,7 +174,8 @@ def test_each_robot_has_its_own_odometry_and_is_placed_when_tied() -> None:
 
 
 def test_a_robot_that_nothing_ties_is_not_drawn_into_the_map_of_another() -> None:
-    """A wall that blue sees 6 m before its start, on red's free road: not in grid and cloud before a loop ties them."""
+    """Blue sees a wall 6 m ahead of its start, on red's free road. It is not in the grid and the cloud before a loop
+    connects the two."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-20, 20, 0.4), np.arange(-20, 20, 0.4)))
     road = np.column_stack([x, y, np.full(len(x), -1.7), np.zeros(len(x))]).astype(np.float32)
     y, z = (v.ravel() for v in np.meshgrid(np.arange(-8, 8, 0.1), np.arange(-1.6, 1, 0.2)))
@@ -192,7 +195,8 @@ def test_a_robot_that_nothing_ties_is_not_drawn_into_the_map_of_another() -> Non
 
 
 def test_where_the_lidar_was_stays_with_its_cloud(tmp_path: Path) -> None:
-    """In the map file, and in what merging, copying in part and recovering make of it; the grid is seen from there."""
+    """The position is in the map file, and in merged, partial and recovered copies. The rays of the grid start
+    there."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-5, 5, 0.25), np.arange(-5, 5, 0.25)))
     floor = np.column_stack([x + 2, y, np.full(len(x), -0.5), np.zeros(len(x))]).astype(np.float32)
     off, mount = SlamSettings.model_validate({"loops": {"enabled": False}}), np.array([2.0, 0.0, 0.5])
@@ -223,7 +227,8 @@ def test_a_cloud_that_is_seen_from_nowhere_is_rejected(origin: list[float]) -> N
 
 
 def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) -> None:
-    """Not because it comes into a map that is there: `dpm2 run --extend` does not know where it is before a loop."""
+    """It is not placed just because it extends an existing map: with `dpm2 run --extend` its position is not known
+    before a loop."""
     _, maps, _ = fleet_maps(1)
     for place, expected in ((None, False), (np.eye(4), True)):
         save_as(maps["d0"], tmp_path / f"map {expected}")
@@ -238,7 +243,8 @@ def test_another_drive_is_placed_where_one_says_where_it_begins(tmp_path: Path) 
 
 
 def test_a_session_whose_odometry_breaks_before_its_first_keyframe_is_tied_loosely(tmp_path: Path) -> None:
-    """As loosely as the break says. It was tied as firmly as the robot had been found before it."""
+    """Its edge includes the covariance of the break. Previously, the edge only had the covariance of the localization
+    before the break."""
     _, maps, _ = fleet_maps(1)
     save_as(maps["d0"], tmp_path / "map")
     broken = Registration(np.eye(4), isotropic(1.0, 30.0), 0.9, 0.05, "test")
@@ -250,7 +256,7 @@ def test_a_session_whose_odometry_breaks_before_its_first_keyframe_is_tied_loose
 
 
 def test_a_map_of_several_drives_is_loaded_with_the_poses_of_its_file(tmp_path: Path) -> None:
-    """However far its loops are from them: they have been weighed against each other."""
+    """The poses are kept however far the loops are from them: the loops have been weighed against each other before."""
     _, maps, joins = fleet_maps(3)
     poses = {name: se3.exp(np.full(6, 0.01 * i)) @ data.poses for i, (name, data) in enumerate(maps.items())}
     data = replace(side_by_side(maps, joins), poses=np.concatenate(list(poses.values())))

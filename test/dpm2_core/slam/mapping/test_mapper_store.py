@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mapper and file together: they agree, sessions follow each other, laps do not pile up, a full disk is survived."""
+"""Mapper and map file together: they agree, sessions are appended, clouds of laps do not accumulate, a full disk is
+survived."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ WRONG = LAP + 4  # a node with a wrong loop
 
 
 def of_the_lap_before(node: int) -> list[Edge]:
-    """Each keyframe's of the lap before; every seventh is rejected."""
+    """Loop of each keyframe to the previous lap; every seventh is rejected."""
     if node < LAP:
         return []
     T = se3.exp([0, 0, 1e-4, 2e-3, 1e-3, 0])
@@ -45,7 +46,7 @@ def make(store: MapStore | None = None, **settings: object) -> Mapper:
 
 @contextmanager
 def begun(path: Path, **settings: object) -> Iterator[Mapper]:
-    """One that writes a session of its own into a file, which is made if it is not there."""
+    """Mapper that writes a new session into a file, which is created if it does not exist."""
     with MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path) as store:
         store.begin_session()
         yield make(store, **settings)
@@ -72,7 +73,7 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
         clouds = list(mapper.clouds)
     with MapStore.open(path) as store:
         data = load_map(store)
-        np.testing.assert_allclose(data.poses, mapper.poses, atol=1.1e-4)  # smaller moves are not written
+        np.testing.assert_allclose(data.poses, mapper.poses, atol=1.1e-4)  # smaller corrections are not written
         assert len(data.constraints) == len(mapper.edges)
         assert sum(not edge.ok for edge in data.edges) == sum(not loop.ok for loop in mapper.loops) == 3
         again = make(store)
@@ -82,7 +83,7 @@ def test_the_file_holds_what_the_mapper_holds(tmp_path: Path) -> None:
 
 
 def one_wrong(node: int) -> list[Edge]:
-    """The same, of which one is far off, and is accepted all the same."""
+    """The same loops, but one is far off and still accepted."""
     loops, wrong = of_the_lap_before(node), se3.exp([0, 0, 0.3, 9.0, 0, 0])
     if node != WRONG:
         return loops
@@ -92,7 +93,7 @@ def one_wrong(node: int) -> list[Edge]:
 
 
 def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> None:
-    """A loop that was accepted, and that those after it contradict, holds nothing in the file either."""
+    """A loop that was accepted but that later ones contradict is no constraint in the file either."""
     path = tmp_path / "a.dpm2map"
     with MapStore.create(path) as store:
         store.begin_session()
@@ -113,13 +114,13 @@ def test_the_file_has_the_verdicts_of_the_last_optimization(tmp_path: Path) -> N
 
 
 def again(node: int) -> bool:
-    """Whether a keyframe's loop, and that of the lap after it to it, are accepted."""
+    """Whether the loop of a keyframe, and the loop of the next lap to it, are accepted."""
     return node % 7 > 0 and (node + LAP) % 7 > 0
 
 
 def test_the_file_keeps_how_a_place_was_last_seen(tmp_path: Path) -> None:
-    """After three laps each keyframe of the last one that borrows has its cloud in the file, and of the second only
-    those whose place was not found again."""
+    """After three laps, the file contains the clouds of all keyframes of the last lap that borrow. Of the second lap it
+    contains only those whose place was not found again."""
     path = tmp_path / "a.dpm2map"
     with begun(path) as mapper:
         for keyframe in laps(3):
@@ -141,7 +142,8 @@ def test_the_file_keeps_how_a_place_was_last_seen(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
-    """A keyframe whose loop was rejected keeps its own: three in the second lap; later ones borrow from these, too."""
+    """A keyframe whose loop was rejected keeps its own cloud: three in the second lap. Later keyframes borrow from
+    these, too."""
     sizes = []
     for count in (1, 4):
         path = tmp_path / f"{count}.dpm2map"
@@ -161,17 +163,18 @@ def test_four_laps_have_the_clouds_of_one(tmp_path: Path) -> None:
 
 
 def test_a_lap_is_tied_to_keyframes_that_have_clouds() -> None:
-    """The search names the lap before, whose keyframes borrow. Where three in ten loops lead from any lap to any other
-    one, a graph of 4000 keyframes, a shift of a robot, takes 9 s to solve; with all tied to the first lap 0.8 s."""
+    """The search returns the previous lap, whose keyframes borrow. If three in ten loops lead from any lap to any other
+    one, a graph of 4000 keyframes (one shift of a robot) takes 9 s to solve. With all loops to the first lap it takes
+    0.8 s."""
     mapper, drive = make(), laps(4)
     for keyframe in drive:
         mapper.add(keyframe)
     mapper.finish()
     tied = [edge for edge in mapper.edges if edge.kind == "loop"]
-    assert len(tied) == 3 * LAP - 9  # of the multiples of 7 from 20 to 79 none
+    assert len(tied) == 3 * LAP - 9  # none for the multiples of 7 from 20 to 79
     assert all(mapper.clouds.loan(edge.from_node) is None for edge in tied)
     assert sum(edge.from_node < edge.to_node - LAP for edge in tied) > LAP
-    for edge in tied:  # each step of a lap errs by 2 mm
+    for edge in tied:  # each step of a lap has an error of 2 mm
         off = se3.inverse(drive[edge.from_node].T_odom_kf) @ drive[edge.to_node].T_odom_kf
         assert se3.magnitude(se3.inverse(off) @ edge.T_from_to)[0] < 0.01
 
@@ -191,7 +194,7 @@ def test_a_borrowed_cloud_lies_where_the_loop_says(tmp_path: Path) -> None:
 
 def test_a_second_session_counts_on(tmp_path: Path) -> None:
     path, drive = tmp_path / "a.dpm2map", laps(1)
-    parts = drive[:8], drive[7:]  # it goes on with the frame of the last keyframe
+    parts = drive[:8], drive[7:]  # the second part begins with the frame of the last keyframe
     for part in parts:
         with begun(path) as mapper:
             if mapper.keyframes:
@@ -208,7 +211,8 @@ def test_a_second_session_counts_on(tmp_path: Path) -> None:
 
 
 def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(tmp_path: Path) -> None:
-    """However the odometry begins: level where an IMU has told what is up, so that a tilted LiDAR was tilted twice."""
+    """The start of the odometry does not matter. It is level if an IMU measures gravity: previously, a tilted LiDAR was
+    then tilted twice."""
     path, drive = tmp_path / "a.dpm2map", laps(1)
     with begun(path) as mapper:
         for keyframe in drive[:8]:
@@ -224,7 +228,7 @@ def test_a_session_that_goes_on_with_the_frame_of_a_keyframe_begins_where_it_is(
 
 
 def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> None:
-    """All said that the map was saved in a file that was not there."""
+    """Previously, all reports said that the map was saved in a file that did not exist."""
     path, elsewhere = tmp_path / "town.dpm2map", tmp_path / "elsewhere.dpm2map"
     with begun(path) as mapper:
         mapper.add(laps(1)[0])
@@ -247,7 +251,7 @@ def test_a_file_that_is_moved_away_is_said_and_still_written(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None:
-    """For ten keyframes no file may have more than the log of the map has before them, and 10 kB."""
+    """For ten keyframes, no file may be larger than the map's log before them plus 10 kB."""
     path, room, problems = tmp_path / "a.dpm2map", 0, list[str]()
     with begun(path) as mapper:
         for number, keyframe in enumerate(laps(1)):
@@ -270,7 +274,7 @@ def test_a_full_disk_is_survived_and_the_file_catches_up(tmp_path: Path) -> None
 
 
 def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None:
-    """Clouds of 8 kB per keyframe packed, 2 MB in all: what stays in memory without descriptors is far less."""
+    """Packed clouds take 8 kB per keyframe, 2 MB in total. Without descriptors, far less remains in memory."""
     import tracemalloc
 
     drive = laps(3)
@@ -286,7 +290,7 @@ def test_memory_of_a_keyframe_is_that_of_its_descriptors(tmp_path: Path) -> None
 
 
 def test_descriptors_that_the_network_cannot_compare_are_told(map_file: Path) -> None:
-    """Of 16 channels, whatever weights the file names; every search for loops would fail with them."""
+    """Descriptors of 16 channels, whatever weights the file names. Every search for loops would fail with them."""
 
     class Network(KnownLoops):
         channels = 128

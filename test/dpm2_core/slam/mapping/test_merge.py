@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map of several says of its parts: where on Earth they are, and which loops hold."""
+"""Properties of a merged map: the georeference of its parts, and which loops are accepted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ T_A_B = se3.exp(np.array([0, 0, 0.5, 30.0, 10.0, 0]))
 def test_a_place_on_earth_goes_only_to_what_is_tied_to_the_keyframes_that_have_it(
     from_node: int, to_node: int, known: bool
 ) -> None:
-    """Two maps of two drives that nothing ties; only the second map has a place on Earth, that of its first drive."""
+    """Two maps, each of two unconnected drives. Only the second map has a georeference, that of its first drive."""
     one = ring(12, points=10)
     a = merge_maps(one, one, np.eye(4))
     b = replace(a, georeference=GEOREFERENCE)
@@ -45,7 +45,7 @@ def test_a_place_on_earth_goes_only_to_what_is_tied_to_the_keyframes_that_have_i
 def test_a_loop_that_the_merged_map_contradicts_is_rejected_in_its_file_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two drives of one place with a tie that is 14 m off, and a third drive that is found in both of them."""
+    """Two drives in one place with a loop that is 14 m off, and a third drive that is found in both of them."""
     one = ring(12, points=10)
     wrong = Edge(
         "loop", 0, 0, Registration(se3.exp(np.array([0, 0, 0, 14.0, 0, 0])), np.eye(6) * 0.3, method="by hand")
@@ -63,5 +63,5 @@ def test_a_loop_that_the_merged_map_contradicts_is_rejected_in_its_file_and_name
         loops = {(e.from_node, e.to_node, e.registration.method): e for e in load_map(store).edges if e.kind == "loop"}
     assert len(loops) == 3 * 2 + 1 + 24
     rejected = {key: edge.registration.reason for key, edge in loops.items() if not edge.ok}
-    assert set(rejected) == {(0, 12, "by hand"), *((at, at + 6, "points") for at in (0, 12, 24))}  # a ring has one
+    assert set(rejected) == {(0, 12, "by hand"), *((at, at + 6, "points") for at in (0, 12, 24))}  # each ring has one
     assert "sigma" in rejected[0, 12, "by hand"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grid for Nav2: walls are occupied, what is seen before them is free, the rest is unknown."""
+"""The grid for Nav2: walls are occupied, the visible space in front of them is free, the rest is unknown."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SETTINGS = OccupancySettings(resolution=0.25, reach=20.0)
 
 
 def room(slope: float = 0.0) -> Points:
-    """Ground 1.7 m below with a slope (m/m along x), a wall at x = 8 of 3 m, a beam at 4 m height; seen from 0, 0."""
+    """Ground 1.7 m below with a slope (m/m along x), a wall of 3 m at x = 8, a beam at 4 m height; seen from 0, 0."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-12, 7.9, 0.2), np.arange(-12, 12, 0.2)))
     ground = np.column_stack([x, y, slope * x - 1.7])
     y, z = (v.ravel() for v in np.meshgrid(np.arange(-6, 6, 0.1), np.arange(0.1, 3, 0.2)))
@@ -31,7 +31,8 @@ def room(slope: float = 0.0) -> Points:
 
 
 def read_back(path: Path) -> tuple[np.ndarray, dict[str, object]]:
-    """Nav2's view: what the trinary mode of nav2_map_server/src/map_io.cpp makes of both files, from the lowest y."""
+    """The grid as Nav2 reads it: both files in the trinary mode of nav2_map_server/src/map_io.cpp, from the lowest
+    y."""
     about = yaml.safe_load(path.read_text())
     magic, size, depth, pixels = (path.parent / about["image"]).read_bytes().split(b"\n", 3)
     assert (magic, depth) == (b"P5", b"255")
@@ -45,7 +46,7 @@ def read_back(path: Path) -> tuple[np.ndarray, dict[str, object]]:
 
 
 def test_each_value_is_to_nav2_what_it_is_here(tmp_path: Path) -> None:
-    """Occupied, unknown, free: Nav2 knows no unknown but what lies between its two thresholds."""
+    """Occupied, unknown, free: for Nav2, only a value between its two thresholds is unknown."""
     path = write_grid(tmp_path / "grid.yaml", Grid(np.uint8([[0, 205, 254]]), (0.0, 0.0), 0.25))
     assert read_back(path)[0].tolist() == [[100, -1, 0]]
 
@@ -59,7 +60,7 @@ def test_a_wall_before_the_unknown(tmp_path: Path, slope: float) -> None:
     assert about["mode"] == "trinary"
 
     def at(x: float, y: float) -> int:
-        """Of a place relative to the sensor."""
+        """Value at a position relative to the sensor."""
         column = int((x + 100 - about["origin"][0]) // 0.25)
         row = int((y - 50 - about["origin"][1]) // 0.25)
         inside = 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
@@ -68,7 +69,7 @@ def test_a_wall_before_the_unknown(tmp_path: Path, slope: float) -> None:
     assert [at(8.1, y) for y in (-5, 0, 5)] == [100, 100, 100]
     assert [at(x, y) for x, y in ((2, 0), (6, 3), (-9, 0), (0, 9), (3, 1))] == [0] * 5  # also under the beam
     assert [at(x, y) for x, y in ((9.5, 0), (12, 2), (0, 18))] == [-1] * 3  # behind the wall, beyond the ground
-    assert (cells == 100).sum() <= 49 * 2  # nothing but the wall
+    assert (cells == 100).sum() <= 49 * 2  # only the wall
 
 
 def test_a_thing_that_most_keyframes_see_through_is_free() -> None:

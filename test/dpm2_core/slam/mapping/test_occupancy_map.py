@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live grid has the walls of a simulated building, and is that of all keyframes whatever happened before."""
+"""The live grid contains the walls of a simulated building, and equals the grid of all keyframes whatever happened
+before."""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ def same(a: Grid, b: Grid) -> bool:
 
 
 class Truth:
-    """What the world has at 0.35 to 1.75 m above the floor, as seen from some poses: cells of 0.1 m."""
+    """Ground truth 0.35 to 1.75 m above the floor, as visible from some poses, in cells of 0.1 m."""
 
     def __init__(self, world: World, poses: Array, grid: Grid) -> None:
         self._low, self.shape = np.round(np.array(grid.origin) / 0.1).astype(int), grid.cells.T.shape
@@ -79,7 +80,8 @@ class Truth:
 
 @pytest.mark.slow
 def test_walls_are_occupied_and_rooms_are_free(world: World, drive: tuple[CloudStore, Array]) -> None:
-    """At least 95 % of the wall cells that a ray at 0.95 m meets, cell for cell, and less than 1 % of the free ones."""
+    """At least 95 % of the wall cells hit by a ray at 0.95 m are occupied, cell for cell, and less than 1 % of the free
+    ones."""
     clouds, poses = drive
     whole = OccupancyMap(SETTINGS, 10**7)
     assert whole.update(clouds, poses)
@@ -96,8 +98,8 @@ def test_walls_are_occupied_and_rooms_are_free(world: World, drive: tuple[CloudS
 
 @pytest.mark.slow
 def test_a_loop_that_moves_everything_leaves_no_trace(drive: tuple[CloudStore, Array]) -> None:
-    """Keyframe by keyframe at drifting poses, then all poses corrected: as if it had known them from the start. Only
-    what turns by less than would show may stay, so the walls are compared to a cell."""
+    """Keyframes are added at drifting poses, then all poses are corrected. The grid is as if the poses had been known
+    from the start. Rotations too small to be visible may remain, so the walls are compared to one cell."""
     clouds, poses = drive
     drifted = poses @ se3.exp([0.0, 0.0, 0.3, 2.0, -1.0, 0.0])
     live = OccupancyMap(SETTINGS, 10**7)
@@ -105,7 +107,7 @@ def test_a_loop_that_moves_everything_leaves_no_trace(drive: tuple[CloudStore, A
         assert live.update(clouds, drifted[:n])
     assert live.update(clouds, poses)
     expected, found = occupancy_grid(clouds, poses, SETTINGS), live.grid()
-    assert np.abs(np.subtract(found.origin, expected.origin)).max() < 0.31  # a cell or two at the rim
+    assert np.abs(np.subtract(found.origin, expected.origin)).max() < 0.31  # a cell or two at the border
     low = np.round((np.subtract(found.origin, expected.origin)) / 0.1).astype(int)
     padded = [np.pad((grid.cells[::-1].T == OCCUPIED), 10) for grid in (expected, found)]
     a, b = padded[0], np.zeros_like(padded[0])
@@ -117,7 +119,7 @@ def test_a_loop_that_moves_everything_leaves_no_trace(drive: tuple[CloudStore, A
 
 
 def room(thing: bool = False) -> Points:
-    """A floor 0.6 m below, walls at 3 m, and perhaps something at x = 1.55."""
+    """A floor 0.6 m below, walls at 3 m, and optionally an object at x = 1.55."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-2.95, 3, 0.1), np.arange(-2.95, 3, 0.1)))
     floor = np.column_stack([x, y, np.full(len(x), -SENSOR)])
     y, z = (v.ravel() for v in np.meshgrid(np.arange(-3, 3, 0.05), np.arange(-0.6, 1.5, 0.1)))
@@ -129,8 +131,8 @@ def room(thing: bool = False) -> Points:
 
 @pytest.mark.parametrize("yaw", [0.3, 2.0])  # not 0: the rays to points of a grid lie between two directions
 def test_what_is_free_is_seen_from_the_lidar(yaw: float) -> None:
-    """The base 2 m behind it gives the grid that the LiDAR alone gives, at first and where the pose has changed; seen
-    from the base the room would be free behind the thing, and not before it."""
+    """With the base 2 m behind the LiDAR, the grid is that of the LiDAR alone, at first and after the pose has changed.
+    Seen from the base, the room would be free behind the object, and not in front of it."""
     mount = se3.make(np.eye(3), [2.0, 0.0, 1.0])
     T, T_later = se3.exp([0, 0, yaw, 0.32, 0.11, 0]), se3.exp([0, 0, yaw + 0.5, 3.34, 1.13, 0])
     cloud = room(thing=True)
@@ -145,13 +147,13 @@ def test_what_is_free_is_seen_from_the_lidar(yaw: float) -> None:
         return drawn
 
     expected, found = grids(np.eye(4), np.zeros(3)), grids(mount, mount[:3, 3])
-    assert differ(expected[0], found[0]) <= 0.002  # the floor's height is looked for in cells of the map
+    assert differ(expected[0], found[0]) <= 0.002  # the floor's height is estimated in cells of the map
     assert differ(expected[1], found[1]) <= 0.002
     assert differ(expected[0], grids(mount, np.zeros(3))[0]) > 0.01
 
 
 def differ(a: Grid, b: Grid) -> float:
-    """Fraction of the cells known to one of two grids that are others in the other one."""
+    """Fraction of the cells known to at least one of two grids in which the grids differ."""
     places = []
     for grid in (a, b):
         rows, columns = np.nonzero(grid.cells[::-1] != UNKNOWN)
@@ -167,7 +169,7 @@ def at(grid: Grid, x: float, y: float) -> int:
 
 
 class Counted(CloudStore):
-    """How often one was read."""
+    """Cloud store that counts how often a cloud is read."""
 
     read = 0
 
@@ -177,7 +179,7 @@ class Counted(CloudStore):
 
 
 def test_what_moved_away_is_left_out_once_it_is_known() -> None:
-    """And no cloud is read again before."""
+    """No cloud is read again before that."""
     cloud, clouds, live = room(thing=True), Counted(), OccupancyMap(SETTINGS, 10**7)
     clouds.append(pack_cloud(cloud))
     for _ in range(2):
@@ -196,8 +198,8 @@ def test_what_moved_away_is_left_out_once_it_is_known() -> None:
 @pytest.mark.parametrize("thing", [True, False])
 @pytest.mark.parametrize("borrows", [True, False])
 def test_what_was_moved_goes_and_what_is_new_appears_when_the_robot_comes_by(thing: bool, borrows: bool) -> None:
-    """In each of four rounds, of which three keyframes are in the room and eleven elsewhere, and whether or not they
-    find the place again; what they saw before, and where they were, leaves no trace."""
+    """In each of four rounds, three keyframes are in the room and eleven elsewhere, whether or not they find the place
+    again. Their earlier observations and poses leave no trace."""
     live, clouds, there = OccupancyMap(SETTINGS, 10**7), stored([]), thing
     poses = np.repeat(np.eye(4)[None], 4 * 14, 0)
     for node in range(4 * 14):
@@ -216,7 +218,8 @@ def test_what_was_moved_goes_and_what_is_new_appears_when_the_robot_comes_by(thi
 
 
 def test_its_size_is_bounded_and_it_grows_fine_again() -> None:
-    """Poses that a wrong loop throws far off make cells coarse, not memory large; put right they are forgotten."""
+    """Poses that a wrong loop moves far away make the cells coarse, but do not take much memory. Once corrected, they
+    have no effect."""
     live, clouds, poses = OccupancyMap(SETTINGS, 1_000_000), stored([room()] * 2), np.repeat(np.eye(4)[None], 2, 0)
     far = poses.copy()
     far[1, :2, 3] = 5000.0
@@ -235,7 +238,7 @@ def test_the_newest_come_first_when_time_is_short(monkeypatch: pytest.MonkeyPatc
     poses = np.repeat(np.eye(4)[None], 3, 0)
     poses[:, 0, 3] = [0.0, 50.0, 100.0]
     live, clouds = OccupancyMap(SETTINGS, 10**7), stored([room()] * 3)
-    assert not live.update(clouds, poses, seconds=1.5)  # a second for each question what time it is
+    assert not live.update(clouds, poses, seconds=1.5)  # each reading of the clock takes a second
     grid = live.grid()
     assert grid.origin[0] > 90.0
     while not live.update(clouds, poses, seconds=1.5):
@@ -245,7 +248,7 @@ def test_the_newest_come_first_when_time_is_short(monkeypatch: pytest.MonkeyPatc
 
 
 def known(grid: Grid) -> set[tuple[int, int]]:
-    """The cells of 0.1 m that are not unknown, by x and y; a larger cell is all of those in it."""
+    """Cells of 0.1 m that are not unknown, by x and y; a larger cell counts as all cells within it."""
     times = round(grid.resolution / 0.1)
     places = np.argwhere(np.kron(grid.cells[::-1].T != UNKNOWN, np.ones((times, times), bool)))
     return set(map(tuple, (places + np.round(np.array(grid.origin) / 0.1).astype(int)).tolist()))
@@ -253,7 +256,8 @@ def known(grid: Grid) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize("most", [10**7, 300_000])
 def test_a_drive_that_leaves_the_grid_loses_nothing_of_it(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Time for three keyframes at each message. A grid of at most 300,000 cells must have larger ones from 24 m on."""
+    """There is time for three keyframes per message. A grid of at most 300,000 cells needs larger cells from 24 m
+    on."""
     poses = np.repeat(np.eye(4)[None], 12, 0)
     poses[:, 0, 3] = 10.0 * np.arange(12)
     live, before, sizes = OccupancyMap(SETTINGS, most), set[tuple[int, int]](), set[float]()
@@ -266,7 +270,7 @@ def test_a_drive_that_leaves_the_grid_loses_nothing_of_it(most: int, monkeypatch
         sizes.add(grid.resolution)
         now = known(grid)
         assert before <= now
-        before = now if grid.resolution == 0.1 else set()  # cells of 0.2 m hold fans by their own rounding
+        before = now if grid.resolution == 0.1 else set()  # fans in cells of 0.2 m are rounded differently
     assert sizes == ({0.1} if most == 10**7 else {0.1, 0.2})
     while not live.update(clouds, poses, seconds=1.5):
         pass
@@ -276,7 +280,7 @@ def test_a_drive_that_leaves_the_grid_loses_nothing_of_it(most: int, monkeypatch
 
 
 def test_fans_outside_the_new_place_of_the_grid_leave_no_trace() -> None:
-    """Poses that move far at once, cells of the same size: there and back again."""
+    """The poses move far away at once and back again; the cells keep their size."""
     clouds, poses = stored([room(), room(thing=True)]), np.repeat(np.eye(4)[None], 2, 0)
     far = poses.copy()
     far[:, 0, 3] = 90.0
@@ -301,7 +305,8 @@ def test_only_what_is_placed_is_drawn_and_taken_back_when_it_no_longer_is() -> N
 
 @pytest.mark.long
 def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
-    """Counts of 16 bits had no walls after 16,384 keyframes at one place, and nothing after twice as many."""
+    """Previously, 16-bit counts lost the walls after 16,384 keyframes in one position, and everything after twice as
+    many."""
     settings, count = OccupancySettings(reach=2.0, resolution=0.5), 16_500
     around = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     wall = np.stack([1.5 * np.cos(around), 1.5 * np.sin(around), 0 * around, 0 * around], 1)
@@ -318,7 +323,8 @@ def test_a_robot_that_stays_for_days_keeps_its_walls() -> None:
 
 @pytest.mark.parametrize("degrees", [0, 20, 35, 180])
 def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: float) -> None:
-    """In each keyframe the same, as of a LiDAR that is mounted like that; to what the ground of a scan is known to."""
+    """It is the same in each keyframe, as for a LiDAR that is mounted tilted. The tolerance is the accuracy of the
+    ground in a scan."""
     T_tilted_level = se3.exp([np.radians(degrees), 0, 0, 0, 0, 0])
     scene = next(iter(open_source(recording).frames())).points
     cloud = se3.transform(T_tilted_level, scene).astype(np.float32)
@@ -326,13 +332,13 @@ def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: floa
         [T_tilted_level @ se3.exp([0, 0, 0.1 * n, n, 0, 0]) @ se3.inverse(T_tilted_level) for n in range(9)]
     )
     assert ground_tilt(stored([cloud] * 9), poses) == pytest.approx(degrees, abs=2.0)
-    mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground, by which there is no sensor over the ground
+    mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground, according to which no sensor is above the ground
     on_base = [cloud + np.append(mount, 0).astype(np.float32)] * 9
     assert ground_tilt(stored(on_base, mount), poses) == pytest.approx(degrees, abs=2.0)
 
 
 def test_of_a_level_building_and_of_clouds_without_ground_no_tilt_is_known(drive: tuple[CloudStore, Array]) -> None:
-    """Ceilings are no ground, and a wall is none."""
+    """Neither a ceiling nor a wall is ground."""
     clouds, poses = drive
     assert ground_tilt(clouds, poses) < 2.0
     wall = np.random.default_rng(0).uniform([5, -20, -1, 0], [5.1, 20, 8, 1], (5000, 4)).astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes can be taken out and maps be joined: constraints, trajectory and clouds survive."""
+"""Keyframes can be removed and maps joined: constraints, trajectory and clouds are kept."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIGMA = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03]) ** 2
 
 
 def laps(count: int, steps: int = 40, session: bool = False) -> MapData:
-    """Rounds of one circle, each keyframe with an edge to the one before and to the one a round before."""
+    """Laps of one circle. Each keyframe has an edge to the previous one and to the one a lap before."""
     turn = 2 * np.pi / steps * np.arange(count * steps)[:, None]
     poses = se3.exp(turn * np.array([0, 0, 1.0, 30.0, 0, 0]))
     clouds = CloudStore()
@@ -49,7 +49,7 @@ def error(edge: Edge, poses: Array) -> Array:
 
 
 def test_composition_and_inversion_carry_the_covariance() -> None:
-    """Against samples: 20 thousand noisy pairs; 5 % is four standard errors of a variance."""
+    """Compared with 20 thousand noisy pairs; 5 % is four standard errors of a variance."""
     rng = np.random.default_rng(0)
     Ta, Tb = se3.exp([0.1, -0.2, 0.5, 3, 1, 0.2]), se3.exp([-0.1, 0.3, 1.0, 2, -4, 0.5])
     a, b = Edge("odometry", 0, 1, Registration(Ta, SIGMA)), Edge("loop", 1, 2, Registration(Tb, 2 * SIGMA))
@@ -64,7 +64,7 @@ def test_composition_and_inversion_carry_the_covariance() -> None:
 
 
 def test_a_chain_keeps_its_ends() -> None:
-    """Taking out the middle of a chain is exact: one edge, whose covariance is the sum along the way."""
+    """Removing the middle of a chain is exact: one edge remains, whose covariance is the sum along the chain."""
     data = laps(1, 6)
     (edge,) = eliminate(data.edges, [1, 2, 3, 4])
     assert (edge.kind, edge.from_node, edge.to_node) == ("odometry", 0, 5)
@@ -78,7 +78,7 @@ def test_a_chain_keeps_its_ends() -> None:
 def test_pruning_laps_leaves_one_with_all_constraints() -> None:
     data = laps(3)
     nodes = redundant_nodes(data, 2.0, 20.0)
-    assert set(nodes) == set(range(40, 119))  # two laps, but for the last keyframe
+    assert set(nodes) == set(range(40, 119))  # two laps, except the last keyframe
     less = prune(data, nodes)
     assert len(less) == 41
     assert len(less.constraints) < len(data.constraints)
@@ -90,18 +90,19 @@ def test_pruning_laps_leaves_one_with_all_constraints() -> None:
     stamps, poses = trajectory(less)  # nothing of the trajectory is lost
     assert stamps == [k.stamp for k in data.keyframes]
     np.testing.assert_allclose(poses, data.poses, atol=1e-9)
-    again = prune(less, [5, 6, 40])  # what a pruned one was tied to can go, too
+    again = prune(less, [5, 6, 40])  # keyframes that took over edges of pruned ones can be pruned, too
     np.testing.assert_allclose(trajectory(again)[1], data.poses, atol=1e-9)
     np.testing.assert_array_equal(again.clouds[5], less.clouds[7])
 
 
 def test_many_laps_leave_no_more_edges_than_few() -> None:
-    """Every loop was carried along the drive to its end: 20 laps of 25 keyframes had not ended after 200 s."""
+    """Previously, every loop was carried along the drive to its end: 20 laps of 25 keyframes had not finished after 200
+    s."""
 
     def left(count: int) -> list[Edge]:
         data = laps(count, 12)
         edges = [e if e.kind == "odometry" else e.between(e.to_node % 12, e.to_node) for e in data.edges]
-        edges = eliminate(edges, range(12, len(data) - 1))  # loops as `to_lender` has them
+        edges = eliminate(edges, range(12, len(data) - 1))  # loops as `to_lender` returns them
         for edge in edges:
             np.testing.assert_allclose(error(edge, data.poses), 0, atol=1e-6)
         return edges
@@ -111,12 +112,13 @@ def test_many_laps_leave_no_more_edges_than_few() -> None:
         return {node: min(np.trace(e.covariance) for e in loops if e.from_node == node) for node in range(12)}
 
     few, many = left(3), left(6)
-    assert len(few) == len(many) == 12 + 14  # the odometry; between neighboring places, and two of the last keyframe
+    assert len(few) == len(many) == 12 + 14  # odometry; loops between neighboring places, and two of the last keyframe
     assert sure(many) == pytest.approx(sure(few), rel=1e-6)  # those of the last lap
 
 
 def test_loops_of_a_street_that_is_driven_again_stay_at_their_places() -> None:
-    """All were carried along the second drive: its length squared was to be composed, and none told much any more."""
+    """Previously, all loops were carried along the second drive. The number of compositions was its length squared, and
+    the resulting loops carried little information."""
     data = laps(2, 60)
     street = eliminate(data.edges, range(60, len(data) - 1))
     loops = [edge for edge in street if edge.kind == "loop"]
@@ -128,7 +130,8 @@ def test_loops_of_a_street_that_is_driven_again_stay_at_their_places() -> None:
 
 
 def test_the_next_storey_is_no_revisit() -> None:
-    """A car park: the lap above the first one is 2.8 m away, nearer than what `dpm2 map prune` takes for a revisit."""
+    """A car park: the lap above the first one is 2.8 m away, nearer than the distance at which `dpm2 map prune` assumes
+    a revisit."""
     data = laps(2)
     poses = data.poses.copy()
     poses[40:, 2, 3] += 2.8
@@ -136,7 +139,8 @@ def test_the_next_storey_is_no_revisit() -> None:
 
 
 def test_what_has_descriptors_does_not_go_for_what_has_none() -> None:
-    """As of a first drive with the points alone, or one whose payloads `dpm2 map check --recover` could not read."""
+    """For example a first drive with point-to-plane registration alone, or one whose payloads `dpm2 map check
+    --recover` could not read."""
     data = laps(2, session=True)
     seen = Descriptors(np.zeros((1, 3), np.float32), np.ones((1, 4), np.int8), np.ones(1, np.float32))
     described = [replace(keyframe, descriptors=seen) for keyframe in data.keyframes]
@@ -148,7 +152,7 @@ def test_what_has_descriptors_does_not_go_for_what_has_none() -> None:
 
 
 def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revisit() -> None:
-    """Without a place found, a second drive begins in the frame of the first, on top of it, wherever it was."""
+    """Without a localization, a second drive begins in the frame of the first, on top of it, wherever it really was."""
     data = laps(2, session=True)
     assert redundant_nodes(data, 2.0, 20.0) == list(range(40, 79))
     session = [keyframe.session for keyframe in data.keyframes]
@@ -159,13 +163,13 @@ def test_a_drive_that_nothing_ties_to_the_map_stays_where_it_seems_to_be_a_revis
 
 
 def test_pruned_keyframes_stay_with_the_part_that_they_are_tied_to() -> None:
-    """Though keyframes of a drive that nothing ties are between them and the rest, or lend them their clouds."""
+    """This is so even if keyframes of an unconnected drive lie between them and the rest, or lend them their clouds."""
     one = laps(1)
     again = [Edge("loop", node, node, Registration(np.eye(4), SIGMA)) for node in range(40)]
     revisit = merge_maps(merge_maps(one, one, np.eye(4)), one, np.eye(4), again)  # the second one is elsewhere
     borrowing = merge_maps(merge_maps(one, one, np.eye(4)), one, np.eye(4), again)
     for node in range(40, 120):
-        borrowing.clouds.borrow(node, Loan(node % 40, np.eye(4)))  # the second by loops that were rejected since then
+        borrowing.clouds.borrow(node, Loan(node % 40, np.eye(4)))  # the second one by loops that were rejected later
     for data, stay in ((revisit, [*range(80), 119]), (borrowing, [*range(40), *range(79, 120)])):
         gone = redundant_nodes(data, 2.0, 20.0)
         assert sorted({*range(len(data))} - {*gone}) == stay
@@ -180,7 +184,7 @@ def test_pruned_keyframes_stay_with_the_part_that_they_are_tied_to() -> None:
 
 
 def test_the_fixes_of_a_pruned_drive_stay_in_the_map() -> None:
-    """Where the antenna was is the same place of the map; a keyframe with a fix of its own keeps that."""
+    """The antenna keeps its position in the map. A keyframe with its own fix keeps that fix."""
     data, antenna = laps(2, session=True), np.array([0.5, 0.2, 1.0])
     poses = np.concatenate([data.poses[:40], data.poses[40:] @ se3.exp([0, 0, 0.1, 0.5, 0.3, 0])])
     fixes = {node: Fix(node, np.array([49.0, 8.4, node]), np.eye(3), antenna) for node in (3, *range(40, 79))}
@@ -194,7 +198,7 @@ def test_the_fixes_of_a_pruned_drive_stay_in_the_map() -> None:
         assert keyframe.fix.geodetic[2] == was
         at, before = less.poses[node] @ np.append(keyframe.fix.antenna, 1), poses[was] @ np.append(antenna, 1)
         np.testing.assert_allclose(at, before, atol=1e-9)  # rounding
-    (last,) = prune(data, range(79)).keyframes  # of all that go: the nearest, some would be 60 m off
+    (last,) = prune(data, range(79)).keyframes  # if all are pruned: only the nearest fix, as some would be 60 m off
     assert last.fix is not None
     assert last.fix.geodetic[2] == 78
 
@@ -220,7 +224,7 @@ def test_the_optimum_stays_when_nodes_go() -> None:
 
 
 def test_borrowers_go_before_their_lenders() -> None:
-    """But for the last one, and those that tell how a place was last seen."""
+    """Except the last one, and those that show how a place was last seen."""
     data = laps(3)
     for node in range(40, 120):
         data.clouds.borrow(node, Loan(node % 40, np.eye(4)))
@@ -239,10 +243,11 @@ def test_borrowers_go_before_their_lenders() -> None:
 
 
 def test_what_is_near_a_borrower_only_stays() -> None:
-    """A third lap 2.5 m beside the second, which borrows from the first: the map has nothing within 3 m of it."""
+    """A third lap runs 2.5 m next to the second, which borrows from the first: no cloud of the map is within 3 m of
+    it."""
     data = laps(3)
     poses = data.poses.copy()
-    poses[:, 2, 3] += np.repeat([0, 2.5, 5.0], 40) / 4  # height counts for four
+    poses[:, 2, 3] += np.repeat([0, 2.5, 5.0], 40) / 4  # height counts four times
     for node in range(40, 80):
         data.clouds.borrow(node, Loan(node - 40, np.eye(4)))
     assert redundant_nodes(replace(data, poses=poses), 3.0, 30.0) == []
@@ -268,7 +273,7 @@ def test_merged_side_by_side(tmp_path: Path, map_file: Path) -> None:
 def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
     a, b = laps(1), laps(1)
     T_a_b = se3.exp([0, 0, 1.0, 50, 20, 1])
-    b = replace(b, poses=se3.inverse(T_a_b) @ b.poses)  # the same places, in another frame
+    b = replace(b, poses=se3.inverse(T_a_b) @ b.poses)  # the same places in another frame
     same = Registration(np.eye(4), SIGMA)
     loops = [Edge("loop", a, b, same) for a, b in ((3, 3), (13, 13), (23, 23), (5, 30))]
     found = align(a, b, lambda one, two: loops)
@@ -281,7 +286,8 @@ def test_maps_are_aligned_by_their_loops_though_one_of_them_is_off() -> None:
 
 
 def test_maps_with_thousands_of_loops_between_them_are_aligned_at_once() -> None:
-    """Each of 1,000 was compared with each in Python: 2.7 s, and 100 times as long of 10 times as many."""
+    """Previously, each of 1,000 loops was compared with each other one in Python: 2.7 s, and 100 times as long for 10
+    times as many."""
     a = laps(1)
     loops = [Edge("loop", node % 40, node % 40, Registration(np.eye(4), SIGMA)) for node in range(2000)]
     began = time.process_time()
@@ -290,7 +296,8 @@ def test_maps_with_thousands_of_loops_between_them_are_aligned_at_once() -> None
 
 
 def test_a_map_that_is_merged_again_and_again_stays_rigid() -> None:
-    """Each time behind another one, as `dpm2 map merge new old`: the rounding of its rotations was doubled."""
+    """It is the second map each time, as in `dpm2 map merge new old`. Previously, the rounding error of its rotations
+    doubled."""
     new, old = laps(1, 4), laps(1, 4)
     loop = Edge("loop", 1, 2, Registration(se3.exp([0.1, 0.2, 0.3, 1, 2, 3]), SIGMA))
     for _ in range(60):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions in the same place have the clouds of one, also where a loop was accepted later than it was found."""
+"""Sessions in the same place have the clouds of one session, even if a loop was accepted later than it was found."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from test.helpers.loops import KnownLoops
 from test.helpers.maps import FIRM
 
 LENGTH = 6
-"""Keyframes of a session."""
+"""Keyframes per session."""
 
 
 def first_waits(node: int) -> list[Edge]:
-    """The keyframe of the session before. The first loop waits for the second, and is accepted with it."""
+    """Loop to the keyframe of the previous session. The first loop waits for the second, and is accepted with it."""
     if node < LENGTH:
         return []
     found = Edge("loop", node - LENGTH, node, Registration(np.eye(4), FIRM, 0.9, 0.05, "known"))
@@ -33,7 +33,7 @@ def first_waits(node: int) -> list[Edge]:
 
 
 def add_session(path: Path, noise: np.random.Generator) -> Mapper:
-    """A straight drive of `LENGTH` keyframes into a map file."""
+    """Add a straight drive of `LENGTH` keyframes to a map file."""
     with MapStore.open(path, read_only=False) if path.exists() else MapStore.create(path) as store:
         store.begin_session()
         mapper = Mapper(MapSettings(), PoseGraph(RobustSettings()), KnownLoops(first_waits), store)
@@ -48,8 +48,8 @@ def add_session(path: Path, noise: np.random.Generator) -> Mapper:
 def test_sessions_that_begin_where_others_did_have_the_clouds_of_one(
     tmp_path: Path, noise: np.random.Generator
 ) -> None:
-    """The first keyframe of each kept its own: at every session there was one more place that could be found. Of each
-    place the newest cloud stays, too."""
+    """Previously, the first keyframe of each session kept its own cloud: every session added one more place to be
+    found. The newest cloud of each place is kept, too."""
     path = tmp_path / "a.dpm2map"
     for _ in range(4):
         written = add_session(path, noise)
@@ -69,7 +69,8 @@ def test_sessions_that_begin_where_others_did_have_the_clouds_of_one(
 def test_a_loop_that_waited_for_another_one_is_one_constraint_of_the_file(
     tmp_path: Path, noise: np.random.Generator
 ) -> None:
-    """Its rejection, of the same measurement, was turned into an acceptance at the end: the map had the loop twice."""
+    """Previously, the rejection of the same measurement was changed to an acceptance at the end: the map had the loop
+    twice."""
     path = tmp_path / "a.dpm2map"
     for _ in range(2):
         mapper = add_session(path, noise)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map in tiles is the map, of which only the surroundings are open; what is damaged is named."""
+"""A map in tiles equals the map, but only the surroundings are open. Errors name what is damaged."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZE = 50.0
 
 @pytest.fixture
 def data(noise: np.random.Generator) -> MapData:
-    """A ring of 60 keyframes, 95 m across, with descriptors but for one; one borrows the cloud of another."""
+    """A ring of 60 keyframes, 95 m across. All but one have descriptors, and one borrows the cloud of another."""
     made = ring(60, points=50)
     described = [
         replace(
@@ -51,7 +51,8 @@ def folder(tmp_path: Path, data: MapData) -> Path:
 
 
 def test_every_keyframe_with_a_cloud_is_in_the_tile_of_its_place(folder: Path, data: MapData) -> None:
-    """With its pose, cloud, descriptors and the edges between them; each tile is a sound map by itself."""
+    """A tile contains its pose, cloud and descriptors and the edges between its keyframes. Each tile is a valid map by
+    itself."""
     found: dict[int, Path] = {}
     for path in folder.glob("*.dpm2map"):
         assert not check_map(path).problems
@@ -123,10 +124,10 @@ def test_what_is_wrong_is_named(tmp_path: Path, folder: Path, data: MapData) -> 
 def test_what_can_be_read_is_searched_without_what_cannot(
     folder: Path, data: MapData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One tile that was missing among the candidates hid all places in the others."""
+    """Previously, one missing tile among the candidates hid all places in the others."""
 
     class Here:
-        """Stands in for a relocalizer: everything is found, or nothing is."""
+        """Stand-in for a relocalizer: it finds everything or nothing."""
 
         def __init__(self, made: MapData) -> None:
             self.count = len(made)
@@ -149,11 +150,11 @@ def test_what_can_be_read_is_searched_without_what_cannot(
                 else:
                     with pytest.raises(Dpm2Error, match=r"0_0\.dpm2map: no such map file"):
                         ask(keyframe)
-    assert counts == [44] * 4  # of 59, 15 of them in the tile that is missing
+    assert counts == [44] * 4  # of 59; 15 of them are in the missing tile
 
 
 def test_a_full_disk_names_what_was_asked_for(tmp_path: Path) -> None:
-    """And no hidden file or folder in which it was written."""
+    """The error does not name the hidden file or folder in which it was written."""
     data, out = ring(20, points=2000), tmp_path / "tiles"
     with largest_file(150_000), pytest.raises(Dpm2Error, match=rf"^{out}/0_0\.dpm2map: (?!.*\.part)"):
         write_tiles(data, out, SIZE)
@@ -163,7 +164,7 @@ def test_a_full_disk_names_what_was_asked_for(tmp_path: Path) -> None:
 
 
 def test_nobody_is_looked_for_in_tiles_without_descriptors(tmp_path: Path, folder: Path) -> None:
-    """As in such a map; the drive went on to its end, and was found nowhere."""
+    """The same for a map without tiles. Previously, the drive continued to its end and was never localized."""
     write_tiles(ring(20, points=50), tmp_path / "bare", SIZE)
     with pytest.raises(UsageError, match="bare: no keyframe has descriptors"):
         open_for_localization(tmp_path / "bare", SlamSettings())
@@ -183,7 +184,7 @@ def test_an_index_that_cannot_be_is_damaged(folder: Path, key: str, value: objec
 
 
 def test_a_table_that_cannot_be_is_damaged(folder: Path) -> None:
-    """Also one that would be code."""
+    """Also a table that would be code."""
     for table in (np.zeros((59, 3), np.float32), np.zeros((59, 528)), np.array([print], dtype=object)):
         np.save(folder / VECTORS, table)
         with pytest.raises(Dpm2Error, match="index of its tiles is damaged"):
