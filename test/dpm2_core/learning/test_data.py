@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training data: packing, augmentation that keeps the truth, and groups."""
+"""Training data: packing, augmentation that preserves the ground truth, and groups."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_packing_keeps_clouds_to_a_millimeter(packed: Path, samples: list[Sample
 
 
 def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], tmp_path: Path) -> None:
-    """What a killed run leaves has another name, and is replaced by the next; the name of the whole does not matter."""
+    """A killed run leaves another name, which the next run replaces; the name of the parent folder does not matter."""
     root = tmp_path / "root.parts"
     left = root / f".new.{os.getpid()}.part"
     shutil.copytree(packed / "world", left)
@@ -60,7 +60,7 @@ def test_without_a_drive_of_some_weight_there_is_nothing_to_learn(packed: Path, 
 
 
 def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tmp_path: Path) -> None:
-    """LiDAR alone was learned, and the weights said that they know images."""
+    """Only LiDAR data was learned, but the metadata of the weights stated that they use images."""
     write_packed(tmp_path / "one", [sample._replace(images=()) for sample in samples], {})
     settings = DataSettings(packed={str(tmp_path): 1.0}, images=True)
     with pytest.raises(UsageError, match=r"data\.images: no packed drive"):
@@ -71,7 +71,7 @@ def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tm
 def test_drives_that_differ_in_their_images_alone_are_told_apart(
     samples: list[Sample], tmp_path: Path, frame: int
 ) -> None:
-    """The same points and poses, as a world at another hour has them; or the same pixels of another camera."""
+    """The same points and poses, as of a world at another time of day; or the same pixels from another camera."""
     image = samples[frame].images[0]
     turned = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ se3.exp([0, 0, 0.1, 0, 0, 0]))
     others = [image, replace(image, pixels=255 - image.pixels), replace(image, camera=turned)]
@@ -86,14 +86,15 @@ def test_drives_that_differ_in_their_images_alone_are_told_apart(
 
 
 def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
-    """No poses, or another format."""
+    """They have no poses, or another format."""
     (tmp_path / "about.json").write_text("{}")
     with pytest.raises(UsageError, match="no packed drive"):
         open_packed(tmp_path)
 
 
 def test_augmentation_keeps_points_where_they_are_in_the_world(samples: list[Sample]) -> None:
-    """After a rigid motion of the sensor frame, pose times cloud is the same set of points, and so is the camera."""
+    """After a rigid motion of the sensor frame, pose times cloud is the same set of points; the same holds for the
+    camera."""
     sample = samples[0]
     motion = {"yaw": 3, "tilt": 0.1, "shift": (2, 2, 1), "extrinsic_rotation": 0, "extrinsic_translation": 0}
     changed = augment(sample, AugmentSettings(**{**NOTHING, **motion}), np.random.default_rng(0))
@@ -108,7 +109,7 @@ def test_augmentation_keeps_points_where_they_are_in_the_world(samples: list[Sam
 
 
 def test_occlusion_removes_what_lies_behind(samples: list[Sample]) -> None:
-    """Sectors lose their far points only, nothing nearer than 2 m, and never the whole scan."""
+    """Sectors lose only their far points, nothing nearer than 2 m, and never the whole scan."""
     settings = AugmentSettings(**{**NOTHING, "occlusion": 1})
     cloud = samples[0].cloud
     sizes = set()
@@ -122,7 +123,7 @@ def test_occlusion_removes_what_lies_behind(samples: list[Sample]) -> None:
 
 
 def test_images_are_dropped_blacked_and_exposed(samples: list[Sample]) -> None:
-    """With certainty where the probability is 1; pixels stay bytes."""
+    """Each happens always if its probability is 1; pixels stay bytes."""
     noise = np.random.default_rng(0)
     assert augment(samples[0], AugmentSettings(**{**NOTHING, "image_drop": 1}), noise).images == ()
     (black,) = augment(samples[0], AugmentSettings(**NOTHING, image_black=1), noise).images
@@ -149,7 +150,7 @@ def test_groups_are_near_and_spread() -> None:
 
 
 def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None:
-    """In a tunnel pairs far apart taught the network to match what is not the same."""
+    """In a tunnel, pairs far apart taught the network to match structures that are not the same."""
     cloud = np.zeros((0, 3), np.float32)
     samples = [Sample(cloud, se3.make(np.eye(3), [x, 0, 0]), ()) for x in np.arange(100.0)]
     settings = DataSettings(radius=50, radii={"tunnel": 15})
@@ -163,13 +164,13 @@ def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("setting", [{"emphasis": {"citty": 100}}, {"radii": {"tunel": 1}}])
 def test_an_unknown_place_is_rejected(setting: dict) -> None:
-    """It was taken, and changed nothing."""
+    """It was accepted, but had no effect."""
     with pytest.raises(ValidationError, match="there are city, suburb, rural"):
         DataSettings(**setting)
 
 
 def test_a_lonely_frame_is_its_own_group() -> None:
-    """No neighbor within the radius: it repeats."""
+    """Without a neighbor within the radius, the frame repeats."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 100
     assert len(set(draw_group(poses, np.random.default_rng(0), 3, 20))) == 1
@@ -188,13 +189,13 @@ def test_overlap_groups_have_half_positives_and_hard_negatives() -> None:
 
 
 def test_average_precision_of_known_rankings() -> None:
-    """All right is 1; one positive ranked second is a half."""
+    """If all are ranked correctly it is 1; one positive ranked second gives a half."""
     assert average_precision(np.array([0.9, 0.8, 0.1]), np.array([True, True, False])) == 1
     assert average_precision(np.array([0.9, 0.8, 0.1]), np.array([False, True, False])) == 0.5
 
 
 def test_batches_depend_on_their_number_alone(packed: Path) -> None:
-    """So that a resumed run, with any number of workers, sees the same."""
+    """Thus a resumed run, with any number of workers, receives the same batches."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, images=True, workers=0)
     data = GroupDataset(settings, tiny(), settings.draw, seed=3)
     later = GroupDataset(settings.model_copy(update={"workers": 2}), tiny(), settings.draw, seed=3)
@@ -207,7 +208,7 @@ def test_batches_depend_on_their_number_alone(packed: Path) -> None:
 
 @pytest.mark.parametrize("every", [False, True])
 def test_a_scan_that_shows_nothing_does_not_end_a_training(samples: list[Sample], tmp_path: Path, every: bool) -> None:
-    """As beside a truck: another place is drawn; an error only where there is no other one."""
+    """As next to a truck: another place is drawn. It is an error only if there is no other place."""
     nothing = [sample._replace(cloud=sample.cloud[:3]) for sample in samples]
     write_packed(tmp_path / "world", nothing if every else [*samples, nothing[0]], {})
     settings = DataSettings(packed={str(tmp_path): 1.0}, groups=1, frames=2)
@@ -222,7 +223,7 @@ def test_a_scan_that_shows_nothing_does_not_end_a_training(samples: list[Sample]
 
 @pytest.mark.parametrize("sides", [(1, 1), (1, 3), (2, 2)])
 def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[int, int]) -> None:
-    """Members moved to the first of their side, and one side to the other, meet in the world."""
+    """Members moved to the first of their side, and one side moved to the other, coincide in the world."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=2, frames=4, workers=0)
     batch = GroupDataset(settings, model.settings, settings.draw, 0)[0, 0]
     plan = sample_set_pairs(batch.poses, 2, sides, 20.0, torch.Generator().manual_seed(0))
@@ -245,7 +246,7 @@ def test_plans_hold_the_truth(model: DeepPointMap2, packed: Path, sides: tuple[i
 
 @pytest.mark.parametrize("view_aligned", [True, False])
 def test_merged_sets_have_the_same_axes_in_training_and_in_use(view_aligned: bool) -> None:
-    """Offsets are trained in the axes in which the decoder reads them: turned with the member, or those of the set."""
+    """Offsets are trained in the axes in which the decoder reads them: rotated with the member, or those of the set."""
     noise = np.random.default_rng(0)
     axes = noise.normal(size=(2, 5, 2))
     axes = (axes / np.linalg.norm(axes, axis=-1, keepdims=True)).astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fine-tuning: gradients of the trajectory against differences, references by SLAM, resuming, what cannot be."""
+"""Fine-tuning: gradients of the trajectory against differences, references by SLAM, resuming, and invalid requests."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from ...helpers.networks import tiny
 from ...helpers.training import stopped
 
 GEOMETRIC = SlamSettings(registration="geometric", loops={"descriptors": False}, threads=1)  # type: ignore[arg-type]
-"""A reference by points alone: what is made of it is the same as by the network, which takes most of the time."""
+"""A reference by geometric registration alone: what follows is the same as with the network, which takes most time."""
 
 GEOMETRIC = SlamSettings(registration="geometric", loops={"descriptors": False}, threads=1)  # type: ignore[arg-type]
-"""A reference by points alone: what is made of it is the same as by the network, which takes most of the time."""
+"""A reference by geometric registration alone: what follows is the same as with the network, which takes most time."""
 
 
 def descriptors(poses: torch.Tensor, channels: int) -> Tokens:
-    """Tokens of G * F scans of the same 60 places, each with its own feature in every scan; poses (G, F, 4, 4)."""
+    """Tokens of G * F scans of the same 60 places, each with the same feature in every scan; poses (G, F, 4, 4)."""
     generator = torch.Generator().manual_seed(0)
     places = torch.randn(60, 3, generator=generator, dtype=torch.float64) * torch.tensor([15.0, 15.0, 1.0])
     features = torch.randn(60, channels, generator=generator)
@@ -60,7 +60,7 @@ def road() -> torch.Tensor:
 
 
 def test_the_gradient_of_the_trajectory_is_that_of_differences(road: torch.Tensor) -> None:
-    """With respect to one coordinate of one descriptor, to 2 %: the last least-squares steps carry it."""
+    """With respect to one coordinate of one descriptor, to 2 %: the last least-squares steps carry the gradient."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     tokens = descriptors(road, model.settings.channels)
@@ -145,7 +145,7 @@ def _truth(recording: Path) -> Array:
 
 @pytest.mark.slow
 def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have_none(recording: Path) -> None:
-    """No ground truth goes in: from scan to scan it is within 2 cm of it."""
+    """No ground truth is used: from scan to scan the reference is within 2 cm of it."""
     referenced = refer(open_source(recording), SlamSettings(threads=1))
     truth = _truth(recording)
     steps = [se3.inverse(poses[:-1]) @ poses[1:] for poses in (referenced.poses, truth)]
@@ -153,7 +153,7 @@ def test_the_reference_is_the_trajectory_of_the_slam_and_frames_without_one_have
 
 
 def carried(frame: Frame) -> Frame:
-    """After eight frames the recording goes on 20 s later in another place: the mirror image."""
+    """After eight frames the recording continues 20 s later in another place: the mirror image."""
     if frame.index < 8:
         return frame
     return replace(frame, points=frame.points * np.float32([1, -1, 1, 1]), stamp=frame.stamp + 20 * 10**9)
@@ -161,8 +161,8 @@ def carried(frame: Frame) -> Frame:
 
 @pytest.mark.slow
 def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording: Path) -> None:
-    """Where the second part is to the first is a guess, which was learned from and measured against like all else. The
-    last scan before the pause is left out: the motion to the next one, by which its sweep is straightened, is none."""
+    """The pose of the second part relative to the first is a guess, but was used for training and evaluation. The last
+    scan before the pause is left out: the motion to the next scan, which its de-skewing needs, is invalid."""
     referenced = refer(InMemory([*map(carried, open_source(recording).frames())]), GEOMETRIC)
     poses, truth = referenced.poses, _truth(recording)
     there = np.flatnonzero(np.isfinite(poses).all((1, 2)))
@@ -180,7 +180,7 @@ def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording
 
 @pytest.mark.slow
 def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() -> None:
-    """Of clouds that were de-skewed already the SLAM finds that out; they were packed de-skewed once more."""
+    """The SLAM detects that the clouds are de-skewed already; they were packed de-skewed a second time."""
     lidar = LidarConfig(beams=32, columns=512, height=1.4, car_body=False)
     robot = TurningRobot(build_world("loop", "suburb", seed=1, length=300.0), 40, RIDES["waved"], lidar)
     frames = []
@@ -199,16 +199,16 @@ def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() ->
 def test_a_stopped_training_goes_on_to_the_same_weights(
     recording: Path, tmp_path: Path, settings: FinetuneSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And the weights carry the metadata of those that they started from."""
+    """The weights also carry the metadata of those that they started from."""
     data = tmp_path / "data"
     network = load_model(Path(settings.weights)).settings
     prepare([open_source(recording)], settings, network, SlamSettings(threads=1), data)
     assert sum(len(packed) for packed in open_packed(data / "drives")) == 20
-    other = settings.model_copy(update={"held_out": 0.4})  # another part was held out, and it went on without a word
+    other = settings.model_copy(update={"held_out": 0.4})  # with another part held out, it continued without a message
     with pytest.raises(UsageError, match=f"{data}.*: made with held_out {settings.held_out}, not 0.4; remove it"):
         prepare([open_source(recording)], other, network, SlamSettings(threads=1), data)
     with pytest.raises(UsageError, match=r"00_\w+: of a drive that is not asked for; remove it"):
-        prepare([], settings, network, SlamSettings(threads=1), data)  # it was learned from, too
+        prepare([], settings, network, SlamSettings(threads=1), data)  # that drive was used for training, too
     whole = finetune(settings, tmp_path / "whole", data=data)
     stopped(lambda: finetune(settings, tmp_path / "parts", data=data), monkeypatch)
     parts = finetune(settings, tmp_path / "parts", data=data)
@@ -224,7 +224,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
 def test_the_reference_leaves_as_many_threads_as_there_were(
     recording: Path, packed: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
-    """The SLAM took all but one, and --resume, for which there is nothing left to refer, had them: other weights."""
+    """The SLAM used all but one, and --resume, with no references left to compute, used all: other weights resulted."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
@@ -251,7 +251,7 @@ def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
 def test_a_held_out_part_is_measured_where_it_has_pairs_and_named_where_it_has_none(
     recording: Path, tmp_path: Path, settings: FinetuneSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last four scans are within 5 m, the last ten are not; scans that are 7 m apart have no near pair."""
+    """The last four scans are within 5 m, the last ten are not; scans 7 m apart have no near pair."""
     network = load_model(Path(settings.weights)).settings
     for held_out, every, measured in ((0.15, 1, False), (0.4, 1, True), (0.5, 8, False)):
         source = open_source(recording)
@@ -279,19 +279,19 @@ def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: F
         assert done.returncode == 2
         assert message in done.stderr
         assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "o").exists()  # as of every request that cannot be carried out
+    assert not (tmp_path / "o").exists()  # as for every request that cannot be carried out
 
 
 def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
     recording: Path, packed: Path, samples: list[Sample], tmp_path: Path, settings: FinetuneSettings
 ) -> None:
-    """Packed again, with another drive, they gave other weights without a word."""
+    """After packing them again with another drive, other weights resulted without a message."""
     short = tmp_path / "short" / "velodyne" / "000000.bin"
     short.parent.mkdir(parents=True)
     shutil.copy(recording / "sequences" / "00" / "velodyne" / "000000.bin", short)
     asked = ["finetune", tmp_path / "short", "--out", tmp_path / "o", "--set", f"weights={settings.weights}"]
     asked += ["--set", f"rehearsal={packed}"]
-    assert "nothing to learn" in dpm2(*asked).stderr  # after what was asked for has been written
+    assert "nothing to learn" in dpm2(*asked).stderr  # after the request has been recorded
     (tmp_path / "o" / "checkpoint.pt").touch()
     assert "nothing to learn" in dpm2(*asked, "--resume").stderr
     write_packed(packed / "another", samples[:2], {"source": "boxes"})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train pack`: recorded drives become what training reads, and are mixed by weight."""
+"""`dpm2 train pack`: recorded drives are converted to training data, and mixed by weight."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from ...helpers.scenes import boxes, make_image
 
 
 class Sweeps(IndexedSource):
-    """Six sweeps of a street at 10 m/s in a bend, each point seen from where the LiDAR was at its time."""
+    """Six sweeps of a street at 10 m/s in a bend; each point is relative to the LiDAR's pose at the point's time."""
 
     def __init__(self, world: np.ndarray, images: bool = True) -> None:
         super().__init__("sweeps", 6)
@@ -59,7 +59,7 @@ class Sweeps(IndexedSource):
 
 
 def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
-    """Enlarged, way and all."""
+    """It is enlarged, including the trajectory."""
     poses = rooms.walk(5)
     source = InMemory(rooms.frames(poses))
     source.poses = poses
@@ -74,14 +74,14 @@ def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
 
 
 class Leaning(IndexedSource):
-    """Two scans of a street by a sensor that leans forward by 20 degrees, with images."""
+    """Two scans of a street by a sensor that is pitched forward by 20 degrees, with images."""
 
     def __init__(self) -> None:
         super().__init__("leaning", 2)
         level = np.stack([np.eye(4), se3.exp([0, 0, 0.1, 1, 0, 0])])
         self.poses = level @ se3.exp([0, np.radians(20), 0, 0, 0, 0])
         world = boxes(np.random.default_rng(0), 20_000)
-        self.world = world[world[:, 2] >= -1.7]  # nothing beneath the ground
+        self.world = world[world[:, 2] >= -1.7]  # nothing below the ground
 
     def frame(self, position: int) -> Frame:
         seen = se3.transform(se3.inverse(self.poses[position]), self.world)
@@ -90,7 +90,7 @@ class Leaning(IndexedSource):
 
 
 def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -> None:
-    """As the network sees them; poses and cameras go with them."""
+    """The network receives them in these axes; poses and cameras are transformed with them."""
     source = Leaning()
     pack(source, tmp_path / "d", tiny())
     drive = PackedDrive(tmp_path / "d")
@@ -99,14 +99,15 @@ def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -
         assert sample.pose[2, 2] > np.cos(np.radians(2))  # the street is level
         there = se3.transform(sample.pose, sample.cloud.astype(np.float64))
         gap = cKDTree(source.world).query(there)[0]
-        assert gap.max() < 0.01  # 2 mm of packing
+        assert gap.max() < 0.01  # packing: 2 mm
         of_camera = source.poses[n] @ frame.images[0].camera.T_lidar_cam
         np.testing.assert_allclose(sample.pose @ sample.images[0].camera.T_lidar_cam, of_camera, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
-    """Undistorted by the true motion, the points of all frames are the same in the world; no pose, no sample."""
+    """After de-skewing by the true motion, points of all frames coincide in the world; frames without a pose are left
+    out."""
     world = boxes(np.random.default_rng(0), 1000)
     seen: list[tuple[int, int]] = []
     assert pack(Sweeps(world), tmp_path / "d", tiny(), progress=lambda *done: seen.append(done)) == 5
@@ -118,13 +119,13 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
         assert sample.images[0].pixels.shape == (height, width, 3)
         there = se3.transform(sample.pose, sample.cloud.astype(np.float64))
         gap = np.linalg.norm(there[:, None] - world[None], axis=2).min(1)
-        # 2 mm of packing, and steps of a millisecond at 10 m/s; without undistorting it is half a meter.
+        # 2 mm of packing, and steps of a millisecond at 10 m/s; without de-skewing it is half a meter.
         assert np.quantile(gap, 0.99) < 0.02
 
 
 def test_a_scan_that_shows_hardly_anything_is_left_out_and_said(kitti: Path, tmp_path: Path) -> None:
-    """An empty file, and a sensor that sees its own housing alone: the first pair of a validation that took such a scan
-    ended the training, and every one that was resumed."""
+    """An empty file, and a scan that shows only the sensor's own housing: the first validation pair with such a scan
+    ended the training, and also every resumed one."""
     drive, out = kitti / "sequences" / "03", tmp_path / "d"
     (drive / "velodyne" / "000000.bin").write_bytes(b"")
     np.full((500, 4), 0.2, np.float32).tofile(drive / "velodyne" / "000002.bin")
@@ -139,7 +140,7 @@ def test_a_scan_that_shows_hardly_anything_is_left_out_and_said(kitti: Path, tmp
 
 
 def test_what_cannot_be_packed(tmp_path: Path) -> None:
-    """No poses; none in the range; images in some frames only."""
+    """No poses; no pose in the range; images in some frames only."""
     source = Sweeps(boxes(np.random.default_rng(0), 200), images=False)
     with pytest.raises(UsageError, match="sweeps: frame 0 has no usable image of camera, frame 3 has one"):
         pack(source, tmp_path / "d", tiny())
@@ -165,13 +166,13 @@ def kitti(tmp_path: Path) -> Path:
 
 
 def test_command_and_mixture(kitti: Path, packed: Path, tmp_path: Path) -> None:
-    """`dpm2 train pack`, then training data by weight: 0.9 of the groups from a folder whatever its size."""
+    """`dpm2 train pack`, then training data by weight: 0.9 of the groups come from a folder, whatever its size."""
     out = tmp_path / "real" / "03"
     arguments = ["train", "pack", str(kitti), str(out), "--frames", "1:", "--set", "input.sequence=03"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert f"{out}: 3 frames" in done.stderr
-    arguments[3], arguments[-1] = str(tmp_path / "quiet"), "input.sequence=03"  # as dpm2 run has it, and its errors
+    arguments[3], arguments[-1] = str(tmp_path / "quiet"), "input.sequence=03"  # as in dpm2 run; and its errors
     assert CliRunner().invoke(app, [*arguments, "--quiet"]).stderr == ""
     assert PackedDrive(out).about["source"] == "03"
     assert len(PackedDrive(out)) == 3
@@ -186,7 +187,7 @@ def test_command_and_mixture(kitti: Path, packed: Path, tmp_path: Path) -> None:
 
 
 def test_a_bag_with_poses_packs_like_its_drive(kitti: Path, tmp_path: Path) -> None:
-    """Ground truth in an Odometry topic is as good as a poses.txt."""
+    """Ground truth in an Odometry topic is used like a poses.txt."""
     runner = CliRunner()
     bag, drive = tmp_path / "bag", str(kitti)
     arguments = {
@@ -223,7 +224,7 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     ):
         refused = CliRunner().invoke(app, [*arguments, *other])
         assert f"03: made with {name}" in str(refused.exception)
-    (kitti / "sequences" / "05" / "velodyne" / "000001.bin").unlink()  # no other drive, and no scans that were packed
+    (kitti / "sequences" / "05" / "velodyne" / "000001.bin").unlink()  # no other drive, and none whose scans changed
     shutil.rmtree(kitti / "sequences" / "03" / "velodyne")
     fewer = CliRunner().invoke(app, arguments)
     assert re.search(r"05: made with drive of 4 scans \(\w+\), not of 3 scans", str(fewer.exception))
@@ -234,7 +235,7 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
 
 
 def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path, tmp_path: Path) -> None:
-    """The first without scans or with one image missing ended the call, and each later one, without a name."""
+    """The first drive without scans or with a missing image ended this call and each later one, without being named."""
     for name in ("01", "05"):
         shutil.copytree(kitti / "sequences" / "03", kitti / "sequences" / name)
     for scan in (kitti / "sequences" / "01" / "velodyne").iterdir():
@@ -274,7 +275,7 @@ def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path
 def test_a_packed_drive_that_is_damaged_is_an_error_when_it_is_opened(
     file: str, content: bytes | list[Any] | None, tmp_path: Path
 ) -> None:
-    """Not in the midst of a training, nor never; None: cut off."""
+    """It is not an error in the middle of a training, nor undetected; None: truncated."""
     folder = tmp_path / "one"
     image = Image(np.zeros((4, 8, 3), np.uint8), Camera(np.eye(3), np.eye(4), (8, 4)))
     write_packed(folder, [Sample(np.zeros((5, 3), np.float32), np.eye(4), (image,)) for _ in range(3)], {})
@@ -288,7 +289,7 @@ def test_a_packed_drive_that_is_damaged_is_an_error_when_it_is_opened(
 
 
 def test_packing_holds_a_frame_at_a_time(tmp_path: Path) -> None:
-    """A hundred frames cost less memory than thirty of them together."""
+    """A hundred frames need less memory than thirty of them together."""
     frame = Sample(np.random.default_rng(0).uniform(-50, 50, (30_000, 3)).astype(np.float32), np.eye(4))
     tracemalloc.start()
     write_packed(tmp_path / "d", (frame for _ in range(100)), {})
@@ -309,14 +310,14 @@ def test_frames_that_differ_leave_nothing_behind(tmp_path: Path) -> None:
 
 def test_a_world_that_cannot_be_written_ends_the_others(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    (tmp_path / "world_001000").symlink_to(tmp_path / "file" / "below")  # where the first world cannot be
+    (tmp_path / "world_001000").symlink_to(tmp_path / "file" / "below")  # blocks the folder of the first world
     with pytest.raises(Dpm2Error, match="not written: Not a directory"):
         generate(tmp_path, GenerateSettings(worlds=20, frames=2, length=60, beams=16, mixture={"tunnel": 1}), 1)
-    assert len(list(tmp_path.glob("world_*"))) < 10  # of 20: those that were begun
+    assert len(list(tmp_path.glob("world_*"))) < 10  # of 20: those that had been started
 
 
 def test_worlds_of_other_settings_are_not_taken_for_those_that_are_asked_for(tmp_path: Path) -> None:
-    """A set that is continued with another sensor would be of both, without a word."""
+    """A set that is continued with another sensor would silently mix both."""
     settings = GenerateSettings(worlds=1, frames=2, length=60, beams=16, mixture={"tunnel": 1})
     generate(tmp_path, settings, 1)
     generate(tmp_path, settings, 1)
@@ -327,7 +328,7 @@ def test_worlds_of_other_settings_are_not_taken_for_those_that_are_asked_for(tmp
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
-    """`ulimit -f` as the disk: a file may have no more than 64 kB."""
+    """`ulimit -f` acts as the disk: a file may have no more than 64 kB."""
     code = """
 import resource, signal, sys, numpy as np
 from pathlib import Path

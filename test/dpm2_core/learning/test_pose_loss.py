@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss on the pose: what an error costs, and that it trains the network, from the truth where that has diverged."""
+"""The loss on the pose: the cost of an error, and its training of the network, from the truth after divergence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TRUTH = torch.from_numpy(se3.exp([0.01, -0.02, 1.0, 3.0, 0.5, 0.1]))[None]
 
 @pytest.mark.parametrize("size", [0.1, 0.5])
 def test_five_meters_count_as_much_as_a_radian(size: float) -> None:
-    """Of both the loss is that of the distance, less than `FINE` for the smooth part off."""
+    """For both, the loss is that of the distance, apart from less than `FINE` for the smooth part."""
     costs = [
         float(pose_loss(TRUTH @ torch.from_numpy(se3.exp(xi)), TRUTH))
         for xi in ([0, 0, 0, 0.6 * size, 0.8 * size, 0], [0, size / 5, 0, 0, 0, 0])
@@ -35,7 +35,7 @@ def test_five_meters_count_as_much_as_a_radian(size: float) -> None:
 
 
 def test_farther_errors_cost_more_but_never_more_than_the_limit() -> None:
-    """A pair that shows nothing of its motion does not rule the others."""
+    """A pair that shows nothing of its motion does not dominate the others."""
     costs = [float(pose_loss(TRUTH @ torch.from_numpy(se3.exp([0, 0, 0, x, 0, 0])), TRUTH)) for x in (1, 3, 30, 300)]
     assert costs == sorted(costs)
     assert costs[-1] < DIVERGED
@@ -51,7 +51,7 @@ def test_no_error_costs_nothing_and_has_a_finite_gradient() -> None:
 
 
 def places(count: int, channels: int) -> tuple[Tokens, Tokens]:
-    """The same places, each with a feature of its own, as two scans see them that are `TRUTH` apart."""
+    """The same points, each with a distinct feature, as seen in two scans that are `TRUTH` apart."""
     noise = torch.Generator().manual_seed(0)
     xyz = torch.randn(1, count, 3, generator=noise) * torch.tensor([15.0, 15.0, 1.0])
     features, mask = torch.randn(1, count, channels, generator=noise), torch.ones(1, count, dtype=torch.bool)
@@ -61,7 +61,7 @@ def places(count: int, channels: int) -> tuple[Tokens, Tokens]:
 
 
 def test_what_has_diverged_starts_at_the_truth_and_learns_what_pulls_it_away() -> None:
-    """The same pair is compared with a truth that it is near, and with one 3 m beside, towards which it would go."""
+    """The same pair is compared with a truth near its pose, and with one 3 m away, from which it would diverge."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     source, target = places(60, model.settings.channels)
@@ -81,7 +81,7 @@ def test_what_has_diverged_starts_at_the_truth_and_learns_what_pulls_it_away() -
 
 
 def test_features_that_are_not_finite_take_the_truth() -> None:
-    """A step without a pose has no gradient instead of one that is not a number."""
+    """A step without a pose has no gradient, instead of one that is not a number."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     source, target = places(60, model.settings.channels)
@@ -99,7 +99,7 @@ def test_registration_trains_by_it(packed: Path) -> None:
     loss = LossSettings(pairing=0, coarse=0, backbone=0, image=0, offset=0, pose=1, near=32, own=16)
     batch = GroupDataset(data, tiny(), data.draw, seed=0)[0, 0]
     module = RegistrationTraining(tiny(), loss)
-    with torch.no_grad():  # the last layer of the offsets is zero at first, and passes no gradient on
+    with torch.no_grad():  # the last layer of the offsets is zero at first, and blocks the gradient
         module.model.decoder.offset.out.weight.normal_(std=0.1)
     plan = set_pairs_of(batch.poses, RegistrationTrainingSettings(data=data, loss=loss, pairs=2, sets=0), 0)[0]
     tokens = module.model.encoder(batch.points, None).tokens
@@ -108,7 +108,7 @@ def test_registration_trains_by_it(packed: Path) -> None:
         solved = solve_batch(module.model.decoder, source, target, module.model.decoder(source, target))
     assert solved is not None
     beside = solved.T.float()
-    beside[:, 0, 3] += 0.3  # not diverged, and not without an error
+    beside[:, 0, 3] += 0.3  # not diverged, but not exact
     total, figures = module(batch.points, None, (plan._replace(T_target_source=beside),))
     total.backward()
     assert float(figures["pose"]) > 0.1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recipes in config/ are of the settings that read them."""
+"""The recipes in config/ fit the settings classes that read them."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def test_no_recipe_of_the_network_is_forgotten_here() -> None:
 
 
 def test_the_sensor_of_the_dynamic_objects_drives_is_the_simulators_own() -> None:
-    """YAML cannot name it, so it stands there again."""
+    """YAML cannot refer to it by name, so the recipe repeats it."""
     assert load_settings(TaskDriveSettings, CONFIG / "movers_drives.yaml").lidar == HDL64E
 
 
 def test_both_ablations_differ_in_the_fusion_and_in_how_long_they_train() -> None:
-    """So that what stands in one table can be held against the other."""
+    """Thus the two tables can be compared."""
     shipped, paper = (
         load_settings(AblationSettings, CONFIG / f"{name}.yaml") for name in ("ablation", "ablation_paper")
     )
@@ -79,12 +79,13 @@ def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> Non
 
 @pytest.mark.parametrize("name", ["train_paper_registration", "train_paper_overlap"])
 def test_the_recipes_of_the_paper_change_scans_as_its_predecessor_and_leave_images_as_they_are(name: str) -> None:
-    """Exposure, colors and calibration were changed at random, too, by what is usual here."""
+    """By default, exposure, colors and calibration are changed at random, too."""
     settings = load_settings(READ_BY[name], CONFIG / f"{name}.yaml").data.augment
     changed = {key for key, value in settings if value != getattr(UNCHANGED, key)}
     assert changed == {"drop", "occlusion", "jitter", "yaw", "tilt", "shift"}
 
 
 def test_the_papers_network_has_its_reference_points() -> None:
-    """The farthest ones, as of v1; it had half of them on edges and corners, as `small` does."""
+    """They are the farthest ones, as in v1; the paper's network had half of them on edges and corners, as `small`
+    does."""
     assert [preset(name).fusion.reference for name in ("paper", "v1")] == ["fps", "fps"]

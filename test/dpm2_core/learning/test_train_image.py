@@ -50,7 +50,7 @@ def settings(packed: Path, network: NetworkSettings, tmp_path: Path) -> ImageTra
 def test_it_changes_the_image_branch_alone(
     settings: ImageTrainingSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """LiDAR, fusion and decoder stay bit for bit, and resuming gives the weights of one run."""
+    """LiDAR, fusion and decoder stay identical bit for bit, and resuming gives the weights of one run."""
     whole = load_file(train_image(settings, tmp_path / "whole"))
     before = load_file(Path(settings.start))
     changed = {name for name in before if not torch.equal(before[name], whole[name])}
@@ -77,7 +77,7 @@ def test_points_of_a_pair_are_the_same_in_the_world(settings: ImageTrainingSetti
 
 
 def test_shown_is_what_projects_into_the_image() -> None:
-    """Ahead and inside, not behind, not beside. The camera looks along x of the LiDAR."""
+    """A point ahead and inside the image is, points behind or outside are not. The camera looks along the LiDAR's x."""
     T_lidar_cam = se3.make(R_AHEAD, np.zeros(3))
     camera = Camera(np.array([[50, 0, 50], [0, 50, 25], [0, 0, 1.0]]), T_lidar_cam, (100, 50))
     points = np.array([[10, 0, 0], [-10, 0, 0], [10, 9, 0], [10, 11, 0], [10, 0, 6]], np.float32)
@@ -87,7 +87,7 @@ def test_shown_is_what_projects_into_the_image() -> None:
 def test_what_cannot_be_trained_is_rejected(
     settings: ImageTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """A network without features of its own pixels, a drive without images, and too few points."""
+    """A network without image features of its own, a drive without images, and too few points."""
     with pytest.raises(UsageError, match=r"no image features of its own"):
         train_image(settings.model_copy(update={"network": {"fusion": {"pixel": False}}, "start": ""}), tmp_path / "a")
     with pytest.raises(UsageError, match=r"hardly any image shows 99999 points"):
