@@ -10,6 +10,6 @@ from torch import Tensor
 
 @pytest.fixture
 def noisy(scans: list[Tensor]) -> list[Tensor]:
-    """The scans with 1 cm of noise, of their own each: residuals are not zero at the minimum."""
+    """The scans, each with independent noise of 1 cm: residuals are not zero at the minimum."""
     generator = torch.Generator().manual_seed(3)
     return [scan + 0.01 * torch.randn(scan.shape, generator=generator, dtype=scan.dtype) for scan in scans]

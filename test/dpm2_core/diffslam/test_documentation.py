@@ -14,7 +14,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "diffslam.md"
 
 
 class Denoiser(torch.nn.Module):
-    """A user's model: moves each point by as much as a small network says."""
+    """A user's model: a small network predicts the displacement of each point."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -26,7 +26,7 @@ class Denoiser(torch.nn.Module):
 
 @pytest.mark.slow
 def test_the_example_runs_and_the_slam_loss_takes_part(scans: list[Tensor]) -> None:
-    """Twenty lines, two sequences of five scans, six epochs, the fifth with the SLAM loss; all weights move."""
+    """Twenty lines, two sequences of five scans, six epochs, the fifth with the SLAM loss; all weights change."""
     example = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
     assert example is not None
     code = example[1]

@@ -18,7 +18,7 @@ EYE = torch.eye(4).double()[None]
 
 
 def error(found: Tensor, wanted: Tensor) -> tuple[float, float]:
-    """m, rad."""
+    """Translation and rotation error, m and rad."""
     e = se3.inverse(wanted.numpy()) @ found.detach().numpy()
     return float(np.linalg.norm(e[:3, 3])), float(se3.angle(e))
 
@@ -36,7 +36,7 @@ def test_known_motion_is_recovered(scans: list[Tensor], motion: Tensor) -> None:
 
 
 def test_printed_gate_does_not_converge_and_gradslam_hides_it(scans: list[Tensor], motion: Tensor) -> None:
-    """Equation 5 as printed takes nothing of a good step; to the power 1/200 it takes some."""
+    """Equation 5 as printed accepts nothing of a good step; to the power 1/200 it accepts some."""
     source, target = Cloud(scans[1][None]), Cloud(scans[0][None])
     left = {}
     for gate in ("soft", "none", "gradslam", "paper"):
@@ -56,7 +56,7 @@ def test_error_falls_with_every_iteration(scans: list[Tensor], motion: Tensor) -
 
 
 def test_batch_and_padding_change_nothing(noisy: list[Tensor]) -> None:
-    """Pairs in one batch, padded by points of weight zero (NaN excepted), give what each gives alone."""
+    """Pairs in one batch, padded by points of weight zero (but not NaN), give the same result as each alone."""
     alone = [register(Cloud(noisy[i + 1][None]), Cloud(noisy[i][None]), EYE, settings()) for i in range(2)]
     pad = torch.full((100, 3), 1.0).double()
     points = torch.stack([torch.cat([scan, pad]) for scan in noisy[:3]])
@@ -68,7 +68,7 @@ def test_batch_and_padding_change_nothing(noisy: list[Tensor]) -> None:
 
 @pytest.mark.slow
 def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
-    """Of the pose by points and weights of both clouds, 12 points, through 2 iterations.
+    """For the gradient of the pose by points and weights of both clouds, with 12 points, through 2 iterations.
 
     Normals are given; associations do not change, since the points are far apart.
     """
@@ -91,7 +91,7 @@ def test_gradcheck_in_double(noisy: list[Tensor]) -> None:
 
 @pytest.mark.parametrize("kernel", ["huber", "geman_mcclure", "none"])
 def test_implicit_gradient_is_the_unrolled_one_at_convergence(noisy: list[Tensor], kernel: str) -> None:
-    """Within 1 % of its length, after 40 iterations; values within 1e-9."""
+    """Gradients agree within 1 % of their length, after 40 iterations; values within 1e-9."""
     gradients, poses = [], []
     for gradient in ("unrolled", "implicit"):
         source = noisy[1].clone()[None].requires_grad_()
@@ -105,7 +105,7 @@ def test_implicit_gradient_is_the_unrolled_one_at_convergence(noisy: list[Tensor
 
 
 def test_points_of_little_weight_have_little_to_say(noisy: list[Tensor], motion: Tensor) -> None:
-    """A third of the scan moves on its own; the pose follows the rest the more, the less the third weighs."""
+    """A third of the scan moves independently; the lower its weight, the more the pose follows the rest."""
     moving = noisy[1].clone()
     moving[:200, 0] += 1.0
     errors = []
@@ -118,7 +118,7 @@ def test_points_of_little_weight_have_little_to_say(noisy: list[Tensor], motion:
 
 
 def test_weights_receive_a_gradient(noisy: list[Tensor]) -> None:
-    """Of both clouds: this is how a selection is learned."""
+    """The weights of both clouds do, so that a selection can be learned."""
     w = torch.full((1, 600), 0.5, dtype=torch.float64, requires_grad=True)
     v = torch.full((1, 600), 0.5, dtype=torch.float64, requires_grad=True)
     register(Cloud(noisy[1][None], w), Cloud(noisy[0][None], v), EYE, settings())[0, 0, 3].backward()
@@ -127,7 +127,7 @@ def test_weights_receive_a_gradient(noisy: list[Tensor]) -> None:
 
 
 def test_single_plane_moves_only_along_its_normal(noise: np.random.Generator) -> None:
-    """What a plane does not determine stays at the guess, and everything is finite, gradients too."""
+    """Motion that a plane does not determine stays at the guess; everything is finite, including gradients."""
     flat = torch.from_numpy(np.column_stack([noise.uniform(-20, 20, (400, 2)), np.full(400, -1.7)]))
     lower = (flat - torch.tensor([0, 0, 0.1])).requires_grad_()
     for gradient in ("unrolled", "implicit"):
@@ -140,7 +140,7 @@ def test_single_plane_moves_only_along_its_normal(noise: np.random.Generator) ->
 
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
 def test_without_evidence_the_guess_stays(scans: list[Tensor], motion: Tensor, gradient: str) -> None:
-    """Weights of zero, or clouds that are nowhere near each other: the guess, and a gradient of zero."""
+    """With weights of zero, or clouds that are far from each other, the guess is returned, with a gradient of zero."""
     far = (scans[1] + 1000.0)[None].requires_grad_()
     near = scans[1][None].clone().requires_grad_()
     for source, weights in ((far, torch.ones(1, 600)), (near, torch.zeros(1, 600))):
@@ -160,7 +160,7 @@ def test_gpu_gives_the_poses_of_the_cpu(noisy: list[Tensor]) -> None:
 
 
 def test_translation_of_the_frames_is_no_matter(noisy: list[Tensor]) -> None:
-    """Seen in another frame of reference the motion is the conjugate."""
+    """In another frame of reference the motion is the conjugate."""
     A = torch.from_numpy(se3.exp(np.array([0.1, -0.2, 1.0, 3.0, -2.0, 1.0])))
     T = register(Cloud(noisy[1][None]), Cloud(noisy[0][None]), EYE, settings(30))[0]
     moved = [se3_torch.transform(A, cloud)[None] for cloud in noisy[:2]]

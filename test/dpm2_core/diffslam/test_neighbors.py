@@ -17,17 +17,17 @@ def clouds(offset: float = 0.0) -> tuple[Tensor, Tensor]:
 
 
 def by_tree(points: Tensor, valid: Tensor, queries: Tensor, k: int = 1) -> Tensor:
-    """As on the CPU."""
+    """The search that is used on the CPU."""
     return NeighborSearch(points, valid).nearest(queries, k)
 
 
 def by_distance(points: Tensor, valid: Tensor, queries: Tensor, k: int = 1) -> Tensor:
-    """As on a GPU."""
+    """The search that is used on a GPU."""
     return nearest_by_distance(queries, points.masked_fill(~valid[..., None], torch.inf), k)
 
 
 def test_tree_and_distance_agree_with_brute_force() -> None:
-    """Indices of the 5 nearest valid points, in their order, 100 m off too: no cancellation."""
+    """Indices of the 5 nearest valid points, in order, also at an offset of 100 m: no cancellation."""
     for offset in (0.0, 100.0):
         points, valid = clouds(offset)
         queries = points + 0.3
@@ -39,7 +39,7 @@ def test_tree_and_distance_agree_with_brute_force() -> None:
 
 
 def test_fewer_points_than_asked_repeat_the_nearest() -> None:
-    """And a cloud without any gives its first."""
+    """A cloud without any valid point returns its first."""
     points, valid = clouds()
     valid[0] = False
     valid[1] = False
@@ -54,7 +54,7 @@ def test_fewer_points_than_asked_repeat_the_nearest() -> None:
 
 
 def test_select_keeps_each_cloud_with_its_points() -> None:
-    """In the order asked for, repeated too."""
+    """Clouds are in the requested order, also if repeated."""
     points, valid = clouds()
     search = NeighborSearch(points, valid)
     both = search.select([2, 0, 2]).nearest(points[[2, 0, 2]], 3)

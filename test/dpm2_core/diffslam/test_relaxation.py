@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relaxation of a ring with a loop: consistent measurements are met, gradients agree, errors name what is wrong."""
+"""Relaxation of a ring with a loop: consistent measurements are met, gradients agree, errors name the problem."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def moved(T: Tensor, scale: float, seed: int = 0) -> Tensor:
 
 
 def test_consistent_measurements_are_met(ring: Tensor) -> None:
-    """From poses 20 cm and 11 degrees off, the ring comes back; its first pose never moves."""
+    """From poses 20 cm and 11 degrees off, the ring is restored; its first pose never moves."""
     begin = torch.cat([ring[:1], moved(ring[1:], 0.2)])
     found = relax(begin, EDGES, relative(ring), settings=SoftLmSettings(iterations=15))
     torch.testing.assert_close(found, ring, atol=1e-6, rtol=0)
@@ -43,7 +43,7 @@ def test_consistent_measurements_are_met(ring: Tensor) -> None:
 
 
 def test_a_loop_pulls_drift_together(ring: Tensor) -> None:
-    """Odometry that turns a degree too far at each step, and two right loops: the end comes nearer its place."""
+    """Odometry that rotates a degree too far at each step, and two correct loops: the end moves closer to the truth."""
     turn = torch.from_numpy(se3.exp(np.array([0, 0, np.deg2rad(1), 0, 0, 0])))
     measured = relative(ring)
     measured[: N - 1] = measured[: N - 1] @ turn
@@ -58,7 +58,7 @@ def test_a_loop_pulls_drift_together(ring: Tensor) -> None:
 
 
 def test_weights_decide_between_loops(ring: Tensor) -> None:
-    """A wrong loop of weight zero is as good as none."""
+    """A wrong loop of weight zero has no effect."""
     wrong = relative(ring)
     wrong[-1, 1, 3] += 5.0
     weights = torch.ones(len(EDGES)).double()
@@ -70,7 +70,8 @@ def test_weights_decide_between_loops(ring: Tensor) -> None:
 
 @pytest.mark.slow
 def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) -> None:
-    """Of every third pose by measurements (as tangents) and weights; inconsistent ones: residuals are not zero."""
+    """For every third pose, by measurements (as tangents) and weights; they are inconsistent: residuals are not
+    zero."""
     measured = moved(relative(ring), 0.05)
     xi = torch.zeros(len(EDGES), 6, dtype=torch.float64, requires_grad=True)
     weights = torch.full((len(EDGES),), 0.7, dtype=torch.float64, requires_grad=True)
@@ -88,7 +89,7 @@ def test_gradients_agree_with_finite_differences_and_each_other(ring: Tensor) ->
 
 
 def test_unusable_graphs_are_rejected(ring: Tensor) -> None:
-    """An edge to a pose that is not there, fewer measurements than edges."""
+    """An edge to a pose that does not exist, or fewer measurements than edges."""
     with pytest.raises(UsageError, match="pose 9 of 8"):
         relax(ring, torch.tensor([[0, 9]]), relative(ring)[:1])
     with pytest.raises(UsageError, match="for 3 measured"):
@@ -98,7 +99,7 @@ def test_unusable_graphs_are_rejected(ring: Tensor) -> None:
 
 
 def test_poses_without_edges_stay(ring: Tensor) -> None:
-    """What no measurement holds is left where it was, finite."""
+    """Poses without measurements keep their finite values."""
     found = relax(ring, EDGES[:2], relative(ring)[:2])
     torch.testing.assert_close(found, ring, atol=1e-9, rtol=0)
     torch.testing.assert_close(relax(ring, EDGES[:0], relative(ring)[:0]), ring)

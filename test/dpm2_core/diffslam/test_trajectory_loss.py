@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The SLAM loss: zero where nothing differs, right slopes, selections, truncation, graphs, the cache and bad input."""
+"""The SLAM loss: zero for equal clouds, correct gradients, selections, truncation, graphs, the cache and bad input."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def leaves(clouds: list[Tensor]) -> list[Tensor]:
 
 
 def test_odometry_follows_the_scans(scans: list[Tensor], motion: Tensor) -> None:
-    """Each pose to 1 mm, from identity as from a guess, for a list as for a padded tensor with its mask."""
+    """Each pose is correct to 1 mm, from identity and from a guess, for a list and for a padded tensor with its
+    mask."""
     requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
     padded = torch.nn.functional.pad(torch.stack(scans), (0, 0, 0, 50), value=torch.nan)
     mask = torch.nn.functional.pad(torch.ones(4, 600), (0, 50))
@@ -34,7 +35,7 @@ def test_odometry_follows_the_scans(scans: list[Tensor], motion: Tensor) -> None
 
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
 def test_equal_clouds_have_no_loss_and_no_gradient(noisy: list[Tensor], gradient: str) -> None:
-    """Exactly, also when a graph is relaxed."""
+    """Both are exactly zero, also if a graph is relaxed."""
     icp = IcpSettings(solver=SoftLmSettings(gradient=gradient))
     for spans in ((1,), (1, 2)):
         pred = leaves(noisy)
@@ -48,8 +49,8 @@ def test_equal_clouds_have_no_loss_and_no_gradient(noisy: list[Tensor], gradient
 @pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit"])
 def test_slope_by_one_point_is_the_finite_difference(noisy: list[Tensor], scans: list[Tensor], gradient: str) -> None:
-    """Within 1 %: for the points with the largest slope, of the last scan, which is a source, and of one that is a
-    target too, whose normals turn with it; moved by 0.1 mm along it."""
+    """Within 1 %, for the points with the largest gradient. One is in the last scan, a source; one is in a scan that is
+    also a target, whose normals rotate with it. Points are moved by 0.1 mm along the gradient."""
     loss = SlamLoss(SlamLossSettings(icp=IcpSettings(solver=SoftLmSettings(iterations=30, gradient=gradient))))
     pred = leaves(noisy)
     slopes = torch.autograd.grad(loss(pred, scans), pred)
@@ -67,7 +68,7 @@ def test_slope_by_one_point_is_the_finite_difference(noisy: list[Tensor], scans:
 
 
 def test_descending_the_loss_repairs_a_cloud(noisy: list[Tensor], scans: list[Tensor]) -> None:
-    """A scan that was shifted as a whole by 5 cm is pulled back: the slope points the right way."""
+    """A scan that was shifted as a whole by 5 cm is moved back: the gradient has the right direction."""
     shift = torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
     loss = SlamLoss()
     before = loss([scans[0], scans[1] + shift, *scans[2:]], scans)
@@ -78,8 +79,8 @@ def test_descending_the_loss_repairs_a_cloud(noisy: list[Tensor], scans: list[Te
 
 
 def test_warm_start_measures_at_the_end_of_the_way(scans: list[Tensor], noisy: list[Tensor]) -> None:
-    """Two iterations from the identity are not enough for a step of 0.8 m, and leave both on their way; started where
-    the reference has ended, the loss comes near the converged one. Equal clouds have no loss; the reference is kept."""
+    """Two iterations from the identity are too few for a step of 0.8 m, and neither branch converges. Started where the
+    reference ended, the loss is close to the converged one. Equal clouds have no loss; the reference is cached."""
     two = IcpSettings(solver=SoftLmSettings(iterations=2))
     with torch.no_grad():
         requested = float(SlamLoss(CONVERGED)(noisy, scans))
@@ -90,11 +91,12 @@ def test_warm_start_measures_at_the_end_of_the_way(scans: list[Tensor], noisy: l
         assert float(loss(noisy, noisy)) < 1e-20
         frames = [("drive", t) for t in range(4)]
         assert float(loss(noisy, scans, frames=frames)) == warm
-        assert float(loss(noisy, noisy, frames=frames)) == warm  # of the frames' own targets, not of these
+        assert float(loss(noisy, noisy, frames=frames)) == warm  # with the frames' own targets, not these
 
 
 def test_removing_a_moving_object_reduces_the_loss(scans: list[Tensor]) -> None:
-    """A fifth of the points drives along with the sensor; the loss falls with their weight, and its slope says so."""
+    """A fifth of the points moves with the sensor; the loss decreases with their weight, and its gradient shows
+    that."""
     generator = torch.Generator().manual_seed(5)
     box = torch.rand(150, 3, generator=generator, dtype=torch.float64) * torch.tensor([4, 2, 1.5]) + torch.tensor(
         [8.0, 3.0, -1.6]
@@ -112,7 +114,7 @@ def test_removing_a_moving_object_reduces_the_loss(scans: list[Tensor]) -> None:
 
 
 def test_float32_clouds_get_float32_gradients(noisy: list[Tensor], scans: list[Tensor]) -> None:
-    """What networks predict; the solve itself is in double."""
+    """Networks predict float32; the solver itself uses double."""
     pred = leaves([cloud.float() for cloud in noisy])
     loss = SlamLoss()(pred, [scan.float() for scan in scans])
     assert loss.dtype == torch.float64
@@ -132,7 +134,7 @@ def test_truncation_stops_the_gradient_and_not_the_value(noisy: list[Tensor], sc
 
 
 def test_spans_make_a_graph_that_averages_noise(noisy: list[Tensor], motion: Tensor) -> None:
-    """Scans two apart add measurements: the trajectory stays right, and differs from the chain alone."""
+    """Scans two apart add measurements: the trajectory stays correct, and differs from that of the chain alone."""
     requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
     chain = odometry(noisy, settings=CONVERGED)
     graph = odometry(noisy, settings=CONVERGED.model_copy(update={"spans": (1, 2)}))
@@ -141,7 +143,7 @@ def test_spans_make_a_graph_that_averages_noise(noisy: list[Tensor], motion: Ten
 
 
 def test_a_scan_that_shows_nothing_does_not_move_the_others(scans: list[Tensor], motion: Tensor) -> None:
-    """Its pairs count for nothing; the pair around it holds the trajectory together. It stays where its guess leads."""
+    """Its pairs have no effect; the pair around it connects the trajectory. It stays at the pose of its guess."""
     requested = torch.stack([torch.linalg.matrix_power(motion, t) for t in range(4)])
     weights = [torch.ones(len(scan)).double() for scan in scans]
     weights[2] = torch.zeros(len(scans[2])).double()
@@ -156,7 +158,7 @@ def test_scans_far_apart_are_registered_from_where_the_steps_have_led(scans: lis
     graph = odometry(scans, settings=SlamLossSettings(spans=(1, 3)))
     chain = odometry(scans)
     torch.testing.assert_close(graph, requested, atol=max(2e-3, 2 * float((chain - requested).abs().max())), rtol=0)
-    assert torch.equal(odometry(scans, settings=SlamLossSettings(spans=(1, 10))), chain)  # no scans are so far apart
+    assert torch.equal(odometry(scans, settings=SlamLossSettings(spans=(1, 10))), chain)  # no scans are that far apart
 
 
 @pytest.mark.parametrize("settings", [{"spans": (1, 2), "truncate": 2}, {"spans": (0,)}, {"spans": ()}])
@@ -166,7 +168,7 @@ def test_spans_that_make_no_sense_are_rejected(settings: dict) -> None:
 
 
 def test_reference_is_kept_by_frame(noisy: list[Tensor], scans: list[Tensor]) -> None:
-    """Named frames: the second call does not look at the targets. Without names it does."""
+    """With named frames, the second call does not read the targets; without names it does."""
     loss, frames = SlamLoss(), [("00", t) for t in range(4)]
     first = loss(noisy, scans, frames=frames)
     other = [scan + 0.5 * t for t, scan in enumerate(scans)]
@@ -191,7 +193,7 @@ def test_windows_that_are_not_contiguous_are_rejected(scans: list[Tensor]) -> No
 
 @pytest.mark.parametrize("side", ["predicted", "target"])
 def test_unusable_clouds_are_named(scans: list[Tensor], side: str) -> None:
-    """Which of the two, which scan, what is wrong."""
+    """The error names the side, the scan and the problem."""
 
     def rejected(clouds: list[Tensor], message: str) -> None:
         with pytest.raises(UsageError, match=f"{side}.*{message}"):
@@ -223,7 +225,7 @@ def test_unusable_weights_and_windows_are_rejected(scans: list[Tensor]) -> None:
 
 
 def test_zero_weights_give_a_finite_loss_and_no_gradient(noisy: list[Tensor], motion: Tensor) -> None:
-    """The predicted scans stand still, as guessed; nothing becomes NaN."""
+    """The predicted scans keep the guessed pose; nothing becomes NaN."""
     weights = [torch.zeros(600, dtype=torch.float64, requires_grad=True) for _ in noisy]
     pred = leaves(noisy)
     loss = SlamLoss()(pred, noisy, weights)
@@ -236,7 +238,7 @@ def test_zero_weights_give_a_finite_loss_and_no_gradient(noisy: list[Tensor], mo
 
 
 def test_large_clouds_are_downsampled_alike(noise: np.random.Generator, scans: list[Tensor]) -> None:
-    """More than `points` are downsampled, the same in each call; gradients go to those that were kept."""
+    """More than `points` are downsampled, in the same way in each call; gradients go to the points that were kept."""
     big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
     pred = leaves(big)
     loss = SlamLoss(SlamLossSettings(points=500))(pred, big)
@@ -247,13 +249,13 @@ def test_large_clouds_are_downsampled_alike(noise: np.random.Generator, scans: l
 
 
 def test_a_weight_of_zero_changes_the_choice_of_that_point_alone(scans: list[Tensor]) -> None:
-    """Of more points than are kept, predicted and target scans keep the same ones where their weights differ little."""
+    """Predicted and target scans with more points than are kept keep the same ones, if their weights differ little."""
     big = [torch.cat([scan, scan + 0.01, scan - 0.01]) for scan in scans]
     weights = [torch.ones(len(scan)) for scan in big]
     for weight in weights:
         weight[7] = 0
     loss = SlamLoss(SlamLossSettings(points=500))(big, big, weights)
-    # One of 500 points of a voxel of 0.5 m; drawn independently, the loss of these scans is 100 times as large.
+    # One of 500 points in a voxel of 0.5 m; drawn independently, the loss of these scans is 100 times as large.
     assert float(loss) < 1e-6
 
 
@@ -274,8 +276,8 @@ def test_trajectory_loss_by_hand() -> None:
 
 
 def test_a_placebo_compares_with_the_window_before(scans: list[Tensor]) -> None:
-    """The first window has none before it and no loss, whatever was predicted; the next, which goes the other way, that
-    of the first; and so it is again after a new start."""
+    """The first window has no previous window and no loss, for any prediction. The next, which moves in the opposite
+    direction, is compared with the first. After a restart the same holds again."""
     loss = SlamLoss(SlamLossSettings(placebo=True, icp=CONVERGED.icp))
     assert float(loss(scans[::-1], scans)) == 0
     backwards = scans[::-1]

@@ -17,7 +17,7 @@ from dpm2_core.errors import UsageError
 
 @given(lengths=st.lists(st.integers(0, 40), min_size=1, max_size=5), window=st.integers(2, 9), every=st.integers(1, 3))
 def test_no_window_crosses_a_border(lengths: list[int], window: int, every: int) -> None:
-    """Each is contiguous, in one sequence; none overlap; less than a window and its gaps are left at an end."""
+    """Each is contiguous, in one sequence; none overlap; at an end, less than a window and its gaps is left over."""
     owner = [s for s, length in enumerate(lengths) for _ in range(length)]
     reach = (window - 1) * every + 1
     if max(lengths) < reach:
@@ -36,7 +36,7 @@ def test_no_window_crosses_a_border(lengths: list[int], window: int, every: int)
 
 
 def test_order_is_shuffled_anew_and_repeatable() -> None:
-    """By seed and epoch; never inside a window."""
+    """The order depends on seed and epoch; scans within a window keep their order."""
     sampler = ContiguousWindows([40, 40], 4, seed=1)
     first = list(sampler)
     sampler.set_epoch(1)
@@ -48,20 +48,20 @@ def test_order_is_shuffled_anew_and_repeatable() -> None:
 
 
 def test_a_data_loader_takes_it() -> None:
-    """As batch_sampler: a batch is a window."""
+    """It is a batch_sampler: a batch is a window."""
     batches = list(DataLoader(range(10), batch_sampler=ContiguousWindows([5, 5], 4)))  # type: ignore[arg-type]
     assert [batch.tolist() for batch in batches] == [[0, 1, 2, 3], [5, 6, 7, 8]]
 
 
 @pytest.mark.parametrize("bad", [(1, 1), (4, 0)])
 def test_windows_without_motion_are_rejected(bad: tuple[int, int]) -> None:
-    """One scan, or the same scan again and again."""
+    """A window of one scan, or of the same scan repeated."""
     with pytest.raises(UsageError, match="want at least 2"):
         ContiguousWindows([100], *bad)
 
 
 def test_every_kth_epoch_has_the_slam_loss() -> None:
-    """k = 5: epochs 4, 9, ... as in the paper, 30 of 150; elsewhere it is not even computed."""
+    """k = 5: epochs 4, 9, ... as in the paper, 30 of 150; in other epochs it is not even computed."""
     settings = ScheduleSettings(gamma=0.5, every=5, most=None)
     assert [epoch for epoch in range(12) if is_due(epoch, settings)] == [4, 9]
     assert sum(is_due(epoch, settings) for epoch in range(150)) == 30
@@ -80,8 +80,8 @@ def test_every_kth_epoch_has_the_slam_loss() -> None:
 
 
 def test_a_lost_registration_is_not_the_whole_step() -> None:
-    """gamma L_slam is bounded by a fraction of L_model, its slope along with it; below, it is as it is. That of the
-    task stays as it is."""
+    """gamma L_slam is bounded by a fraction of L_model, and its gradient with it; below the bound it is unchanged. The
+    gradient of the task is unchanged."""
     for error, ratio in ((0.05, 0.05), (0.1, 0.1), (1.0, 0.1), (100.0, 0.1), (0.0, 0.0)):
         task, slam = (torch.tensor(value, requires_grad=True) for value in (4.0, 2 * error))
         settings = ScheduleSettings(gamma=2.0, every=1, most=0.1)
@@ -93,7 +93,7 @@ def test_a_lost_registration_is_not_the_whole_step() -> None:
 
 
 def test_a_task_loss_below_zero_bounds_by_its_size() -> None:
-    """As a likelihood may be; the SLAM loss is descended all the same."""
+    """A likelihood may be below zero; the SLAM loss is minimized nevertheless."""
     slam = torch.tensor(9.0, requires_grad=True)
     total = total_loss(torch.tensor(-2.0), lambda: slam, 0, ScheduleSettings(gamma=1.0, every=1, most=0.5))
     total.backward()

@@ -69,7 +69,7 @@ def settings(packed: Path) -> RegistrationTrainingSettings:
 
 
 def losses(out: Path) -> dict[int, float]:
-    """Logged loss of each step, the last entry of a step counting."""
+    """Logged loss of each step; the last entry of a step counts."""
     rows = read_log(out)
     return {row["step"]: row["loss"] for row in rows if "loss" in row}
 
@@ -92,7 +92,7 @@ def test_resumed_equals_uninterrupted(
 
 @pytest.mark.slow
 def test_log_has_figures_and_validation(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """One JSON object a line; validation gives medians and success of near, far and turned pairs."""
+    """One JSON object per line; validation gives medians and success rates of near, far and turned pairs."""
     train_registration(settings, tmp_path / "out")
     rows = read_log(tmp_path / "out")
     assert {"pairing", "coarse", "backbone", "image", "offset", "offset_m", "right", "norm", "rate"} <= rows[0].keys()
@@ -116,7 +116,7 @@ def test_images_have_a_loss_of_their_own(settings: RegistrationTrainingSettings)
 
 @pytest.mark.slow
 def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """And so is a file of another kind."""
+    """A file of another kind is rejected, too."""
     train_registration(settings, tmp_path / "out")
     other = settings.model_copy(update={"network": {"image": {"size": tiny().image.size}}})  # that of the packed images
     with pytest.raises(UsageError, match="checkpoint of another network"):
@@ -127,7 +127,7 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
 
 
 def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Its weights said that they had two steps, of four."""
+    """Its weights recorded two steps instead of four."""
     train_registration(settings, tmp_path / "out")
     fewer = settings.model_copy(update={"optimiser": settings.optimiser.model_copy(update={"steps": 2})})
     with pytest.raises(UsageError, match=r"has 4 steps, optimiser\.steps wants 2"):
@@ -135,7 +135,7 @@ def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTra
 
 
 class Toy(torch.nn.Module):
-    """A layer that is trained by a loss of what it is given and what it makes of that."""
+    """A layer, trained by a loss of its input and its output."""
 
     def __init__(self, layer: torch.nn.Module, loss: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
         super().__init__()
@@ -147,12 +147,12 @@ class Toy(torch.nn.Module):
 
 
 def line(loss: Callable[..., torch.Tensor] = lambda x, y: y.sum() ** 2) -> Toy:
-    """Of one weight for each of two numbers."""
+    """A toy module with one weight for each of two numbers."""
     return Toy(torch.nn.Linear(2, 1), loss)
 
 
 def trainer(module: Toy, out: Path, saved: list[Toy] | None = None, **steps: int) -> Trainer[Toy]:
-    """Batches are ones, 8 rows of two."""
+    """A trainer whose batches are ones, 8 rows of two."""
     settings = OptimizerSettings(compile=False, bf16=False, **steps)  # type: ignore[arg-type]
     return Trainer(
         module, lambda *_: repeat((torch.ones(8, 2),)), settings, out, [].append if saved is None else saved.append
@@ -160,7 +160,7 @@ def trainer(module: Toy, out: Path, saved: list[Toy] | None = None, **steps: int
 
 
 def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
-    """Each step was skipped, and untrained weights were written as if all was well."""
+    """Each step was skipped, and untrained weights were written as if the training had succeeded."""
     saved: list[Toy] = []
     with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
         trainer(line(lambda x, y: y.sum() * torch.nan), tmp_path, saved, steps=3).run()
@@ -168,8 +168,9 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
 
 
 def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
-    """Until its first checkpoint a second one began in it, also with other settings: one log was of both or of either,
-    one checkpoint and one set of weights were left of two trainings, which both had ended well."""
+    """A second training could begin in it until the first checkpoint, also with other settings. The log then mixed both
+    or had either. One checkpoint and one set of weights were left of two trainings that had both ended without an
+    error."""
     steps, kept = OptimizerSettings(steps=3, seed=1), tmp_path / "begun.json"
     begin_or_resume(tmp_path, False, OptimizerSettings(steps=3))
     before = kept.read_text()
@@ -186,11 +187,11 @@ def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
     replace(trainer(line(), tmp_path, steps=3), batches=batches).run()
     assert kept.read_text() == before
     assert list(losses(tmp_path)) == [0, 1, 2]
-    begin_or_resume(tmp_path, True, OptimizerSettings(steps=3))  # it is free again
+    begin_or_resume(tmp_path, True, OptimizerSettings(steps=3))  # the folder is free again
 
 
 def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
-    """The other steps were skipped, for hours, and weights of the few first ones written as if all was well."""
+    """The other steps were skipped, for hours, and weights after the few first ones were written without an error."""
     saved: list[Toy] = []
     module = line(lambda x, y: y.square().sum() * (1.0 if float(x[0]) < 7 else torch.nan))
     batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
@@ -202,8 +203,8 @@ def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
 def test_the_progress_of_a_training_is_that_of_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On stderr, without a terminal in lines, and not with --quiet; it was a bar among the results, whatever was asked
-    for."""
+    """It goes to stderr, in lines if there is no terminal, and not with --quiet; it was a bar among the results, in any
+    case."""
 
     def shown(quiet: bool) -> tuple[str, list[str]]:
         token = QUIET.set(quiet)
@@ -221,7 +222,7 @@ def test_the_progress_of_a_training_is_that_of_every_command(
 
 
 def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None:
-    """Those of the validation drives came into the weights: each figure was of a forward pass that learns."""
+    """The means of the validation drives entered the weights: each figure came from a forward pass in training mode."""
     saved: list[Toy] = []
     for name, validate in (("with", lambda m: {"seen": float(m(torch.full((8, 2), 100.0))[0])}), ("without", None)):
         module = Toy(torch.nn.BatchNorm1d(2), lambda x, y: (y - x).square().mean())
@@ -231,7 +232,7 @@ def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None
 
 
 def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
-    """The checkpoint said that its step was done, so the figures of the last steps were lost for good."""
+    """The checkpoint recorded its step as done, so the figures of the last steps were lost."""
     outcomes = iter([1.0, None, 2.0])
 
     def validate(module: Toy) -> dict[str, float]:
@@ -268,7 +269,7 @@ def test_a_checkpoint_that_does_not_fit_is_an_error_of_use(damage: str, tmp_path
 
 @pytest.mark.parametrize("damage", ["empty", "text", "zeros", "half", "flipped", "folder", "none"])
 def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path) -> None:
-    """It was nothing at all, or paragraphs of torch on settings of its own; flipped bytes were weights."""
+    """The message was empty, or paragraphs from torch about its own settings; flipped bytes were loaded as weights."""
     path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(32, 32)
     made = make_optimizer(module, OptimizerSettings())
     save_checkpoint(path, module, module, made, 7)
@@ -299,7 +300,7 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
 def test_drives_that_were_packed_anew_are_not_gone_on_with(
     settings: RegistrationTrainingSettings, packed: Path, tmp_path: Path
 ) -> None:
-    """As many frames may be others."""
+    """The same number of frames does not mean the same frames."""
     drives = shutil.copytree(packed, tmp_path / "drives")
     settings = settings.model_copy(
         update={"data": settings.data.model_copy(update={"packed": {str(drives): 1.0}}), "validation": ""}
@@ -316,7 +317,7 @@ def test_drives_that_were_packed_anew_are_not_gone_on_with(
 
 @pytest.mark.slow
 def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Every other tensor of the weights stays as the registration training left it."""
+    """Every other tensor of the weights stays as after the registration training."""
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, rate=1e-2, steps=4)
     second = second.model_copy(update={"validation": settings.validation, "validation_batches": 1})
@@ -330,7 +331,7 @@ def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTraini
 def test_the_decoder_alone_learns_where_the_encoder_does_not(
     settings: RegistrationTrainingSettings, tmp_path: Path
 ) -> None:
-    """So that the descriptors stay those of the weights that it began with."""
+    """Thus the descriptors stay those of the weights that it started from."""
     start = train_registration(settings, tmp_path / "one")
     second = settings.model_copy(update={"start": str(start), "encoder": False})
     before, after = load_file(start), load_file(train_registration(second, tmp_path / "two"))
@@ -342,7 +343,7 @@ def test_the_decoder_alone_learns_where_the_encoder_does_not(
 def test_overlap_with_images_is_validated_on_worlds_without(
     settings: RegistrationTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """As in the recipe of the shipped weights: it was an error that no packed drive has images."""
+    """The recipe of the shipped weights does this: it was an error that no packed drive has images."""
     write_packed(tmp_path / "val" / "world", [sample._replace(images=()) for sample in samples], {"source": "boxes"})
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, steps=1)
@@ -352,8 +353,8 @@ def test_overlap_with_images_is_validated_on_worlds_without(
 
 
 def test_what_a_training_makes_of_its_scans_is_not_measured(samples: list[Sample], tmp_path: Path) -> None:
-    """Trainings that augment in different ways were measured on different scans, 20 m apart or not by where the
-    augmentation had shifted them."""
+    """Trainings with different augmentation were evaluated on different scans, whose distance of 20 m depended on the
+    shift by the augmentation."""
     apart = se3.exp([0, 0, 0, 1, 0, 0])
     drive = [s._replace(pose=np.linalg.matrix_power(apart, 9 * k)) for k, s in enumerate(samples)]
     write_packed(tmp_path / "val" / "world", drive, {"source": "boxes", "preset": "city"})
@@ -368,7 +369,7 @@ def test_what_a_training_makes_of_its_scans_is_not_measured(samples: list[Sample
 
 
 def test_overlap_leaves_the_running_means_of_the_encoder_as_they_are() -> None:
-    """A backbone of timm has such: its descriptors were no longer those of the maps."""
+    """Backbones of timm have running means: the descriptors no longer equaled those of the maps."""
     module = OverlapTraining(tiny()).train()
     assert module.model.decoder.training
     assert not any(part.training for part in module.model.encoder.modules())
@@ -395,8 +396,8 @@ class Normed(torch.nn.Module):
 def test_an_encoder_that_does_not_learn_keeps_its_running_means(
     phase: str, settings: RegistrationTrainingSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A backbone of timm has such. They were those of the training's last batches: descriptors were no longer those of
-    the maps, which these weights then refused."""
+    """Backbones of timm have running means. They were those of the training's last batches: the descriptors no longer
+    equaled those of the maps, which then rejected these weights."""
     monkeypatch.setitem(sys.modules, "timm", SimpleNamespace(create_model=lambda *_, **__: Normed()))
     network = merged(settings.network, {"image": {"backbone": "timm:normed"}})
     settings = settings.model_copy(update={"network": network, "validation": ""})
@@ -415,15 +416,15 @@ def test_an_encoder_that_does_not_learn_keeps_its_running_means(
 
 
 def _overlap(settings: RegistrationTrainingSettings, start: Path, **optimiser: float) -> OverlapTrainingSettings:
-    """The overlap training on the drives of the registration training, as if from a YAML file that sets these keys
-    alone."""
+    """The overlap training on the drives of the registration training, as from a YAML file with only these keys."""
     data = {"packed": settings.data.packed, "groups": 1, "workers": 0, "images": True}
     tree = {"start": str(start), "data": data, "optimiser": {"compile": False, "bf16": False, **optimiser}}
     return settings_from(OverlapTrainingSettings, tree)
 
 
 def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
-    """The paper's 1e-4 and 1e-5 hold beside other keys of the optimizer; one that is set itself counts."""
+    """The paper's 1e-4 and 1e-5 are kept if other keys of the optimizer are set; a rate or decay that is set takes
+    effect."""
     chosen = settings_from(
         OverlapTrainingSettings, {"start": "w", "optimiser": {"steps": 2000, "decay": 3e-5}}
     ).optimiser
@@ -434,8 +435,8 @@ def test_overlap_keeps_a_tenth_of_the_rate_whatever_else_is_set() -> None:
 def test_overlap_keeps_the_network_of_registration_and_what_is_said_of_it(
     settings: RegistrationTrainingSettings, tmp_path: Path
 ) -> None:
-    """Also settings that change no shape and differ from the preset: the weights that it writes have them again; and
-    steps and images, by which the SLAM knows whether to use the camera. The phase is two."""
+    """This includes settings that change no shape and differ from the preset: its weights store them again. Steps and
+    images, which the SLAM reads to decide whether to use the camera, are kept, too. The phase is two."""
     changed = {"decoder": {"temperature": 0.5}, "fusion": {"image_mask": "front"}}
     start = train_registration(
         settings.model_copy(update={"network": merged(settings.network, changed)}), tmp_path / "one"
@@ -453,23 +454,22 @@ def test_overlap_keeps_the_network_of_registration_and_what_is_said_of_it(
     (ImageTrainingSettings, "images"),
 ])  # fmt: skip
 def test_a_setting_that_a_phase_does_not_use_is_rejected(kind: type, key: str) -> None:
-    """Frames of a place are fixed in the overlap training, two images of one in the image branch."""
+    """The overlap training has a fixed number of frames per place; the image branch, two images per place."""
     with pytest.raises(UsageError, match=f"unknown key data.{key}"):
         settings_from(kind, {"start": "w", "data": {key: 3}})
 
 
 @pytest.mark.long
 def test_it_overfits_four_pairs_to_two_centimeters(packed: Path) -> None:
-    """The same 4 pairs over and over are registered to 2 cm within 160 steps: nothing in the chain blocks the signal.
+    """The same 4 pairs, repeated, are registered to 2 cm within 160 steps: nothing in the chain blocks the gradient.
 
-    With so small a network an unlucky start may leave one pair unmatched, and which start that is changes with the
-    order of sums (threads, processor): one of three starts has to do it.
-    """
+    With so small a network an unlucky initialization may leave one pair unmatched. Which initialization that is depends
+    on the order of sums (threads, processor): one of three must succeed. """
     assert any(_overfits(packed, seed) for seed in (1, 2, 0))
 
 
 def _overfits(packed: Path, seed: int) -> bool:
-    """Whether all 4 pairs are at some time registered to 2 cm, looked at every 25 steps."""
+    """Whether at some time all 4 pairs are registered to 2 cm, checked every 25 steps."""
     torch.manual_seed(seed)
     network = tiny(fusion={"points": 96})
     module = RegistrationTraining(network, LossSettings(offset=1, near=64, own=32))
@@ -509,15 +509,15 @@ def _errors(module: RegistrationTraining, batch: object, plans: tuple) -> list[f
 
 
 def test_the_rate_drops_instead() -> None:
-    """By 0.8 after every 15 steps, as GndNet's authors have it, after the warm-up."""
+    """It drops by 0.8 after every 15 steps, as in GndNet's training, after the warm-up."""
     settings = OptimizerSettings(rate=1.0, warmup=2, drop_every=15, drop=0.8)
     assert [round(learning_rate(settings, s), 6) for s in (0, 1, 2, 14, 15, 30, 45)] == [0.5, 1, 1, 1, 0.8, 0.64, 0.512]
 
 
 @pytest.mark.parametrize(("kind", "after"), [("adamw", 0.8), ("adam", 0.9), ("sgd", 0.7)])
 def test_one_step_of_each_optimizer_by_hand(kind: str, after: float) -> None:
-    """A weight of 1, a gradient of 2, rate 0.1, decay 1: AdamW steps by the rate and decays by it, Adam's decay is lost
-    in the size of the gradient, and SGD steps by the rate times gradient and decay together."""
+    """A weight of 1, a gradient of 2, rate 0.1, decay 1: AdamW steps by the rate and decays by it; Adam's decay
+    vanishes in the normalization of the gradient; SGD steps by the rate times the sum of gradient and decay."""
     module = torch.nn.Linear(1, 1, bias=False)
     torch.nn.init.ones_(module.weight)
     optimizer = make_optimizer(module, OptimizerSettings(kind=kind, rate=0.1, decay=1.0))
@@ -527,13 +527,13 @@ def test_one_step_of_each_optimizer_by_hand(kind: str, after: float) -> None:
 
 
 def test_learning_rate() -> None:
-    """Warm-up to the peak, cosine through the half, to the floor."""
+    """Warm-up to the peak, then a cosine, half way down in the middle, to the final rate."""
     settings = OptimizerSettings(steps=110, warmup=10, rate=1.0, final_rate=0.2)
     assert [round(learning_rate(settings, s), 6) for s in (0, 9, 10, 60, 110)] == [0.1, 1.0, 1.0, 0.6, 0.2]
 
 
 def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Where its package is installed: the same losses at the same steps as log.jsonl, to float32."""
+    """If its package is installed: the same losses at the same steps as in log.jsonl, to float32."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     train_registration(settings, tmp_path / "out")
     events = accumulator.EventAccumulator(str(tmp_path / "out" / "tensorboard")).Reload()
@@ -543,8 +543,8 @@ def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSe
 
 
 def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its package is an optional one."""
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # what a missing package looks like to import
+    """Its package is optional."""
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # as a missing package appears to an import
     log = Log(tmp_path)
     log.write(7, {"loss": 0.5})
     log.close()
@@ -553,7 +553,7 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
 
 
 def test_a_log_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
-    """Steps since the last checkpoint are done again after a kill; they stood there twice."""
+    """Steps since the last checkpoint are repeated after a kill; they were in the log twice."""
     log = Log(tmp_path)
     for step in range(4):
         log.write(step, {"loss": 0.5})
@@ -572,7 +572,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[
 
 @pytest.mark.long
 def test_two_processes_give_the_gradients_of_one(packed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """gloo on the CPU, this process and another: each its part of the places, the mean of the losses."""
+    """gloo on the CPU, this process and another: each has a part of the places; the losses are averaged."""
     one = ranks.gradients(str(packed), tiny())
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -601,7 +601,8 @@ train_registration(RegistrationTrainingSettings.model_validate_json(settings), P
 
 @pytest.mark.long
 def test_the_whole_loop_runs_under_torchrun(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Two gloo ranks train, log, validate and save once; their losses are not those of one process' smaller batch."""
+    """Two gloo ranks train, log, validate and save once; their losses differ from those of one process's smaller
+    batch."""
     script = tmp_path / "loop.py"
     script.write_text(LOOP)
     command = [*TORCHRUN, script, tmp_path / "two", settings.model_dump_json()]
@@ -613,5 +614,5 @@ def test_the_whole_loop_runs_under_torchrun(settings: RegistrationTrainingSettin
     train_registration(settings, tmp_path / "one")
     one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys()
-    assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank's part counts
+    assert any(not torch.equal(one[name], two[name]) for name in one)  # the second rank contributes
     assert all(torch.isfinite(tensor).all() for tensor in two.values())
