@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""matplotlib without a window: a new figure, a figure as a file, and the colors that pictures have in common."""
+"""matplotlib without a window: a new figure, a figure as a file, and the common colors of the images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BACKGROUND, INK, ESTIMATE = "#0d1117", "#c9d1d9", "#ff9f1c"
-"""Dark ground, what is written on it, and what was found."""
+"""Dark background, text on it, and the estimate."""
 
 
 def new_figure(**attributes: Any) -> Figure:
@@ -29,7 +29,7 @@ def new_figure(**attributes: Any) -> Figure:
 
 
 def save_png(path: Path | str, figure: Figure) -> None:
-    """Write a figure, whole or not at all.
+    """Write a figure, completely or not at all.
 
     Raises:
         Dpm2Error: the file could not be written.

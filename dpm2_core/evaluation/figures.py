@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images: runs from above (map, estimated and true trajectory), and what a failing sensor delivers."""
+"""Images: runs from above (map, estimated and true trajectory), and the data of a failing sensor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _TRUTH = "#ffffff"
 _HEIGHTS = ("#3d4f8f", "#2f8f9d", "#7fd1ae", "#f6f3c0")  # ground to roofs
-_PIXELS = 1100  # of the map raster along its longer side: about 0.15 m on a street, where voxels are 0.2 m
+_PIXELS = 1100  # of the map raster along its longer side: about 0.15 m for a street, with voxels of 0.2 m
 _MARGIN = 45.0  # m of map shown around the trajectory; beyond it a LiDAR map is mostly stray points
 
 
@@ -61,7 +61,7 @@ def trajectory_png(
 
 
 def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None, title: str) -> None:
-    """Draw the ways (N, 3), m, of several methods and the true one from above, all in one frame.
+    """Draw the trajectories (N, 3), m, of several methods and the true one from above, all in one frame.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -80,7 +80,7 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
 
 
 def corrupted_png(path: Path | str, before: Frame, after: Frame, title: str) -> None:
-    """Draw a frame as it is and as a failing sensor delivers it: the scan from above, and the image.
+    """Draw a frame as it is and as from a failing sensor: the scan from above, and the image.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -109,7 +109,7 @@ def _aligned(gt: Array, est: Array) -> Array | None:
 
 
 def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
-    """Corners (2,), (2,) of what is shown: the trajectory with a margin, which the map may cut to where points are."""
+    """Corners (2,), (2,) of the drawn area: the trajectory with a margin, which is cut to the area with map points."""
     low, high = positions[:, :2].min(0) - _MARGIN, positions[:, :2].max(0) + _MARGIN
     if cloud is not None and len(cloud):
         reach = 3.0
@@ -119,10 +119,10 @@ def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
 
 
 def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray[np.float64]:
-    """(H, W, 3) image of the points: hue from the highest in each pixel, brightness from how many there are.
+    """(H, W, 3) image of the points: hue from the highest in each pixel, brightness from their number.
 
-    Heights count from the nearest of the (N, 3) positions of the LiDAR: a street on a hill must not outshine houses
-    in the valley. Pixels are no finer than the spacing of the points, so that surfaces look like surfaces.
+    Heights are relative to the nearest of the (N, 3) positions of the LiDAR: a street on a hill must not be brighter
+    than houses in the valley. Pixels are no finer than the spacing of the points, so that surfaces have no gaps.
     """
     with needs("plot", "drawing"):
         from matplotlib.colors import LinearSegmentedColormap, to_rgb

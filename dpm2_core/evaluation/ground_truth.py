@@ -16,13 +16,13 @@ from dpm2_core.geometry import se3
 
 
 def read_ground_truth(source: Source, path: Path | str | None, start: int, stop: int) -> Array | Trajectory | None:
-    """Of frames start..stop-1: LiDAR poses (N, 4, 4), or a trajectory to be matched by stamp or number, or None.
+    """Ground truth of frames start..stop-1: LiDAR poses (N, 4, 4), a trajectory to match by stamp or number, or None.
 
     Args:
-        path: file of poses (KITTI: left camera; TUM: LiDAR); those of the source otherwise.
+        path: file of poses (KITTI: left camera; TUM: LiDAR); None for those of the source.
 
     Raises:
-        UsageError: no such file, or one of another drive or of other frames.
+        UsageError: no such file, or it is of another drive or of other frames.
     """
     if path is None:
         return None if source.poses is None else source.poses[start:stop]
@@ -30,10 +30,10 @@ def read_ground_truth(source: Source, path: Path | str | None, start: int, stop:
     if truth.kind != "kitti":
         _check_overlap(truth, path, source, start, stop)
         return truth
-    numbers = getattr(source, "numbers", None)  # those in the file names; a bag has none
+    numbers = getattr(source, "numbers", None)  # numbers in the file names; a bag has none
     if len(truth) < len(source) or (len(truth) > len(source) and numbers is None):
         raise UsageError(f"{path}: {len(truth)} poses for {len(source)} frames of {source.name}")
-    if len(truth) > len(source):  # a file of the whole sequence beside an excerpt
+    if len(truth) > len(source):  # a file of the whole sequence for an excerpt
         numbers = np.asarray(numbers)[start:stop]
         if max(numbers) >= len(truth):
             raise UsageError(f"{path}: {len(truth)} poses, but {source.name} has frame {max(numbers)}")
@@ -44,7 +44,7 @@ def read_ground_truth(source: Source, path: Path | str | None, start: int, stop:
 
 
 def _check_overlap(truth: Trajectory, path: Path | str, source: Source, start: int, stop: int) -> None:
-    """Before the run: at its end the error would cost all its time.
+    """Check before the run that the truth fits, as an error at its end would waste all its time.
 
     Raises:
         UsageError: all true poses are from before or after those frames.
@@ -81,15 +81,15 @@ def truth_by_stamp(
 
 
 def camera_poses(poses: Array, T_cam_lidar: Array | None) -> Array:
-    """Of LiDAR poses (N, 4, 4) those of the left camera, as KITTI has them; the same where its place is not known."""
+    """Convert LiDAR poses (N, 4, 4) to those of the left camera, as in KITTI; unchanged without its extrinsics."""
     return poses if T_cam_lidar is None else _in_other_frame(poses, T_cam_lidar)
 
 
 def lidar_poses(poses: Array, T_cam_lidar: Array | None) -> Array:
-    """The poses of the LiDAR, given those that `camera_poses` would make of them."""
+    """The inverse of `camera_poses`: poses of the LiDAR from those of the left camera."""
     return poses if T_cam_lidar is None else _in_other_frame(poses, se3.inverse(T_cam_lidar))
 
 
 def _in_other_frame(poses: Array, T_other_sensor: Array) -> Array:
-    """Poses of one sensor as those of another that is rigidly mounted to it."""
+    """Convert poses of one sensor to those of another that is rigidly mounted to it."""
     return T_other_sensor @ poses @ se3.inverse(T_other_sensor)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the network looks: the attention of a reference point to the image (the paper's Figure 7).
+"""The attention of a reference point of the network to the image (the paper's Figure 7).
 
-The network keeps no attention weights, since that would cost time and memory in every frame. They are computed again
-of what the last fusion layer's image attention was given.
+The network stores no attention weights, since that would cost time and memory in every frame. They are computed again
+from the inputs of the image attention in the last fusion layer.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class ImageAttention:
     """What a frame's descriptors read from its first image.
 
     Attributes:
-        pixels: (H, W, 3) uint8, as the network sees it.
-        points: (N, 3) reference points, m. uv: (N, 2) where they are in the image, pixels. seen: (N,) whether in it.
-        chosen: one of them. heat: (H, W) 0..1, its attention, the mean of all heads, per pixel; 1 is the most.
+        pixels: (H, W, 3) uint8, as the network reads it.
+        points: (N, 3) reference points, m. uv: (N, 2) their positions in the image, pixels. seen: (N,) whether in it.
+        chosen: one of them. heat: (H, W) 0..1, its attention, the mean of all heads, per pixel; 1 is the maximum.
     """
 
     pixels: NDArray[np.uint8]
@@ -48,9 +48,9 @@ class ImageAttention:
     heat: NDArray[np.float32]
 
 
-@torch.no_grad()  # in inference mode only the points that an image shows would be asked, under other numbers
+@torch.no_grad()  # inference mode computes only the points in the image, with other numbers
 def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None) -> ImageAttention:
-    """Attention of one reference point in the last layer; by default of the one nearest to the middle of the image.
+    """Attention of one reference point in the last layer; by default of the one nearest to the image center.
 
     Raises:
         UsageError: weights without a camera or without attention to it, a frame without an image, no such point, or
@@ -90,7 +90,7 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     sizes = [m.features.shape[-2:] for m in encoded.maps]
     heat = np.zeros((height, width), np.float32)
     for (h, w), part in zip(sizes, weights.float().cpu().split([h * w for h, w in sizes]), strict=True):
-        # Attention per pixel: that of a coarse map is spread over more of them.
+        # Attention per pixel: that of a coarse map is spread over more pixels.
         grid = part.view(h, w).numpy() * (h * w)
         heat += cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR)
     heat /= max(float(heat.max()), 1e-9)
@@ -114,7 +114,7 @@ def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str) 
 
 
 def draw_attention(axes: Any, looked: ImageAttention) -> None:
-    """The image with its reference points, and over it the attention of the chosen one."""
+    """Draw the image with its reference points, and over it the attention of the chosen one."""
     gray = looked.pixels.mean(2, keepdims=True) / 255 * 0.7
     color = cv2.cvtColor(
         cv2.applyColorMap((255 * looked.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB

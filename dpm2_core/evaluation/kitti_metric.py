@@ -23,7 +23,7 @@ OFFICIAL_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 @dataclass(frozen=True, eq=False)
 class SegmentErrors:
-    """One entry a segment.
+    """Errors, with one entry per segment.
 
     Attributes:
         length: (S,) m.
@@ -41,16 +41,16 @@ class SegmentErrors:
         return len(self.length)
 
     def where(self, chosen: NDArray[np.bool_]) -> SegmentErrors:
-        """Those that are chosen (S,)."""
+        """The chosen (S,) segments."""
         return SegmentErrors(self.length[chosen], self.t_err[chosen], self.r_err[chosen], self.speed[chosen])
 
     def mean(self) -> tuple[float, float] | None:
-        """(t_err, r_err) as the benchmark ranks them; None where the drive is shorter than every length."""
+        """(t_err, r_err) as in the benchmark's ranking; None if the drive is shorter than every length."""
         return (float(self.t_err.mean()), float(self.r_err.mean())) if len(self) else None
 
 
 def in_words(lengths: Sequence[float]) -> str:
-    """Segment lengths, m, for people."""
+    """Segment lengths, m, as text."""
     return f"{', '.join(f'{length:g}' for length in lengths)} m"
 
 
@@ -60,7 +60,7 @@ def segment_errors(
     """Compare (N, 4, 4) poses with (N, 4, 4) ground truth of the same frames and the same sensor frame.
 
     Args:
-        gt: rows of NaN where the ground truth is unknown; these frames count for the speeds alone.
+        gt: rows of NaN where the ground truth is unknown; these frames are used only for the speeds.
         est: rows of NaN where a frame has no estimate; segments that begin or end there are left out.
         lengths: m. With those of the benchmark a segment starts every 10 frames, as there, with others at each frame.
         stamps: (N,) ns, for the speeds; by default KITTI's period apart.
@@ -78,7 +78,7 @@ def segment_errors(
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
-    # As the development kit counts: to the end of the first frame beyond the length, whether that one is there or not.
+    # As in the development kit: to the end of the first frame beyond the length, whether that one is there or not.
     time, period = stamps - stamps[0], 1e9 * frame_period(stamps)
     end = np.minimum(time[at[last]], np.interp(travelled[first] + length, travelled, time[at]) + period) + period
     seconds = (end - time[at[first]]) / 1e9

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as it goes on, for rerun's viewer: the growing map, the pose, loops, the image, states and times."""
+"""A live view of a run in rerun's viewer: the growing map, the pose, loops, the image, states and times."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 _SCAN = 6000  # points of a scan that are shown; all of a keyframe are, in the map
 _COLORS = {State.TRACKING: (90, 200, 120), State.DEGRADED: (240, 180, 60), State.LOST: (230, 80, 70)}
 _ACCEPTED, _REJECTED, _WAY = (90, 160, 255), (230, 90, 80), (240, 210, 90)
-_WIDTH = 640  # pixels of an image that is shown, at most: to encode a larger one took longer than all the rest
-_PATIENCE = 10.0  # s, for a viewer to take what is left
+_WIDTH = 640  # largest width of an image that is shown: encoding a larger one took longer than all the rest
+_PATIENCE = 10.0  # s, for a viewer to receive the remaining data
 _PORT = 9876  # of a viewer that runs already, also on another machine: forwarded by ssh
 
 
 def check_view(viewer: bool, record: Path | None, out: Path) -> None:
-    """Raise what is known to go wrong with a `LiveView` before anything is read or written.
+    """Raise the errors of a `LiveView` that can be foreseen, before anything is read or written.
 
     Args:
-        out: the folder of the results, which will be there.
+        out: the folder of the results, which will be made.
 
     Raises:
         MissingPackageError: the extra `view` is not installed. UsageError: no such folder for the recording.
@@ -51,7 +51,7 @@ def check_view(viewer: bool, record: Path | None, out: Path) -> None:
 
 
 class LiveView:
-    """Shows each frame as it has been processed. A context manager: leaving it completes the recording."""
+    """Shows each frame once it is processed. A context manager: leaving it completes the recording."""
 
     def __init__(self, name: str, viewer: bool, record: Path | None) -> None:
         """Open rerun's viewer, or a recording, or both.
@@ -84,12 +84,12 @@ class LiveView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(Exception):  # the viewer has been closed: what it has not shown is no loss
+        with suppress(Exception):  # the viewer has been closed: its remaining data are not needed
             self._stream.flush(timeout_sec=_PATIENCE)
         self._stream.disconnect()
 
     def add(self, frame: Frame, result: SlamResult, mapper: Mapper) -> None:
-        """Show a frame and what became of it."""
+        """Show a frame and its result."""
         tracked = result.odometry
         self._stream.set_time("frame", sequence=tracked.index)
         self._stream.set_time("stamp", timestamp=np.datetime64(tracked.stamp, "ns"))
@@ -126,7 +126,7 @@ class LiveView:
             self._stream.log("log", self._rr.TextLog(text, level=level))
 
     def _show_map(self, mapper: Mapper, loops: Sequence[Edge]) -> None:
-        """New keyframes; all poses again where a loop has moved them."""
+        """Show new keyframes, and all poses again if a loop has moved them."""
         poses = mapper.poses
         moved = any(loop.ok for loop in loops)
         for node in range(0 if moved else self._keyframes, len(poses)):
@@ -153,7 +153,7 @@ class LiveView:
 
 
 def _shown() -> bool:
-    """Whether a viewer can open, or one runs: without a display rerun starts one all the same, and waits for ever."""
+    """Whether a viewer can open or is running: without a display rerun would still start one, and wait forever."""
     if not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         return True
     with socket.socket() as found:

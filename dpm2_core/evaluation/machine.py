@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a machine has of what dpm2 uses, and what is missing: each check looks at the real thing."""
+"""Checks of what dpm2 uses on a machine and what is missing: each check tests the real thing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from dpm2_core._version import __version__
 from dpm2_core.evaluation.record import package_version
 
 Level = Literal["ok", "note", "warning", "error"]
-"""A note says what is not there and may not be needed; a warning, what will be felt; an error, what does not work."""
+"""A note: something is missing that may not be needed. A warning: it has noticeable effects. An error: it does not
+work."""
 DISTRIBUTION = "dpm2_ros"
 _PACKAGES = (
     "numpy",
@@ -39,7 +40,7 @@ _GB, _MB = 1e9, 1e6
 
 @dataclass(frozen=True)
 class Finding:
-    """One line: what was looked at, how it is, what was found, and what to do about it."""
+    """One line: what was checked, how it is, what was found, and what to do about it."""
 
     what: str
     level: Level
@@ -48,7 +49,7 @@ class Finding:
 
 
 def check_machine(folder: Path) -> Iterator[Finding]:
-    """Every check but the self-test; `folder`: where results will be written."""
+    """Every check except the self-test; `folder`: where results will be written."""
     yield from (python(), packages(), extras(), processor(), memory(), gpu())
     yield from (disk(folder), shared_memory(), ros(), dds())
 
@@ -86,7 +87,7 @@ def extras() -> Finding:
 
 
 def processors() -> int:
-    """How many this process may use, by its affinity and the quota of a container."""
+    """Number of processors that this process may use, by its affinity and the quota of a container."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = _read("/sys/fs/cgroup/cpu.max").split()
     if len(quota) == 2 and quota[0].isdecimal():
@@ -95,7 +96,7 @@ def processors() -> int:
 
 
 def processor() -> Finding:
-    """Cores that this process may use, and the instructions that the network gains from."""
+    """Cores that this process may use, and the instructions that make the network faster."""
     cores = processors()
     text = _read("/proc/cpuinfo")
     model = re.search(r"model name\s*: (.+)", text)
@@ -142,7 +143,7 @@ def gpu() -> Finding:
 
 
 def disk(folder: Path, enough: float = 5 * _GB) -> Finding:
-    """Whether files can be written to a folder, and how many; `enough` in bytes."""
+    """Whether files can be written to a folder, and the free space; `enough` in bytes."""
     name = f"disk of {folder.resolve()}"
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -159,7 +160,7 @@ def disk(folder: Path, enough: float = 5 * _GB) -> Finding:
 
 
 def shared_memory(folder: Path = Path("/dev/shm"), enough: float = 64 * _MB) -> Finding:
-    """What DDS and the workers of a training exchange data in; `enough` in bytes."""
+    """Memory through which DDS and the workers of a training exchange data; `enough` in bytes."""
     if not folder.is_dir():
         return Finding("shared memory", "warning", f"no {folder}", "clouds between nodes are sent over UDP")
     free = shutil.disk_usage(folder).free
@@ -182,7 +183,7 @@ def ros() -> Finding:
 
 
 def dds(timeout: float = 15.0) -> Finding:
-    """A cloud from a node to itself, in a process of its own; `timeout` in s."""
+    """Send a cloud from a node to itself, in its own process; `timeout` in s."""
     if find_spec("rclpy") is None:
         return Finding("DDS", "note", "not tried without ROS 2")
     names = ("RMW_IMPLEMENTATION", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")

@@ -31,7 +31,7 @@ def write_map_page(path: Path, data: MapData, voxel: float) -> None:
     """Write the page; needs at least one keyframe.
 
     Args:
-        voxel: spacing of its points, m; of more than `MOST_POINTS` those are left out that show least.
+        voxel: spacing of its points, m; of more than `MOST_POINTS` those that show the least are left out.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -48,10 +48,10 @@ def map_page(data: MapData, voxel: float, title: str) -> str:
 
 
 def by_detail(cloud: Points, finest: float) -> Points:
-    """The points in an order of which every beginning shows the whole cloud evenly, and more of it the longer it is.
+    """The points in an order in which the first n points show the whole cloud evenly, in more detail for larger n.
 
     Args:
-        cloud: (N, 4). finest: m between points that nothing is gained by telling apart.
+        cloud: (N, 4). finest: distance, m, below which distinguishing points gives no benefit.
     """
     noise = np.random.default_rng(0)
     rest, order, size = np.arange(len(cloud)), [], _COARSEST
@@ -64,7 +64,7 @@ def by_detail(cloud: Points, finest: float) -> Points:
 
 
 def _content(data: MapData, voxel: float) -> dict[str, Any]:
-    """What the script of the page shows: positions relative to the middle of the keyframes."""
+    """The data for the page's script: positions relative to the center of the keyframes."""
     middle = data.poses[:, :3, 3].mean(0)
     cloud = by_detail(map_cloud(data.clouds, data.poses, voxel), 2 * voxel)[:MOST_POINTS]
     local = cloud[:, :3].astype(np.float64) - middle
@@ -89,7 +89,7 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
         {
             "at": (T[:3, 3] - middle).round(3).tolist(),
             "yaw": round(float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))), 1),
-            "stamp": str(keyframe.stamp),  # ns are more than a number of JavaScript holds
+            "stamp": str(keyframe.stamp),  # ns exceed the precision of a number in JavaScript
             "frame": keyframe.index,
             "robot": keyframe.robot,
             "session": keyframe.session,
@@ -100,7 +100,7 @@ def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
 
 
 def _tracks(data: MapData, middle: Array) -> list[list[list[float]]]:
-    """The way of each drive, through keyframes that were pruned as well."""
+    """The trajectory of each drive, including keyframes that were pruned."""
     return [(way.poses[:, :3, 3] - middle).round(3).tolist() for way in ways(data)]
 
 
@@ -114,7 +114,7 @@ def _loop(edge: Edge) -> dict[str, Any]:
 
 
 def _within(jpeg: bytes | None, room: int) -> bytes | None:
-    """The image in at most so many bytes, smaller if it must be; None where there is none, or something else."""
+    """The image in at most `room` bytes, resized if necessary; None if there is none, or it is no JPEG."""
     if jpeg is None or not jpeg.startswith(b"\xff\xd8"):
         return None
     try:

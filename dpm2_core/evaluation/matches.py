@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look inside a registration: which descriptors of two scans were matched, how surely, and what came of it."""
+"""Drawing of a registration: the matched descriptors of two scans, their confidence, and the result."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def matches_png(
     title: str = "",
     looked: ImageAttention | None = None,
 ) -> None:
-    """Two views from above of how a network registers a scan to another: the scans beside each other with their
+    """Draw how a network registers a scan to another, in two views from above: the scans next to each other with their
     matches, and one on top of the other.
 
     Args:
-        looked: what to draw of the source's image; None: nothing.
+        looked: attention to draw on the source's image; None: no image.
 
     Raises:
         Dpm2Error: too few points, or the file could not be written.
@@ -54,7 +54,7 @@ def compared_png(
     """`matches_png` of several networks, one below the other.
 
     Args:
-        networks: title, network, and what to draw of the image or None, of each.
+        networks: title, network, and attention to draw on the image or None, of each.
 
     Raises:
         Dpm2Error: too few points, or the file could not be written.
@@ -98,7 +98,7 @@ def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, lo
         near = points[np.abs(points[:, :2]).max(1) < _REACH]
         axes.plot(*(near[:, :2] + shift).T, ",", color=color, alpha=0.6)
         axes.set_axis_off()
-    order = np.argsort(confidence)  # the surest on top
+    order = np.argsort(confidence)  # the most confident on top
     ends = np.stack([at_target[order, :2], at_source[order, :2] + right], 1)
     lines = LineCollection(list(ends), array=confidence[order], cmap="viridis", linewidths=0.8, clim=(0, 1))
     beside.add_collection(lines)

@@ -43,27 +43,27 @@ class SpeedErrors(BaseModel):
 
 
 SPEED_STEP = 2.0
-"""Width of a class of speed, m/s: the development kit draws a value each 2 m/s, too, but of twice the width."""
+"""Width of a speed class, m/s: the development kit, too, has a value every 2 m/s, but with twice the width."""
 
 
 class Metrics(BaseModel):
-    """The figures of one run; None where the drive or the ground truth does not allow them."""
+    """The figures of one run; None if the drive or the ground truth does not allow them."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     truth: str | None = None
-    """What the true poses were read from: a file or a topic; None where that is not known."""
+    """Source of the true poses: a file or a topic; None if it is not known."""
     frames: int
     """Frames of the drive."""
     compared: int | None = None
-    """Poses that have a true one beside them: the errors are of these. Fewer than `frames` where the ground truth is
-    sampled more rarely, or is of a part of the drive; None where that is not known."""
+    """Poses with ground truth: the errors are of these. Fewer than `frames` if the ground truth has a lower rate, or is
+    of a part of the drive; None if it is not known."""
     failed_frames: int
     """Frames without an estimate of their own: missing, or only predicted."""
     breaks: int = 0
-    """Pauses across which the way is not known: the poses after one go on from a guess."""
+    """Pauses across which the motion is not known: the poses after a pause continue from a guess."""
     fps: float | None = None
-    """Frames a second of processing, reading excluded; None where it is not known."""
+    """Frames per second of processing, reading excluded; None if it is not known."""
     path_length_m: float | None = None
     """Length of the ground truth, m."""
     t_err_percent: float | None = None
@@ -87,7 +87,7 @@ class Metrics(BaseModel):
     rpe_rot_deg: float | None = None
     """Mean error of the rotation from one frame to the next, degrees."""
     final_drift_percent: float | None = None
-    """Position error at the last frame, aligned at the first pose alone, over the length of the path, percent."""
+    """Position error at the last frame, aligned only at the first pose, over the length of the path, percent."""
 
 
 def evaluate(
@@ -98,15 +98,15 @@ def evaluate(
     stamps: Keys | None = None,
     failed_frames: int | None = None,
 ) -> Metrics:
-    """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames; what is not to be seen from these, as
-    breaks and speed, is left for the caller.
+    """Evaluate (N, 4, 4) poses against (N, 4, 4) ground truth of the same frames. Figures that these do not contain, as
+    breaks and speed, are left to the caller.
 
     Args:
         gt: rows of NaN where the ground truth is unknown; these frames are left out.
         est: in the sensor frame of `gt` (the world frames may differ); rows of NaN where there is no estimate.
         lengths: of the KITTI metric's segments, m.
-        stamps: (N,) ns, for the speeds and for which frames follow each other; by default KITTI's period apart.
-        failed_frames: as the SLAM system counted them; by default the frames without an estimate.
+        stamps: (N,) ns, for the speeds and to find consecutive frames; by default KITTI's period apart.
+        failed_frames: as counted by the SLAM system; by default the frames without an estimate.
 
     Raises:
         UsageError: the two differ in length, or fewer than two frames have both poses.
@@ -153,10 +153,10 @@ def align(source: Array, target: Array) -> Array:
 
 
 def have_other_axes(gt: Array, est: Array) -> bool:
-    """Whether (N, 4, 4) poses run as others do, but along other axes: of LiDAR and camera, or without rotations.
+    """Whether two trajectories (N, 4, 4) agree, but along other axes: of LiDAR and camera, or without rotations.
 
-    Then what aligns the first pose turns the way from where what aligns all positions has it: by 0.3 (17 degrees) or
-    more of its extent, far more than an odometry errs on a way that fits to a tenth.
+    Then the alignment of the first pose rotates the trajectory away from the alignment of all positions: by 0.3 of its
+    extent (17 degrees) or more, far more than the error of an odometry whose trajectory fits to a tenth.
     """
     T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
     turn = gt[0, :3, :3] @ est[0, :3, :3].T - T_gt_est[:3, :3]
@@ -183,7 +183,7 @@ def _position_errors(gt: Array, est: Array) -> Array:
 def rpe(gt: Array, est: Array, stamps: Keys | None = None) -> tuple[float | None, float | None]:
     """Mean error from one frame to the next: translation m, rotation degrees; None without two known neighbors.
 
-    A step across missing frames, more than 1.5 periods of the `stamps` (N,) ns, is none.
+    Steps across missing frames, of more than 1.5 periods of the `stamps` (N,) ns, are left out.
     """
     stamps = stamps_of(np.arange(len(gt))) if stamps is None else stamps
     both = known(gt) & known(est)
@@ -196,14 +196,14 @@ def rpe(gt: Array, est: Array, stamps: Keys | None = None) -> tuple[float | None
 
 
 def final_drift_percent(gt: Array, est: Array) -> float | None:
-    """Position error at the end of (N, 4, 4) poses aligned at the first, over the path; None for one that stands."""
+    """Position error at the end of (N, 4, 4) poses, aligned at the first, over the path length; None without motion."""
     length = path_length(gt)
     end = (gt[0] @ se3.inverse(est[0]) @ est[-1])[:3, 3] - gt[-1, :3, 3]
     return 100 * float(np.linalg.norm(end)) / length if length > 0 else None
 
 
 def path_length(poses: Array) -> float:
-    """Length of the way through (N, 4, 4) poses, m."""
+    """Length of the path through (N, 4, 4) poses, m."""
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
@@ -214,7 +214,7 @@ def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
 
 
 def _kitti(segments: SegmentErrors) -> dict[str, Any]:
-    """The KITTI metric of some segments, under the names that all models here have for it."""
+    """The KITTI metric of some segments, under the names that all models here use."""
     mean = segments.mean()
     t_err, r_err = (None, None) if mean is None else (100 * mean[0], 100 * float(np.degrees(mean[1])))
     return {"segments": len(segments), "t_err_percent": t_err, "r_err_deg_per_100m": r_err}

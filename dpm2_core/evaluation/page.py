@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One-file HTML pages: everything is inside, nothing is fetched, and what comes from files is text."""
+"""One-file HTML pages: they contain everything, fetch nothing, and show the content of files only as text."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PAGE = """<!doctype html>
 {data}{script}</body>
 </html>
 """
-# What the page may do, whatever is written into it: its own scripts and styles, nothing from elsewhere.
+# What the page may do, whatever it contains: its own scripts and styles, nothing from elsewhere.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data: blob:"
 
 
@@ -33,8 +33,8 @@ def page(title: str, body: str, *, style: str = "", script: str = "", data: Any 
     """An HTML page that needs no other file and no network.
 
     Args:
-        title: text. body: HTML; what is in it from elsewhere must have gone through `escape`. style: CSS.
-        script: JavaScript, run at the end of the page. data: what JSON can hold; the script reads it by
+        title: text. body: HTML; text in it from elsewhere must have passed `escape`. style: CSS.
+        script: JavaScript, run at the end of the page. data: anything that JSON can represent; the script reads it by
             `JSON.parse(document.getElementById("data").textContent)`.
 
     Raises:
@@ -49,21 +49,21 @@ def page(title: str, body: str, *, style: str = "", script: str = "", data: Any 
 
 
 def asset(name: str) -> str:
-    """A file of this package's that belongs into a page."""
+    """The text of a file of this package for a page."""
     return (Path(__file__).with_name("assets") / name).read_text(encoding="utf-8")
 
 
 def escape(text: object) -> str:
-    """Text for the body or an attribute."""
+    """Escape text for the body or an attribute."""
     return html.escape(str(text))
 
 
 def data_url(content: bytes, media: str) -> str:
-    """Content such as a PNG as the address of an image, `media` being its type: `image/png`."""
+    """Content such as a PNG as the address of an image; `media`: its type, such as `image/png`."""
     return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _json(data: Any) -> str:
-    """JSON that cannot end the element that it is in."""
+    """JSON that cannot end the HTML element that contains it."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

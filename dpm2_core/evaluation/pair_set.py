@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registration of fixed frame pairs of unseen worlds: what limits a network, and which checkpoint is best."""
+"""Registration of fixed frame pairs of unseen worlds: it shows what limits a network, and which checkpoint is best."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from dpm2_core.network.views import collate_views
 
 NEAR, FAR = 5.0, 20.0  # m, between the frames of a pair
 SUCCESS = (0.6, 1.5)
-"""Errors of a registration, m and deg, below which it counts as a success."""
+"""Errors of a registration, m and deg, below which it is a success."""
 
 
 def has_pair(poses: Array, low: float, high: float) -> bool:
-    """Whether two of (N, 4, 4) poses are so far apart, m; those that are NaN are not looked at."""
+    """Whether two of (N, 4, 4) poses are between `low` and `high` apart, m; poses that are NaN are ignored."""
     distance = pdist(poses[:, :3, 3])
     return bool(((distance > low) & (distance <= high)).any())
 
 
 class PairSet:
-    """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m, two of four with the source turned at random.
+    """Pairs drawn once: half up to 5 m apart, half 5 to `farthest` m, two of four with a randomly rotated source.
 
     Raises:
-        UsageError: no two frames of a drive are so far apart, or the network wants more of them than was packed.
+        UsageError: no two frames of a drive are this far apart, or the network needs more of them than was packed.
     """
 
     def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, farthest: float = FAR) -> None:
@@ -88,7 +88,7 @@ class PairSet:
         return out
 
     def errors(self, model: DeepPointMap2) -> np.ndarray:
-        """Per pair: distance m, turned (0 or 1), translation error m, rotation error deg, squared Mahalanobis error."""
+        """Per pair: distance m, rotated (0, 1), translation error m, rotation error deg, squared Mahalanobis error."""
         descriptors = self.encode(model)
         rows = []
         for begin in range(0, len(self.pairs), 16):
@@ -102,9 +102,9 @@ class PairSet:
         return np.array(rows)
 
     def measure(self, model: DeepPointMap2) -> dict[str, float]:
-        """Medians and success rates of near and far pairs, and of turned ones; kinds without a pair are left out.
+        """Medians and success rates of near and far pairs, and of rotated ones; kinds without a pair are left out.
 
-        Rooms are packed enlarged: distances and the limits of a success are, too; the medians are m of the room.
+        Rooms are packed enlarged. Distances and the limits of a success are enlarged, too; medians are m of the room.
         """
         rows = self.errors(model)
         meters = rows[:, 2] / np.array(self._scale)

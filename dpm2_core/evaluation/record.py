@@ -16,12 +16,12 @@ from dpm2_core.files import atomic_write, json_text
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MEASURED = ("dpm2_core", "benchmarks/*.py")
-"""What of it a record is of."""
+"""The parts of the repository that a record is about."""
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp", "gtsam", "torch", "kiss-icp")
 
 
 def write_record(path: Path, results: dict[str, Any], program: str = "dpm2", threads: int = 2) -> None:
-    """Results with everything that is needed to assess and repeat them, as JSON; the file has the benchmark's name.
+    """Write results as JSON, with everything needed to assess and repeat them; the file has the benchmark's name.
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -39,7 +39,7 @@ def write_record(path: Path, results: dict[str, Any], program: str = "dpm2", thr
 
 
 def git_commit() -> str | None:
-    """The commit that was measured, with "+" where the program or a benchmark differs from it, new files among them.
+    """The commit that was measured, with "+" if the program or a benchmark differs from it, new files included.
 
     None outside its own repository.
     """
@@ -59,7 +59,7 @@ def _git(*arguments: str) -> str:
 
 
 def package_version(package: str) -> str | None:
-    """Of an installed package; None where it is not."""
+    """Version of a package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures as tables for people, each row with its definition."""
+"""Figures as printable tables, each row with its definition."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from dpm2_core.tables import FigureTable
 
 
 def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None = None) -> FigureTable:
-    """The figures, each row with its definition; `frame` says which sensor's poses were compared, `failed` what failed
-    frames are, where no run has counted them and its breaks."""
+    """The figures, each row with its definition. `frame`: the sensor whose poses were compared. `failed`: what failed
+    frames are, if no run has counted them and its breaks."""
     caption = f"Sensor frame: {frame}." + (f" Truth: {metrics.truth}." if metrics.truth else "")
     how_measured = ["how it is measured"]
     table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves for those who look at it later: every frame, every loop that was tried, and the true way, as text.
+"""Files of a run for later analysis: every frame, every loop that was tried, and the true trajectory, as text.
 
-`frames.csv`, `loops.csv` and `ground_truth.tum` stand beside the trajectory. The report and any spreadsheet read them.
+`frames.csv`, `loops.csv` and `ground_truth.tum` are next to the trajectory. The report and any spreadsheet read them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ METRICS, TIMING = "metrics.json", "timing.json"
 POSES, CLOUD, GRAPH, PICTURE = "trajectory_kitti.txt", "map.ply", "pose_graph.g2o", "trajectory.png"
 LOCALIZATION = "localisation.json"
 MAPPING = (POSES, CLOUD, GRAPH, PICTURE, FRAMES, LOOPS, TRUTH, METRICS, TIMING)
-"""Files that a run has that makes a map, and one that localizes has not."""
+"""Files of a run that makes a map, which a run that localizes does not have."""
 _LOOP_COLUMNS = ("from_x", "from_y", "from_z", "to_x", "to_y", "to_z", "accepted", "method", "confidence", "overlap",
                  "reason")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class LoopRow:
-    """A loop that was tried: where in the map its two keyframes are, m, and what became of it."""
+    """A loop that was tried: positions of its two keyframes in the map, m, and the verdict."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
@@ -47,8 +47,8 @@ class RunFolder:
     """A folder that `dpm2 run` or an experiment wrote.
 
     Attributes:
-        trajectory: T_map_lidar, by stamp; may be empty. truth: the same in a world frame of its own, or None.
-        states: of each frame. stages_ms: wall time of each frame by stage, (N,) each; {} of other programs.
+        trajectory: T_map_lidar, by stamp; may be empty. truth: the same in its own world frame, or None.
+        states: of each frame. stages_ms: wall time of each frame by stage, (N,) each; {} for other programs.
         loops: that were tried. metrics, timing: content of these files; {} without.
     """
 
@@ -91,7 +91,7 @@ def write_loops(path: Path, loops: Sequence[Edge], poses: Array) -> None:
 
 
 def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
-    """Write ground_truth.tum: (N, 4, 4) poses of the LiDAR; rows of NaN, which are not known, are left out.
+    """Write ground_truth.tum: (N, 4, 4) poses of the LiDAR; unknown ones, rows of NaN, are left out.
 
     Raises:
         Dpm2Error: it could not be written.
@@ -101,10 +101,10 @@ def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
 
 
 def remove_results(folder: Path, *names: str) -> None:
-    """Remove files of a run before this one that this one has none of: they would be taken for its own.
+    """Remove files of an earlier run that this run does not write: they would be taken for its own.
 
     Raises:
-        Dpm2Error: one could not be removed.
+        Dpm2Error: a file could not be removed.
     """
     for name in names:
         with explaining(folder / name, "not removed"):
@@ -112,13 +112,13 @@ def remove_results(folder: Path, *names: str) -> None:
 
 
 def set_aside(folder: Path, name: str) -> Path:
-    """Move the results of a run to a folder in theirs, so that the next one replaces none of them.
+    """Move the results of a run to a subfolder, so that the next run replaces none of them.
 
     Returns:
-        That folder: `name`, or NAME-2, -3, ... where an earlier run was set aside under that name.
+        That folder: `name`, or NAME-2, -3, ... if an earlier run was set aside under that name.
 
     Raises:
-        Dpm2Error: one could not be moved.
+        Dpm2Error: a file could not be moved.
     """
     into = next(path for path in numbered(folder / name) if not path.exists())
     make_folder(into)
@@ -130,14 +130,14 @@ def set_aside(folder: Path, name: str) -> Path:
 
 
 def read_run(path: Path) -> RunFolder:
-    """Read such a folder; only its trajectory must be there.
+    """Read the folder of a run; only its trajectory is required.
 
     Raises:
-        UsageError: no trajectory in it, or a damaged file; it names that.
+        UsageError: no trajectory in it, or a damaged file, which is named.
     """
     if not (path / TRAJECTORY).is_file():
         raise UsageError(f"{path}: no run; want a folder with {TRAJECTORY}, as `dpm2 run` and `dpm2 experiment` write")
-    trajectory = read_trajectory(path / TRAJECTORY, allow_empty=True)  # of a localization that found nothing
+    trajectory = read_trajectory(path / TRAJECTORY, allow_empty=True)  # empty if a localization found nothing
     if trajectory.kind != "tum":
         raise UsageError(f"{path / TRAJECTORY}: want 8 numbers a line, the stamp first")
     try:

@@ -30,8 +30,8 @@ _FIGURES = {
 
 
 def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Every run in or below the folders, once, with a name of its own: its folder's, and those above it as far as they
-    are below, or as far as it takes to tell two runs apart.
+    """Every run in or below the folders, once, with a unique name: the path of its folder below the given one, with
+    more of the folders above if two runs would have the same name.
 
     Raises:
         UsageError: no such folder, or no run in it.
@@ -52,7 +52,7 @@ def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
 
 
 def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[FigureTable] = ()) -> str:
-    """The page of such runs; those with the same truth are drawn in one frame.
+    """The page of runs; those with the same truth are drawn in one frame.
 
     Raises:
         UsageError: a file of a run is damaged.
@@ -72,7 +72,7 @@ def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[Fig
 
 
 def _by_truth(runs: Sequence[tuple[str, RunFolder]]) -> list[list[tuple[str, RunFolder]]]:
-    """Runs of one drive together; one without a truth stands alone."""
+    """Group the runs of the same drive; a run without ground truth is a group by itself."""
 
     def key(item: tuple[str, RunFolder]) -> str:
         name, run = item
@@ -116,7 +116,7 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
 
 
 def aligned(run: RunFolder) -> Array:
-    """T_truth_map (4, 4) of a run; the identity where too few poses belong together."""
+    """T_truth_map (4, 4) of a run; the identity if too few poses match."""
     if run.truth is None or not len(run.trajectory):
         return np.eye(4)
     try:
@@ -128,7 +128,7 @@ def aligned(run: RunFolder) -> Array:
 
 
 def _flat(positions: Array) -> list[float]:
-    """x, y of (N, 3) positions one after the other, to the centimeter."""
+    """x, y of (N, 3) positions in sequence, rounded to the centimeter."""
     sound = positions[np.isfinite(positions).all(1), :2]
     found: list[float] = np.round(sound, 2).ravel().tolist()
     return found
@@ -140,7 +140,7 @@ def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
 
 
 def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
-    # The KITTI metric of other segments is another figure: each set of lengths has columns of its own.
+    # The KITTI metric of other segments is another figure: each set of lengths has its own columns.
     measured = dict.fromkeys(_lengths(run) for _, run in runs if run.metrics.get("t_err_percent") is not None)
     kitti = sorted(measured, key=lambda lengths: lengths != OFFICIAL_LENGTHS) or [OFFICIAL_LENGTHS]
     headings = [name + _of(lengths) for lengths in kitti for name in _KITTI]
@@ -160,7 +160,7 @@ def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
 
 
 def _lengths(run: RunFolder) -> tuple[float, ...]:
-    """Segment lengths of its KITTI metric, m."""
+    """Segment lengths of a run's KITTI metric, m."""
     return tuple(run.metrics.get("lengths_m") or OFFICIAL_LENGTHS)
 
 

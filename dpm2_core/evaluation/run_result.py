@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run found: its trajectory beside the ground truth, its times, and the files that it leaves."""
+"""The result of a run: its trajectory compared with the ground truth, its times, and the files that it writes."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ from dpm2_core.slam.settings import Config
 
 @dataclass(eq=False)
 class Result:
-    """What a run found. Clouds of the map stay in the map file, if there is one: save before the run is closed.
+    """The result of a run. Clouds of the map stay in the map file, if there is one: save before the run is closed.
 
     Attributes:
-        ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to be matched by stamp or number, or None.
+        ground_truth: LiDAR poses (N, 4, 4) of the frames, or a trajectory to match by stamp or number, or None.
         ground_truth_name: what it was read from.
         recorder: the odometry's pose of every frame.
-        imu: frames by why the IMU was of no use to them, "used" where it was; empty where there is none.
-        problems: frames by what was wrong with an image or with the times of their points, in words.
-        frame_methods: of each frame, how it was registered, "failed" if it was not. frame_states: after each.
+        imu: number of frames by the reason why the IMU was unusable, "used" if it was used; empty without an IMU.
+        problems: number of frames by the problem with an image or with the times of their points, in words.
+        frame_methods: registration method of each frame, "failed" if it failed. frame_states: state after each frame.
         seconds: wall time of each frame by stage.
         wall_s: of the whole run, reading included.
         lengths: of the KITTI metric's segments, m.
@@ -82,7 +82,7 @@ class Result:
         return len(self.recorder)
 
     def add(self, tracked: OdometryResult) -> None:
-        """Take in the next frame."""
+        """Add the next frame."""
         self.recorder.add(tracked)
         self.frame_methods.append("failed" if tracked.failed else tracked.registration.method)
         self.frame_states.append(str(tracked.state))
@@ -99,12 +99,12 @@ class Result:
 
     @property
     def methods(self) -> Counter[str]:
-        """How many frames were registered how; "failed" for those that were not."""
+        """Number of frames by registration method; "failed" for those that were not registered."""
         return Counter(self.frame_methods)
 
     @property
     def states(self) -> Counter[str]:
-        """Frames in each state."""
+        """Number of frames in each state."""
         return Counter(self.frame_states)
 
     @cached_property
@@ -123,18 +123,18 @@ class Result:
 
     @property
     def sensor_poses(self) -> Array:
-        """(N, 4, 4) of the left camera, as KITTI has them; of the LiDAR where the calibration is not known."""
+        """(N, 4, 4) poses of the left camera, as in KITTI; of the LiDAR if the calibration is not known."""
         return camera_poses(self.poses, self.source.T_cam_lidar)
 
     @property
     def connected(self) -> bool:
-        """Whether it is known where in the map this drive is; True if there was none before."""
+        """Whether the pose of this drive in the map is known; True if there was no map before."""
         first = self.mapper.session_start
         return first == 0 or bool(self.mapper.placed[first:].any())
 
     @property
     def fps(self) -> float:
-        """Frames per second of processing alone; 0 without frames."""
+        """Frames per second of processing only; 0 without frames."""
         total = self._frame_seconds
         return len(total) / float(total.sum()) if len(total) else 0.0
 
@@ -160,10 +160,10 @@ class Result:
 
     @cached_property
     def metrics(self) -> Metrics | None:
-        """Against the ground truth; None without any.
+        """Metrics against the ground truth; None without ground truth.
 
         Raises:
-            UsageError: nothing of the ground truth belongs to this drive.
+            UsageError: no pose of the ground truth is of this drive.
         """
         if not len(self):
             return None
@@ -180,20 +180,20 @@ class Result:
         return metrics.model_copy(update=own)
 
     def save(self, out: Path | str, cloud: bool = True) -> list[str]:
-        """Write all files, each whole or not at all; returns what could not be done, in words.
+        """Write all files, each completely or not at all; returns what could not be done, in words.
 
-        Files of a run before, of which this one has none, are removed.
+        Files of an earlier run that this run does not write are removed.
 
         Args:
-            cloud: map.ply, too, and the map in trajectory.png; a long drive's takes hundreds of megabytes.
+            cloud: write map.ply, too, and draw the map in trajectory.png; a long drive's takes hundreds of megabytes.
 
         Raises:
-            Dpm2Error: a file could not be written; the old one survives, and map.ply comes after the figures.
-            UsageError: no folder can be made there, or, when all other files are written, see `metrics`.
+            Dpm2Error: a file could not be written; the old one is kept, and map.ply comes after the figures.
+            UsageError: no folder can be made there, or, once all other files are written, see `metrics`.
         """
         out = Path(out)
         make_folder(out)
-        remove_results(out, METRICS, TRUTH, PICTURE, LOCALIZATION)  # also where the truth turns out not to fit
+        remove_results(out, METRICS, TRUTH, PICTURE, LOCALIZATION)  # also if the truth does not fit
         save_config(self.config, out)
         write_kitti(out / POSES, self.sensor_poses)
         write_tum(out / TRAJECTORY, self.recorder.stamps, self.poses)
@@ -208,7 +208,7 @@ class Result:
                 assert self.ground_truth is not None
                 write_truth(out / TRUTH, *truth_by_stamp(self.ground_truth, self.recorder.stamps, self.recorder.index,
                                                          self.source.T_cam_lidar))  # fmt: skip
-        finally:  # the largest last: where it does not fit on the disk, the figures of the run are there
+        finally:  # the largest file last: if it does not fit on the disk, the figures of the run are written
             points = self.mapper.cloud() if cloud else None
             if points is None:
                 remove_results(out, CLOUD)
@@ -218,7 +218,7 @@ class Result:
         return missing
 
     def _draw(self, path: Path, points: Points | None) -> list[str]:
-        """Write trajectory.png; returns why there is none."""
+        """Write trajectory.png; returns why it is missing."""
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
         try:
@@ -233,7 +233,7 @@ class Result:
         return []
 
     def _compared(self) -> tuple[Array | None, Array, Keys]:
-        """Ground truth and estimate (M, 4, 4) of the same frames, and the stamps (M,) of these, ns."""
+        """Ground truth and estimate (M, 4, 4) of the same frames, and their stamps (M,), ns."""
         truth, stamps = self.ground_truth, np.array(self.recorder.stamps)
         if not isinstance(truth, Trajectory):
             return None if truth is None else truth[: len(self)], self.poses, stamps
@@ -249,7 +249,7 @@ class Result:
 
     @property
     def sensor(self) -> str:
-        """Whose poses are compared with the truth."""
+        """Sensor whose poses are compared with the truth."""
         stamped = isinstance(self.ground_truth, Trajectory) and self.ground_truth.kind == "tum"
         return "LiDAR" if stamped or self.source.T_cam_lidar is None else "left camera"
 

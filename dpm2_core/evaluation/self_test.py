@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few seconds of SLAM on scans that are computed here: whether everything works on this machine, and how fast."""
+"""A few seconds of SLAM on computed scans: whether everything works on this machine, and how fast."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from dpm2_core.slam.settings import SlamSettings
 
 BEAMS, COLUMNS = 64, 1024
 _HEIGHT, _REACH = 1.7, 60.0  # of the LiDAR above the ground, m
-_STEP = 1.0  # m a scan: 36 km/h at 10 Hz
+_STEP = 1.0  # m per scan: 36 km/h at 10 Hz
 _MOST = 60  # scans
 _WARM = 3
-"""The first scans compile the loops, load the network, and find no motion yet: they do not count."""
+"""The first scans compile the loops, load the network, and have no motion estimate yet: they are not counted."""
 
 SLOW_ODOMETRY = 70.0
 """ms per scan of 65,000 points: a real one at 10 Hz has up to twice as many, and 100 ms."""
 SLOW_KEYFRAME = 1000.0
-"""ms: there is one every 5 m, at 18 km/h one a second."""
+"""ms: there is a keyframe every 5 m, at 18 km/h one per second."""
 EXPECTED = "below 30 ms and 300 ms on two cores of a server processor"
 _WRONG = 0.2  # m, over at most 60 m of walls
 
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came out.
+    """The result of a self-test.
 
     Attributes:
-        frames: scans that went through. error_m: of the last position against the truth, over the whole way.
+        frames: scans that were processed. error_m: of the last position against the truth, over the whole drive.
         failed: scans that could not be registered.
-        start_s: until the first scans were through: imports, compiling, loading the network.
+        start_s: until the first scans were processed: imports, compiling, loading the network.
         odometry_ms: median time of a scan. keyframe_ms: median time of a keyframe in the map, the network's descriptors
-            included; None where there was none after the first scans.
+            included; None if there was none after the first scans.
     """
 
     frames: int
@@ -50,7 +50,7 @@ class SelfTest:
     keyframe_ms: float | None
 
     def finding(self) -> Finding:
-        """As a line among those of the machine."""
+        """The result as a line among those of the machine."""
         mapped = "no keyframe" if self.keyframe_ms is None else f"{self.keyframe_ms:.0f} ms a keyframe"
         found = f"{self.frames} scans, {self.odometry_ms:.0f} ms each, {mapped}, {100 * self.error_m:.1f} cm off"
         found = f"{found}; {self.start_s:.1f} s to start"
@@ -66,7 +66,7 @@ class SelfTest:
 
 
 def self_test(seconds: float = 8.0) -> SelfTest:
-    """Drive down a computed street with the default settings, for about so many seconds."""
+    """Run the SLAM along a computed street with the default settings, for about this number of seconds."""
     began = perf_counter()
     street = _street(np.random.default_rng(5))
     noise = np.random.default_rng(6)
@@ -97,7 +97,7 @@ def street_scan(boxes: Array, T_world_lidar: Array, noise: np.random.Generator) 
 
     Args:
         boxes: (B, 2, 3) lowest and highest corner of each, m, in the world; the ground is z = 0.
-        T_world_lidar: (4, 4), level but for its heading.
+        T_world_lidar: (4, 4), level except for its heading.
     """
     elevation = np.radians(np.linspace(2.0, -24.8, BEAMS))[:, None]
     azimuth = np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False)[None]
@@ -140,7 +140,7 @@ def _box(x: float, y: float, size: tuple[float, float, float]) -> Array:
 
 
 def _pose(number: int) -> Array:
-    """(4, 4) T_world_lidar of a scan: straight on, with a little steering."""
+    """(4, 4) T_world_lidar of a scan: straight ahead, with a little steering."""
     x = _STEP * number
     turned = se3.exp(np.array([0, 0, 0.05 * np.sin(x / 12), 0, 0, 0]))[:3, :3]
     return se3.make(turned, np.array([x, 0.6 * np.sin(x / 12), _HEIGHT]))
