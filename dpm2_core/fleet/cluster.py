@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray: parts in processes of their own, here or on a cluster, each tried again when its worker dies.
+"""Ray: parts in their own processes, here or on a cluster, each tried again when its worker dies.
 
-Ray is imported here alone, and only when it is used. It sends no usage statistics; a cluster that was started here ends
-with this process, whatever ends that.
+Ray is imported only here, and only when it is used. It sends no usage statistics. A cluster that was started here ends
+with this process, whatever ends the process.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from dpm2_core.files import part_beside
 from dpm2_core.fleet.part import Outcome, Part, do_part
 
 ATTEMPTS = 3
-"""Workers that may die over one part."""
+"""Workers that may die while they work on one part."""
 MEMORY = 2 * 10**9
-"""Bytes that a part declares; 1.2 GB were measured of a drive with the network, the rest is room."""
-_POLL = 0.5  # s between two looks at what goes on, and between two reports of a part
+"""Bytes that a part declares; 1.2 GB were measured for a drive with the network, the rest is a margin."""
+_POLL = 0.5  # s between two polls, and between two reports of a part
 _PATIENCE = 5.0  # s for an address to answer
-_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: parts hand over little
-_LONGEST = 20  # characters of the folder for temporary files, in which Ray makes sockets, whose names have 107
+_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: parts exchange little
+_LONGEST = 20  # characters of the folder for temporary files, in which Ray makes sockets with names of up to 107
 
 
 class Status(NamedTuple):
-    """Of a part that runs or has run: attempts, frames done, frames in all, and where: HOST:PROCESS."""
+    """Status of a part that runs or has run: attempts, frames done, total frames, and HOST:PROCESS."""
 
     attempts: int
     done: int = 0
@@ -51,15 +51,15 @@ Watch = Callable[[Mapping[str, Status]], None]
 class Cluster:
     """The connection to Ray. A context manager: leaving it ends the parts, and the cluster if it was started here.
 
-    In a program that is connected to Ray already that connection serves, and stays.
+    In a program that is already connected to Ray, that connection is used, and is kept.
     """
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
-        """Nothing is started yet.
+        """Set up the connection; nothing is started yet.
 
         Args:
             address: of a cluster, as `ray.init` takes it; None starts one on this machine.
-            workers: at most so many parts at a time; None: as many as there are processors for.
+            workers: largest number of parts at a time; None: as many as there are processors for.
         """
         self._address, self._workers = address, workers
         self._folder: Path | None = None
@@ -77,20 +77,20 @@ class Cluster:
             cores: of a part, for a cluster that is started here.
 
         Raises:
-            UsageError: it is not installed, does not start, or nobody answers at that address.
+            UsageError: Ray is not installed, does not start, or does not answer at that address.
         """
         if self._ray is not None:
             return
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: beside other programs next to nothing
+        os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: hardly any time next to other programs
         with _loopback(self._address is None), needs("fleet", "a fleet"):
             import ray
         self._ray = ray
         if not ray.is_initialized():
             try:
                 self._connect(ray, cores)
-            except Exception as error:  # Ray raises that very class where it does not start in time
+            except Exception as error:  # Ray raises exactly this class if it does not start in time
                 self.__exit__()
                 where = "Ray" if self._address is None else f"--ray {self._address}"
                 raise UsageError(f"{where}: {one_line(error)}") from None
@@ -123,10 +123,10 @@ class Cluster:
         self._ray = None
 
     def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
-        """Do the parts, each as it ends; those that fail end with the reason, and the rest goes on.
+        """Do the parts, and yield each outcome as a part ends; if it failed, with the reason. The others continue.
 
         Args:
-            out: the folder of the whole, absolute. watch: told twice a second of the parts that have begun.
+            out: the folder of all parts, absolute. watch: called twice per second with the parts that have begun.
         """
         waiting = deque(parts)
         if not waiting:
@@ -145,7 +145,7 @@ class Cluster:
             watch(self._status(ray))
 
     def _limits(self, ray: Any) -> dict[str, float]:
-        """What the largest node has: a part that declares more would wait for ever; and how many to hand over."""
+        """Resources of the largest node (a part that declares more would wait forever), and how many to submit."""
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = [node.get("CPU", 0) for node in nodes]
         if max(cpus, default=0) < 1:
@@ -164,16 +164,16 @@ class Cluster:
     def _status(self, ray: Any) -> Mapping[str, Status]:
         try:
             status: Mapping[str, Status] = ray.get(self._board.all.remote(), timeout=_POLL)
-        except ray.exceptions.RayError:  # it is only for show, and begins anew
+        except ray.exceptions.RayError:  # it is only for display, and is restarted
             return {}
         return status
 
 
 @contextmanager
 def _loopback(wanted: bool) -> Iterator[None]:
-    """Ray listens on 127.0.0.1 alone where it is told when it is imported that there are no other machines.
+    """Make Ray listen only on 127.0.0.1, by a variable that is set while Ray is imported: there are no other machines.
 
-    The variable is named for systems on which that is the default; it works on Linux, too. It is read once.
+    The variable is named after systems on which that is the default; it works on Linux, too. It is read once.
     """
     name = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
     ours = wanted and name not in os.environ
@@ -187,17 +187,17 @@ def _loopback(wanted: bool) -> Iterator[None]:
 
 
 def _keep_private(folder: Path) -> None:
-    """Ray writes the token by which a cluster is used into its folder, and lets everybody read it."""
-    with suppress(OSError):  # not ours, or a home that cannot be written: Ray says what it cannot do
+    """Make Ray's folder private: Ray writes the access token of a cluster into it, readable for everybody."""
+    with suppress(OSError):  # not ours, or a home that cannot be written: Ray reports its own errors
         folder.mkdir(mode=0o700, exist_ok=True)
         folder.chmod(0o700)
 
 
 def _check_address(address: str) -> None:
-    """Raise ConnectionError where nobody answers: Ray would go on asking for minutes."""
+    """Raise ConnectionError if the address does not answer: Ray would retry for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not colon or not port.isdecimal():
-        return  # "auto", and what else Ray knows by name
+        return  # "auto", and other names that Ray supports
     try:
         socket.create_connection((host, int(port)), _PATIENCE).close()
     except (OSError, OverflowError) as error:
@@ -205,7 +205,7 @@ def _check_address(address: str) -> None:
 
 
 class _Board:
-    """Where parts say how far they are: an actor of Ray, which lives in a process of its own."""
+    """Progress of the parts, reported by them: an actor of Ray, in its own process."""
 
     def __init__(self) -> None:
         self._status: dict[str, Status] = {}
@@ -222,7 +222,7 @@ class _Board:
 
 
 def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
-    """In the worker: what the work raises is a result, and only a death is tried again."""
+    """Do a part in the worker: an exception of the work is a result; only the death of the worker is tried again."""
     board.begin.remote(part.name, f"{socket.gethostname()}:{os.getpid()}")
     told = 0.0
 
@@ -238,7 +238,7 @@ def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
         return Outcome(part.name, "done", do_part(part, out, advance))
     except Dpm2Error as error:
         return Outcome(part.name, "failed", reason=str(error))
-    except Exception as error:  # a bug ends its part, not the hours of the others
+    except Exception as error:  # a bug ends its own part, not the others
         last = traceback.extract_tb(error.__traceback__)[-1]
         why = f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
         return Outcome(part.name, "failed", reason=why)

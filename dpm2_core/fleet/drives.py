@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives of a fleet: as paths or as a manifest in; each run by the code of `dpm2 run`, in a folder of its own."""
+"""Drives of a fleet, given as paths or as a manifest; each is run by the code of `dpm2 run`, in its own folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.store.map_file import SUFFIX
 
 MAP = f"drive{SUFFIX}"
-"""In the folder of a drive: its map file."""
+"""The map file in the folder of a drive."""
 _WORK = "dpm2_core.fleet.drives:run_drive"
 _MANIFEST = (".yaml", ".yml")
 
@@ -35,26 +35,26 @@ class ManifestDrive(Settings):
     path: str
     """The recording; relative to the manifest's folder."""
     name: str = ""
-    """Its folder in the results; that of its last folder or file by default."""
+    """Its folder in the results; by default the name of its last folder or file."""
     frames: str = ":"
     """Which frames, a:b by position from 0."""
     gt: str = ""
     """Ground truth (KITTI: left camera; TUM: LiDAR), relative to the manifest's folder."""
     set: tuple[str, ...] = ()
-    """KEY=VALUE of its own, such as input.points_topic=/ouster/points."""
+    """Its own KEY=VALUE, such as input.points_topic=/ouster/points."""
 
 
 class Manifest(Settings):
-    """Drives, and what is particular to each."""
+    """Drives, and the settings of each."""
 
     drives: list[ManifestDrive] = Field(min_length=1)
 
 
 def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
-    """Drives by their paths, or those of the one manifest that is given; all with names, no two alike.
+    """Drives from their paths, or those of a single given manifest; all with unique names.
 
     Raises:
-        UsageError: an invalid manifest, a name twice, or one that cannot be a folder's.
+        UsageError: an invalid manifest, a name twice, or one that a folder cannot have.
     """
     drives = [ManifestDrive(path=str(path)) for path in given]
     root = Path()
@@ -83,8 +83,8 @@ def parts_of(
     """A part for each drive.
 
     Args:
-        config, overrides: as of `dpm2 run`, for all drives; those of a drive's own come last.
-        prefix: before the name of each.
+        config, overrides: as for `dpm2 run`, for all drives; a drive's own settings are applied last.
+        prefix: put before the name of each drive.
 
     Raises:
         UsageError: an invalid setting or span of frames.
@@ -106,7 +106,7 @@ def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
 
 
 def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
-    """The settings with whole paths of weights, as a worker has another working directory; and what they run with."""
+    """The settings with absolute paths of weights, as a worker has another working directory; and these files."""
     files, changes = [], dict[str, Any]()
     if slam.uses_descriptors:
         files.append(weights_path(slam.neural.weights).resolve())
@@ -120,10 +120,10 @@ def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
 
 
 def driven(run: OfflineRun, advance: Advance) -> Result:
-    """What came of a run as a part of more, which is told of each frame.
+    """The result of a run as a part; `advance` is called for each frame.
 
     Raises:
-        KeyboardInterrupt: it was stopped before its end.
+        KeyboardInterrupt: the run was stopped before its end.
     """
     done = count(1)
     result = run.run(lambda _: advance(next(done), len(run)))
@@ -133,7 +133,7 @@ def driven(run: OfflineRun, advance: Advance) -> Result:
 
 
 def run_drive(folder: Path, advance: Advance, path: str, frames: Span, gt: str, config: Config) -> Figures:
-    """Run a drive; leaves the files of `dpm2 run` and its map in the folder.
+    """Run a drive; writes the files of `dpm2 run` and its map to the folder.
 
     Raises:
         UsageError: a recording that cannot be opened. Dpm2Error: results that cannot be written.

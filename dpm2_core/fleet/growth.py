@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives into a map file, in one transaction: new ones beside what is there, of which only what they touch is moved.
+"""Add drives to a map file, in one transaction: of the existing drives, only those that the new ones touch are moved.
 
-The graph that is solved has the new drives, those that they meet, and those on the ways between these, which share the
-error where a ring is closed; all others are held. Where that strains the loops to a drive by more than their own
-uncertainty, that drive is solved for as well.
+The graph that is solved contains the new drives, those that they meet, and those on the paths between these, which
+share the error when a ring is closed. All others are fixed. If this strains the loops to a fixed drive by more than
+their own uncertainty, that drive is solved for as well.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import edge_of, pose_of
 from dpm2_core.slam.store.writer import STILL
 
-_STRAINED = 2.0  # standard deviations by which the loops to a drive have been pulled at, in all
-_TOGETHER = 200  # nodes that are asked for at once
+_STRAINED = 2.0  # standard deviations by which the loops to a drive are strained, in total
+_TOGETHER = 200  # spans of nodes in one query
 
 
 def spans_of(sizes: Mapping[str, int]) -> dict[str, range]:
-    """The nodes of each drive in a file that has so many keyframes of each, one drive after the other."""
+    """The nodes of each drive in a file with these numbers of keyframes, one drive after the other."""
     return {name: range(first, first + sizes[name]) for name, first in first_nodes(sizes).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Drives that come into a map.
+    """Drives that are added to a map.
 
     Attributes:
-        maps: of these, with their poses in the map. joins: all that were checked, between drives that are there then.
-        moved: (4, 4) poses of nodes that are there, by node. judged: loops of the map that no longer hold, by number.
+        maps: of these, with their poses in the map. joins: all that were checked, between drives of the new map.
+        moved: (4, 4) poses of existing nodes, by node. judged: loops of the map that no longer hold, by number.
     """
 
     maps: dict[str, MapData]
@@ -58,15 +58,15 @@ class Growth:
 
 
 def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refused: Iterable[Join] = ()) -> None:
-    """Write them behind the drives in a file, each a robot by its name.
+    """Append drives to those in a file, each as a robot with the drive's name.
 
-    A file that does not know its place on Earth takes over that of the first of them that does.
+    A file without a georeference takes that of the first added drive with one.
 
     Args:
-        refused: joins that were rejected; those of drives that are not there are left out.
+        refused: joins that were rejected; those of drives that are not in the file are left out.
 
     Raises:
-        Dpm2Error: it could not be written.
+        Dpm2Error: the file could not be written.
     """
     for name, data in growth.maps.items():
         append_map(store, _renamed(name, data))
@@ -79,7 +79,7 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
 
 
 def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
-    """Loops of a file as joins of the drives in it; those within a drive, too."""
+    """Loops of a file as joins of the drives in it, including those within a drive."""
     first = first_nodes(inside)
     ones, others = (owners([getattr(loop, end) for loop in loops], first) for end in ("from_node", "to_node"))
     return [
@@ -89,7 +89,7 @@ def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
 
 
 def _georeference(data: MapData) -> Georeference | None:
-    """That of the map in which a drive has its poses, by the drive's fixes: its own is of the frame that it had."""
+    """The georeference of the merged map, from a drive's fixes: the drive's own one is of its former frame."""
     return None if data.georeference is None else located(data, placed(data))
 
 
@@ -103,11 +103,11 @@ def _renamed(name: str, data: MapData) -> MapData:
 
 @dataclass(frozen=True)
 class Standing:
-    """A map that is there.
+    """An existing map.
 
     Attributes:
-        store: its file. sizes: keyframes of each drive in it, in its order. ties: every two drives that are joined.
-        settings: of its graph. largest: keyframes that are solved for at once.
+        store: its file. sizes: keyframes of each drive in it, in its order. ties: all pairs of drives that are joined.
+        settings: of its graph. largest: most keyframes that are solved for at once.
     """
 
     store: MapStore
@@ -117,7 +117,7 @@ class Standing:
     largest: int
 
     def between(self, names: Collection[str]) -> set[str]:
-        """These drives, and those on the shortest ways from the first of them to the others."""
+        """These drives, and those on the shortest paths from the first of them to the others."""
         order = list(self.sizes)
         number = {name: at for at, name in enumerate(order)}
         rows, columns = np.array([[number[one], number[other]] for one, other in self.ties]).reshape(-1, 2).T
@@ -132,16 +132,16 @@ class Standing:
 
 
 def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
-    """Where new drives are in a map that is there, and what becomes of their joins and of what they touch.
+    """Poses of new drives in an existing map, the verdicts on their joins, and the changes of what they touch.
 
     Args:
         maps: of the new drives, without descriptors. joins: accepted ones between two drives that have enough of them.
 
     Returns:
-        None: the map must be made anew, since so much of it moves, or what was believed of it does not hold.
+        None: the map must be made again, since too much of it moves, or its earlier joins no longer hold.
 
     Raises:
-        Dpm2Error: the map cannot be read, or the graph not be solved.
+        Dpm2Error: the map cannot be read, or the graph cannot be solved.
     """
     refused: list[Join] = []
     maps, joins = dict(maps), list(joins)
@@ -162,7 +162,7 @@ def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -
 
 
 def _nearest_first(inside: Collection[str], maps: Mapping[str, MapData], joins: Sequence[Join]) -> dict[str, MapData]:
-    """New drives in the order in which their joins lead from the map to them."""
+    """New drives, in the order in which they are reached from the map by their joins."""
     order: dict[str, MapData] = {}
     while True:
         there = {*inside, *order}
@@ -173,7 +173,7 @@ def _nearest_first(inside: Collection[str], maps: Mapping[str, MapData], joins: 
 
 
 def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
-    """Solve for new drives and for what they touch, and for more of the map as long as its borders are strained."""
+    """Solve for new drives and the drives that they touch, and for more of the map while its borders are strained."""
     sizes, spans, first = there.sizes, spans_of(there.sizes), first_nodes(there.sizes)
     active = there.between({end for join in joins for end in (join.one, join.other) if end in sizes})
     while sum(map(len, maps.values())) + sum(sizes[name] for name in active) <= there.largest:
@@ -181,7 +181,7 @@ def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join])
         growth = region.with_drives(maps, joins, {name: first[name] for name in active})
         further = region.strained(first)
         if any(join.loop.ok for join in affirmed(growth.joins)[1]) and len(active) < len(sizes):
-            further = set(sizes)  # it may be the held ones that are wrong
+            further = set(sizes)  # the fixed ones may be wrong
         if not further:
             return growth if region.holds(sizes) else None
         active |= further
@@ -189,7 +189,7 @@ def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join])
 
 
 class _Region:
-    """Drives of a map file that are solved for; the nodes of others to which their loops lead are held.
+    """Drives of a map file that are solved for; nodes of other drives at the ends of their loops are fixed.
 
     Raises:
         Dpm2Error: the file is damaged.
@@ -226,7 +226,7 @@ class _Region:
             self._graph.add_node(poses[node], _between(chain[node], self._at) if node in chain else None)
 
     def with_drives(self, maps: Mapping[str, MapData], joins: Sequence[Join], first: Mapping[str, int]) -> Growth:
-        """Solve with new drives; `first`: node of the file with which each drive of the region begins."""
+        """Solve with new drives; `first`: the first node in the file of each drive of the region."""
         graph, begins = self._graph, {name: self._at[node] for name, node in first.items()}
         for name, data in maps.items():
             begins[name] = len(graph)
@@ -255,7 +255,7 @@ class _Region:
                 for (number, loop), now in zip(self._loops.items(), self._graph.loops, strict=False)}  # fmt: skip
 
     def strained(self, first: Mapping[str, int]) -> set[str]:
-        """The drives beside the region whose loops to it the new poses pull at; `first` is of all drives here."""
+        """The drives outside the region whose loops to it are strained by the new poses; `first`: of all drives."""
         outer = set(self._outer)
         border = [loop for loop in self._loops.values() if {loop.from_node, loop.to_node} & outer]
         if not border:
@@ -273,7 +273,7 @@ class _Region:
         return loop_errors(poses, ends, np.array([loop.T_from_to for loop in loops]))
 
     def holds(self, inside: Mapping[str, int]) -> bool:
-        """Whether all drives that were joined are joined by enough loops still."""
+        """Whether all drives that were joined are still joined by enough loops."""
         left: dict[tuple[str, str], set[int]] = defaultdict(set)
         for join in joins_of(self._judged().values(), inside):
             left[join.one, join.other] |= {join.loop.to_node} if join.loop.ok else set()
@@ -281,13 +281,13 @@ class _Region:
 
 
 def _within(spans: Sequence[range], *columns: str) -> str:
-    """The condition that a column of a table is a node of these."""
+    """The SQL condition that a column of a table is a node in these spans."""
     return " OR ".join(f"{column} BETWEEN {s.start} AND {s.stop - 1}" for s in spans for column in columns) or "FALSE"
 
 
 def _rows(store: MapStore, table: str, spans: Sequence[range], *columns: str) -> Iterator[tuple[Any, ...]]:
-    """Rows of a table of which a column is a node of these, some more than once."""
-    for first in range(0, len(spans), _TOGETHER):  # SQLite's expressions have a depth
+    """Rows of a table in which a column is a node in these spans; some occur more than once."""
+    for first in range(0, len(spans), _TOGETHER):  # SQLite limits the depth of an expression
         yield from store.rows(table, where=_within(spans[first : first + _TOGETHER], *columns))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where two drives meet: stretches that look alike, and the loops between them that network and points affirm."""
+"""Places where two drives meet: stretches that look alike, and loops between them that network and points confirm."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from dpm2_core.slam.store.map_data import MapData, borrowing, load_map
 from dpm2_core.slam.store.map_store import MapStore
 
 ENOUGH = 3
-"""Loops that a join of two drives needs: two can be wrong alike where houses are."""
+"""Loops that a join of two drives needs: two can be wrong in the same way if houses look alike."""
 _WORK = "dpm2_core.fleet.joins:verify"
-_GAP = 8  # keyframes without a candidate, over which a stretch goes on
+_GAP = 8  # keyframes without a candidate, over which a stretch continues
 _LONGEST = 40  # keyframes of a stretch: a task of a minute
-_AROUND = 6  # keyframes before and after a candidate that are looked at with it: 22 m of surroundings and more
+_AROUND = 6  # keyframes before and after a candidate that are used with it: 22 m of surroundings and more
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Keyframes of one drive and keyframes of another one that look like them; nodes are those of their maps."""
+    """Keyframes of one drive, and keyframes of another one that look like them, as nodes of their maps."""
 
     one: str
     other: str
@@ -41,7 +41,7 @@ class Stretch:
 
 
 def stretches(one: str, other: str, pairs: NDArray[np.int64]) -> Iterator[Stretch]:
-    """Group candidates (M, 2), node of one drive and of the other; what too few keyframes say is left out."""
+    """Group candidates (M, 2), node of one drive and of the other; groups of too few keyframes are left out."""
     pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
     begins = [0]
     for row in range(1, len(pairs)):
@@ -57,7 +57,7 @@ def stretches(one: str, other: str, pairs: NDArray[np.int64]) -> Iterator[Stretc
 
 
 def join_part(number: int, stretch: Stretch, maps: Mapping[str, Mapping[str, Any]], slam: SlamSettings) -> Part:
-    """The part that looks for the loops of a stretch; `maps` has path and version of each drive's map."""
+    """The part that searches for the loops of a stretch; `maps` contains path and version of each drive's map."""
     arguments = {
         "one": maps[stretch.one],
         "other": maps[stretch.other],
@@ -86,7 +86,7 @@ def verify(
         first, second = _excerpt(a, nodes[0], "one"), _excerpt(b, nodes[1], "other")
         clouds = _Clouds([first, second])
         keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])
-        parts = np.concatenate([first.parts, second.parts + len(first.data)])  # no part of the two in common
+        parts = np.concatenate([first.parts, second.parts + len(first.data)])  # the two have no part in common
         own = np.concatenate([first.own, second.own])
         tried: dict[tuple[int, int], Edge] = {}
         for count, keyframe in enumerate(second.keyframes, 1):
@@ -95,15 +95,15 @@ def verify(
             for loop in closer.close(keyframes, clouds, poses[:end], parts[:end], own[:end]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
-                    tried[ends] = loop.between(*ends)  # later: confirmed by another one
+                    tried[ends] = loop.between(*ends)  # a later result: confirmed by another loop
             advance(count, len(second.keyframes))
     return {"loops": [edge_figures(loop) for loop in tried.values()]}
 
 
 @dataclass(frozen=True, eq=False)
 class _Excerpt:
-    """Some keyframes of a map: nodes of theirs, keyframes with descriptors, poses (N, 4, 4), parts (N,), whether their
-    cloud is their own (N,), and all of the map."""
+    """Some keyframes of a map: their nodes, keyframes with descriptors, poses (N, 4, 4), parts (N,), whether their
+    cloud is their own (N,), and the whole map."""
 
     nodes: list[int]
     keyframes: list[Keyframe]
@@ -123,13 +123,13 @@ def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
         lent = replace(data.keyframes[owner], descriptors=data.describe(owner))
         keyframe = lent if loan is None else borrowing(data.keyframes[node], {owner: lent}, loan)  # type: ignore[arg-type]
         follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
-        # Their own names keep the odometry of the two apart; a gap begins another stretch of it.
+        # Separate names keep the odometry of the two apart; a gap begins another stretch of odometry.
         keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if follows else None))
     return _Excerpt(chosen, keyframes, data.poses[chosen], parts_of(data)[chosen], data.clouds.own[chosen], data)
 
 
 class _Clouds(LazySequence[Points]):
-    """The clouds of excerpts, one after the other, read when they are asked for."""
+    """The clouds of excerpts, one after the other, read on demand."""
 
     def __init__(self, excerpts: Sequence[_Excerpt]) -> None:
         self._where = [(excerpt.data, node) for excerpt in excerpts for node in excerpt.nodes]
@@ -144,7 +144,7 @@ class _Clouds(LazySequence[Points]):
 
 
 def edge_figures(edge: Edge) -> Figures:
-    """A loop as JSON holds it."""
+    """A loop in a form for JSON."""
     r = edge.registration
     numbers = {"confidence": float(r.confidence), "rmse": float(r.rmse), "ok": bool(r.ok)}
     matrices = {"T": r.T_target_source.tolist(), "covariance": r.covariance.tolist()}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives of a fleet into one map, without any prior: places that look alike, loops that are affirmed, one graph.
+"""Merge drives of a fleet into one map, without initial poses: places that look alike, confirmed loops, one graph.
 
-A map that is there already grows by the drives that are new; it is made anew only where it no longer holds.
+An existing map grows by the new drives; it is made again only if it no longer holds.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from dpm2_core.slam.store.map_store import MapStore
 
 @dataclass
 class Merged:
-    """What came out.
+    """The result of a merge.
 
     Attributes:
-        drives: that are in the map, with their keyframes, in the order of the file.
+        drives: in the map, with their number of keyframes, in the order of the file.
         left_out: the others, with the reason.
         joins: of each two drives with a place in common: loops accepted and rejected, and why.
-        made: from what; a map that was made from other things does not grow, but is made anew.
+        made: its inputs; a map that was made from other inputs does not grow, but is made again.
     """
 
     drives: dict[str, int]
@@ -51,23 +51,23 @@ class Merged:
 
     @property
     def rejected(self) -> dict[str, int]:
-        """Reasons why loops were rejected, and how often."""
+        """Reasons why loops were rejected, and their numbers."""
         total = sum((Counter(row["reasons"]) for row in self.joins), Counter[str]())
         return dict(total.most_common())
 
 
 def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, view: View | None = None,
           largest: int = LARGEST) -> Merged:  # fmt: skip
-    """Join the drives that `dpm2 fleet run` left in a folder, and write the map and OUT.json.
+    """Join the drives that `dpm2 fleet run` wrote to a folder, and write the map and OUT.json.
 
     Args:
-        cluster: not entered yet. largest: keyframes of a region of the pose graph.
+        cluster: not entered yet. largest: most keyframes of a region of the pose graph.
 
     Raises:
-        UsageError: a file is there that is no merge of drives or holds more than these, or the log of a map that was
+        UsageError: a file exists that is no merge of drives or contains more than these, or the log of a map that was
             moved; or there is no drive.
-        Dpm2Error: nothing can be joined, or the map that is there is damaged.
-        KeyboardInterrupt: it was stopped before all drives were looked at; the map stays as it is.
+        Dpm2Error: nothing can be joined, or the existing map is damaged.
+        KeyboardInterrupt: it was stopped before all drives were examined; the map stays as it is.
     """
     folder, left_out = folder.resolve(), dict[str, str]()
     before = _record(out, folder)
@@ -98,26 +98,26 @@ def _beside(out: Path) -> Path:
 
 
 def _record(out: Path, folder: Path) -> Merged | None:
-    """What is known of the map that is there. A map that this wrote may be changed, any other file not."""
+    """The record of the existing map. Only a map that a merge wrote may be changed, no other file."""
     try:
         merged = TypeAdapter(Merged).validate_json(_beside(out).read_bytes())
     except (OSError, ValueError):
         merged = None
     if not out.exists():
-        check_new(out)  # what is left of another map, moved without its log, is not ours to remove
+        check_new(out)  # the log of another map that was moved without it must not be removed
         return merged
     if merged is None:
         raise UsageError(f"{out}: there is a file already, which is no merge of drives")
     drives = merged.drives.keys() | {path.parent.name for path in folder.glob(f"*/{MAP}")}
     with MapStore.open(out) as store:
         others = sum(str(robot).partition("/")[0] not in drives for (robot,) in store.rows("keyframes", "robot"))
-    if others:  # by `dpm2 run --extend`, or the file of another program beside an old record
+    if others:  # by `dpm2 run --extend`, or another program's file next to an old record
         raise UsageError(f"{out}: {others} of its keyframes are of no drive of {folder}; give another --out")
     return merged
 
 
 def _made_from(folder: Path, settings: SlamSettings, parts: Mapping[str, Part]) -> dict[str, Any]:
-    """All that a map depends on."""
+    """Everything that a map depends on."""
     text = json.dumps(settings.model_dump(mode="json"), sort_keys=True)
     return {
         "folder": str(folder),
@@ -127,13 +127,13 @@ def _made_from(folder: Path, settings: SlamSettings, parts: Mapping[str, Part]) 
 
 
 def _stands(before: Merged, out: Path, made: Mapping[str, Any]) -> bool:
-    """Whether the map that is there has those very drives, made as they would be now."""
+    """Whether the existing map contains exactly the recorded drives, made from the same inputs as now."""
     try:
-        with MapStore.open(out, read_only=False) as store:  # what a merge that was killed has left is brought to order
+        with MapStore.open(out, read_only=False) as store:  # this recovers the file after a killed merge
             size = store.size
     except Dpm2Error:  # none, or damaged
         return False
-    if size != sum(before.drives.values()):  # it was written, but not its record
+    if size != sum(before.drives.values()):  # the map was written, but not its record
         return False
     versions, old = made["versions"], before.made.get("versions", {})
     if any(versions.get(name) != old.get(name) for name in before.drives):
@@ -147,7 +147,7 @@ def _sizes(places: Mapping[str, Figures]) -> dict[str, int]:
 
 def _added(before: Merged, out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join],
            largest: int) -> Merged | None:  # fmt: skip
-    """The map with the drives that hang together with it; None: it must be made anew."""
+    """The map with the drives that are connected to it; None: it must be made again."""
     inside, rows = before.drives, {(row["drives"][0], row["drives"][1]): row for row in before.joins}
     enough, refused = affirmed(_untried(before, joins))
     together = component(sizes, enough, inside)
@@ -174,7 +174,7 @@ def _added(before: Merged, out: Path, search: Search, sizes: Mapping[str, int], 
 
 
 def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join], largest: int) -> Merged:
-    """The map of the drives that hang together and have the most keyframes."""
+    """The map of the connected drives that have the most keyframes."""
     enough, refused = affirmed(joins)
     with ExitStack() as stack:
         maps = _maps(sizes, search.folder, stack)
@@ -182,7 +182,7 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
             region = solve(maps, enough, search.settings.pose_graph, largest)
             enough, contradicted = affirmed(region.joins)
             refused += contradicted
-            if not any(join.loop.ok for join in contradicted):  # else what is left of them would hang on too few
+            if not any(join.loop.ok for join in contradicted):  # else these drives would be tied by too few
                 break
         together = component(sizes, enough)
         moved = {name: replace(maps[name], poses=region.poses[name]) for name in together}
@@ -190,7 +190,7 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
         try:
             with named(out, fresh), MapStore.create(fresh) as store:
                 add_drives(store, {}, Growth(moved, enough), refused)
-            if not _beside(out).exists():  # a map without any would be taken for another program's, if this ends here
+            if not _beside(out).exists():  # without it the map would be taken for another program's, if this ends here
                 write_json(_beside(out), asdict(Merged({}, {})))
             move_map(fresh, out)
         finally:
@@ -199,7 +199,7 @@ def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[J
 
 
 def _untried(before: Merged, joins: Sequence[Join]) -> list[Join]:
-    """The joins, rejected where the map that is there has contradicted all those of the two drives."""
+    """The joins, rejected if the existing map has contradicted those of the two drives."""
     refused = {(row["drives"][0], row["drives"][1]) for row in before.joins if row["accepted"] < ENOUGH}
     return [
         replace(join, loop=join.loop.rejected("the map contradicts the two drives' joins"))
@@ -210,7 +210,7 @@ def _untried(before: Merged, joins: Sequence[Join]) -> list[Join]:
 
 
 def _maps(names: Iterable[str], folder: Path, stack: ExitStack) -> dict[str, MapData]:
-    """The maps of drives, which stay open for their clouds; descriptors are read when they are asked for."""
+    """The maps of drives, which stay open for their clouds; descriptors are read on demand."""
     stores = {name: stack.enter_context(MapStore.open(folder / name / MAP)) for name in names}
     return {name: load_map(store, descriptors=False) for name, store in stores.items()}
 

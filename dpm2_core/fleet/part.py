@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a larger work: each is done once, in a folder of its own, so that what was stopped goes on."""
+"""Parts of a larger work: each is done once, in its own folder, so that a stopped work can be continued."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write, explaining, file_digest, make_folder
 
 DONE = "part.json"
-"""In the folder of a part that ended: what it was asked for, and its figures."""
+"""The record in the folder of a part that ended: its request and its figures."""
 
 Figures = dict[str, Any]
 
@@ -36,17 +36,16 @@ class Part:
     """A piece of work.
 
     Attributes:
-        name: also its folder below that of the whole, such as dpm2/06.
-        work: MODULE:FUNCTION, called with the folder, a function to be told of the progress, and the arguments;
-            returns figures.
-        arguments: whatever JSON can hold, paths and settings.
+        name: also its folder below that of the whole work, such as dpm2/06.
+        work: MODULE:FUNCTION, called with the folder, a function for the progress, and the arguments; returns figures.
+        arguments: anything that JSON can represent, paths and settings.
         inputs: files that it reads and another part may write, such as weights; a part whose inputs changed is done
             again.
-        fresh: it begins with an empty folder, which takes its name when all is in it. Else the work finds what an
-            attempt before has left, and goes on with that.
+        fresh: it begins with an empty folder, which gets its name once it is complete. Otherwise the work continues
+            from the files of an earlier attempt.
         cores: processors that it uses.
-        content: what else it reads holds, such as the digest of a drive; a part is done again when that changed, but
-            for one that ended and does not say what it had read.
+        content: content of other data that it reads, such as the digest of a drive; a part is done again when it
+            changed, except one that ended without a record of the content.
     """
 
     name: str
@@ -59,7 +58,7 @@ class Part:
 
 
 class Outcome(NamedTuple):
-    """What became of a part: done now, kept from before, failed with the reason, or not done when it was stopped."""
+    """The outcome of a part: done now, kept from before, failed with the reason, or not done when it was stopped."""
 
     name: str
     state: Literal["done", "kept", "failed", "stopped"]
@@ -69,11 +68,11 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Progress:
-    """What is called as parts go on.
+    """Functions that are called with the progress of the parts.
 
     Attributes:
-        frame: name of the part, frames done, frames in all; only where one part runs at a time.
-        part: name of the part that is done, parts done, parts in all.
+        frame: name of the part, frames done, total frames; only if one part runs at a time.
+        part: name of the part that is done, parts done, total parts.
     """
 
     frame: Callable[[str, int, int], None] = lambda name, done, total: None
@@ -83,13 +82,13 @@ class Progress:
 def run_parts(
     parts: Sequence[Part], out: Path, workers: int = 1, progress: Progress | None = None
 ) -> dict[str, Figures]:
-    """Figures of every part by its name. Those that are done, with the same arguments and inputs, are only read.
+    """Figures of every part by its name. Those already done, with the same arguments and inputs, are only read.
 
     Args:
-        workers: parts at a time; more than one run in processes of their own.
+        workers: parts at a time; if more than one, each runs in its own process.
 
     Raises:
-        Dpm2Error: a part failed; it is named. Those that are done stay.
+        Dpm2Error: a part failed; it is named. Parts that are done are kept.
     """
     progress = progress or Progress()
     found = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
@@ -101,12 +100,12 @@ def run_parts(
 
 
 def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -> Iterator[tuple[str, Figures]]:
-    """Do the parts, each as it ends."""
+    """Do the parts, and yield the figures of each as it ends."""
     if workers < 2 or len(parts) < 2:
         for part in parts:
             yield part.name, _named(part, out, partial(progress.frame, part.name))
         return
-    context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads half
+    context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads only partly
     pool = ProcessPoolExecutor(workers, mp_context=context)
     try:
         running = {pool.submit(_named, part, out): part.name for part in parts}
@@ -127,7 +126,7 @@ def do_part(part: Part, out: Path, advance: Advance = untold) -> Figures:
     """Do a part in this process, whether it was done before or not; returns its figures.
 
     Raises:
-        Dpm2Error: it failed, or its results could not be written. Of a fresh part nothing is left then.
+        Dpm2Error: it failed, or its results could not be written. A fresh part then leaves no files.
     """
     began = perf_counter()
     with _folder(part, out) as folder:
@@ -146,7 +145,7 @@ def do_part(part: Part, out: Path, advance: Advance = untold) -> Figures:
 
 
 def figures_of(part: Part, out: Path) -> Figures | None:
-    """What a part that ended has found; None where it has not, was asked for something else, or is not whole."""
+    """Figures of a part that ended; None if it has not ended, had another request, or is not complete."""
     try:
         asked = json.loads(json.dumps(_asked(part), default=_plain))
         record = {"content": part.content, **json.loads((out / part.name / DONE).read_text(encoding="utf-8"))}
@@ -158,7 +157,7 @@ def figures_of(part: Part, out: Path) -> Figures | None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a fresh part that ended is still there with all its files, and none was cut short since."""
+    """Whether a fresh part that ended still has all its files, none of them truncated since."""
     try:
         listed = json.loads((folder / DONE).read_text(encoding="utf-8"))["files"].items()
         return all((folder / name).stat().st_size == size for name, size in listed)
@@ -167,7 +166,7 @@ def is_whole(folder: Path) -> bool:
 
 
 def remove_attempts(part: Part, out: Path) -> None:
-    """Remove what attempts that were killed have left; none may be running."""
+    """Remove the files of killed attempts; none may be running."""
     folder = out / part.name
     for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.attempt"):
         shutil.rmtree(left, ignore_errors=True)
@@ -175,9 +174,9 @@ def remove_attempts(part: Part, out: Path) -> None:
 
 @contextmanager
 def _folder(part: Part, out: Path) -> Iterator[Path]:
-    """The folder to work in: its own, or one that takes its place at the end of the block.
+    """The folder to work in: the part's own, or one that replaces it at the end of the block.
 
-    No two attempts work in the same one: that of a worker that was given up for dead may still be at it.
+    No two attempts work in the same folder: a worker that was considered dead may still be running.
     """
     folder = out / part.name
     if not part.fresh:
@@ -191,9 +190,9 @@ def _folder(part: Part, out: Path) -> Iterator[Path]:
             made = attempt.stat().st_ino
         yield attempt
         with explaining(folder):
-            if attempt.stat().st_ino != made:  # removed meanwhile, and made anew by what was written later
+            if attempt.stat().st_ino != made:  # removed meanwhile, and made again by a later write
                 raise Dpm2Error(f"{attempt}: removed while it was written to")
-            if figures_of(part, out) is None:  # else another attempt was first, with the same
+            if figures_of(part, out) is None:  # else another attempt with the same result was first
                 if folder.exists():
                     folder.rename(old)
                 attempt.rename(folder)
@@ -212,7 +211,7 @@ def _read(record: Mapping[str, Any]) -> Figures:
 
 
 def _plain(argument: object) -> object:
-    """What JSON has no word for."""
+    """Convert an object that JSON cannot represent."""
     return argument.model_dump(mode="json") if isinstance(argument, Settings) else str(argument)
 
 
@@ -230,5 +229,5 @@ def _digest(path: Path) -> str | None:
 
 @lru_cache
 def _hashed(path: Path, mtime_ns: int, size: int) -> str:
-    """SHA-256 of a file; many parts read the same weights. `mtime_ns` and `size`: as it is now."""
+    """SHA-256 of a file, cached: many parts read the same weights. `mtime_ns` and `size`: its current ones."""
     return file_digest(path)

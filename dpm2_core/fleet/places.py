@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place vectors of many drives in one index: for each keyframe those of other drives that look most alike.
+"""The place vectors of many drives in one index: for each keyframe the most similar ones of other drives.
 
 A graph is searched (HNSW, by faiss): Y. Malkov, D. Yashunin, "Efficient and Robust Approximate Nearest Neighbor Search
 Using Hierarchical Navigable Small World Graphs", TPAMI 2020.
@@ -30,10 +30,10 @@ _WORK = "dpm2_core.fleet.places:describe"
 _PLACES, _VECTORS = "places", "places.npy"
 _INDEX, _LISTED = "index.faiss", "index.json"
 _LATE = 20_000
-"""Places up to which each is compared: 100 keyframes cost 30 ms then, and 0.3 s to take them into the graph."""
-_AT_ONCE = 256  # queries: of all cosines of a long drive there would be gigabytes
+"""Up to this number of places each is compared: 100 keyframes then cost 30 ms, and 0.3 s to add them to the graph."""
+_AT_ONCE = 256  # queries: all cosines of a long drive would be gigabytes
 _LINKS, _BUILD, _SEARCH = 32, 80, 64
-"""Of the graph: neighbors of a place; how many are looked at when one is added, and when one is searched for."""
+"""Settings of the graph: neighbors of a place; places examined when one is added, and when one is searched for."""
 
 
 def places_part(name: str, path: Path) -> Part:
@@ -43,19 +43,19 @@ def places_part(name: str, path: Path) -> Part:
 
 
 def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int]) -> Figures:
-    """Check a map, all of it, and write the vectors of its places.
+    """Check a whole map, and write the vectors of its places.
 
     Raises:
-        Dpm2Error: it is damaged, or has no descriptors; nothing of it should be used.
+        Dpm2Error: the map is damaged, or has no descriptors; nothing of it should be used.
     """
-    del advance, version  # quick; and only to know another map of that name by
+    del advance, version  # quick; the version only identifies another map of that name
     if problems := check_map(path).problems:
         raise Dpm2Error(f"{path}: {problems[0]}; see dpm2 map check")
     with MapStore.open(path) as store:
         data = load_map(store)
     vectors = np.zeros((len(data), WIDTH), np.float32)
     for node, keyframe in enumerate(data.keyframes):
-        if keyframe.descriptors is not None and data.clouds.loan(node) is None:  # else all that is found is one place
+        if keyframe.descriptors is not None and data.clouds.loan(node) is None:  # else all candidates are one place
             vectors[node] = pooled(keyframe.descriptors)
     if not vectors.any():
         raise Dpm2Error(f"{path}: no keyframe has descriptors, by which it could be found in the others")
@@ -64,16 +64,16 @@ def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int])
 
 
 def vectors_of(out: Path, name: str) -> Vector:
-    """(N, 528) of a drive whose part is done; zeros where a keyframe has none of its own."""
+    """Vectors (N, 528) of a drive whose part is done; zeros for keyframes without descriptors of their own."""
     return np.asarray(np.load(out / _PLACES / name / _VECTORS), np.float32)
 
 
 class FleetIndex:
-    """The places of all drives in the order in which the drives came; kept beside the vectors of each drive.
+    """Index of the places of all drives, in the order in which they were added; stored next to each drive's vectors.
 
-    Vectors are compared by their cosine, less the mean of those that came first: what all places share does not tell
-    them apart. Places that came late are compared one by one, until they are worth their way into the graph: so a
-    drive costs the same in a large map as in a small one.
+    Vectors are compared by their cosine, after the mean of the first drive's is subtracted: what all places share does
+    not distinguish them. Places that were added late are compared one by one, until adding them to the graph pays off:
+    so a drive costs the same in a large map as in a small one.
 
     Attributes:
         drives: name, version, and number of keyframes of each.
@@ -84,7 +84,7 @@ class FleetIndex:
     _late: Vector
 
     def __init__(self, folder: Path) -> None:
-        """With what is in the folder of the drives' places, if it is whole."""
+        """Load the index from the folder of the drives' places, if it is complete."""
         with needs("fleet", "the index of places"):
             import faiss
         self._faiss: Any = faiss
@@ -101,12 +101,12 @@ class FleetIndex:
             if [each.shape for each in vectors] != [(count, WIDTH) for *_, count in late]:
                 return
         except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError):
-            return  # none, or one that is not whole: it is made anew
+            return  # none, or an incomplete one: it is made again
         self.drives, self._mean, self._graph = drives, mean, graph
         self._late = np.concatenate([self._late, *(centered(each, mean) for each in vectors)])
 
     def _kept_graph(self, linked: int) -> Any:
-        """The graph of so many places; None where it is none, another one, or damaged: then each is compared."""
+        """The stored graph of `linked` places; None if missing, another one, or damaged: then each is compared."""
         with suppress(RuntimeError):
             graph = self._faiss.read_index(str(self._folder / _INDEX)) if linked else None
             if graph is not None and (graph.ntotal, graph.d) == (linked, WIDTH):
@@ -114,7 +114,7 @@ class FleetIndex:
         return None
 
     def clear(self) -> None:
-        """Forget all, as where a drive has changed."""
+        """Drop all places, e.g. if a drive has changed."""
         self.drives = []
         self._mean = np.zeros(WIDTH, np.float32)
         self._graph = None
@@ -127,9 +127,9 @@ class FleetIndex:
         return 0 if self._graph is None else int(self._graph.ntotal)
 
     def similar(self, vectors: Vector, count: int) -> NDArray[np.int64]:
-        """(M, count) places of the drives in it that look most like each of (M, 528), the most similar first; -1: none.
+        """(M, count) places in the index most similar to each of (M, 528), the most similar first; -1: none.
 
-        A place is a number over all drives: the keyframes of the first, then those of the second.
+        Places are numbered over all drives: the keyframes of the first drive, then those of the second.
         """
         queries = centered(vectors, self._mean)
         cosines = [np.full((len(vectors), count), -np.inf, np.float32)]
@@ -149,7 +149,7 @@ class FleetIndex:
         return np.asarray(out, np.int64)
 
     def add(self, name: str, version: Sequence[int], vectors: Vector) -> None:
-        """Take a drive in."""
+        """Add a drive."""
         if not self.drives:
             self._mean = vectors[vectors.any(1)].mean(0)
         rows = centered(vectors, self._mean)
@@ -159,7 +159,7 @@ class FleetIndex:
             self._link()
 
     def _link(self) -> None:
-        """Take the late ones into the graph."""
+        """Add the late places to the graph."""
         if self._graph is None:
             self._graph = self._faiss.IndexHNSWFlat(WIDTH, _LINKS, self._faiss.METRIC_INNER_PRODUCT)
         self._graph.hnsw.efConstruction = _BUILD
@@ -167,10 +167,10 @@ class FleetIndex:
         self._late, self._relinked = self._late[:0], True
 
     def save(self) -> None:
-        """Write to its folder what the vectors of the drives do not say.
+        """Write the parts of the index that do not follow from the drives' vectors to its folder.
 
         Raises:
-            Dpm2Error: it cannot be written. What was there before stays usable.
+            Dpm2Error: it cannot be written. The earlier files stay usable.
         """
         if self._relinked:
             with atomic_write(self._folder / _INDEX, "wb") as file:
@@ -181,8 +181,8 @@ class FleetIndex:
 
 
 def _compared(queries: Vector, places: Vector, count: int) -> tuple[Vector, NDArray[np.int64]]:
-    """Cosines (M, count) of the places that look most like each of the queries (M, 528), in no order, and which they
-    are."""
+    """Cosines (M, count) of the places most similar to each of the queries (M, 528), unsorted, and the indices of these
+    places."""
     cosines = np.empty((len(queries), count), np.float32)
     which = np.empty((len(queries), count), np.int64)
     for start in range(0, len(queries), _AT_ONCE):

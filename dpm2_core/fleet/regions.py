@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph of a fleet in stages: drives that meet often are solved as a region, then what ties the regions.
+"""The pose graph of a fleet in stages: drives that meet often are solved as a region, then the ties of the regions.
 
-A region gives to the second stage only the keyframes at which others touch it, with what it knows of their relative
-poses; where these come out elsewhere, it is solved again with them held. No stage needs a cloud.
+The second stage receives only the keyframes at which other regions touch a region, and its estimate of their relative
+poses. If the second stage moves these, the region is solved again with them fixed. No stage needs a cloud.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from dpm2_core.slam.mapping.restore import restore
 from dpm2_core.slam.store.map_data import MapData
 
 LARGEST = 20_000
-"""Keyframes of a region."""
-_MOVED = 1e-3  # m and rad: borders that moved by less leave their region as it is
+"""Most keyframes of a region."""
+_MOVED = 1e-3  # m and rad: if the borders moved by less, the region is not solved again
 
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """A loop from a node of one drive to a node of another one, in the numbers of their maps."""
+    """A loop from a node of one drive to a node of another one, numbered as in their maps."""
 
     one: str
     other: str
     loop: Edge
 
     def loop_at(self, first: Mapping[str, int]) -> Edge:
-        """The loop in a graph, by the node of it with which each drive begins."""
+        """The loop in a graph; `first`: the first node of each drive there."""
         return self.loop.between(self.loop.from_node + first[self.one], self.loop.to_node + first[self.other])
 
     def judged(self, registration: Registration) -> Join:
-        """The join with the verdict that a graph has come to."""
+        """The join with the verdict of a graph."""
         return replace(self, loop=replace(self.loop, registration=registration))
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Drives that are solved together: poses (N, 4, 4) by drive, and the joins within, checked."""
+    """Drives that are solved together: poses (N, 4, 4) by drive, and the checked joins between them."""
 
     poses: dict[str, Array]
     joins: list[Join]
 
 
 def regions_of(sizes: Mapping[str, int], joins: Sequence[Join], largest: int = LARGEST) -> list[list[str]]:
-    """Drives, in their order, into regions: each goes where most of its joins lead, if there is room.
+    """Group drives, in their order, into regions: each joins the region with most of its joins that has room.
 
     Args:
-        sizes: keyframes of each drive. largest: of a region; a longer drive is one by itself.
+        sizes: keyframes of each drive. largest: of a region; a longer drive is a region by itself.
     """
     regions: list[list[str]] = []
     owner: dict[str, int] = {}
@@ -97,7 +97,7 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSe
 
 
 def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
-    """The drives in one map, each with the poses that it has, and their joins as loops; its frame that of the first."""
+    """The drives in one map, each with its own poses, and their joins as loops; its frame is that of the first."""
     first = first_nodes(sizes_of(maps))
     loops = [join.loop_at(first) for join in joins]
     drives = list(maps.values())
@@ -111,18 +111,18 @@ def sizes_of(maps: Mapping[str, MapData]) -> dict[str, int]:
 
 
 def first_nodes(sizes: Mapping[str, int]) -> dict[str, int]:
-    """The node with which each drive begins where one is after the other."""
+    """The first node of each drive if the drives are put one after the other."""
     return dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
 
 
 def owners(nodes: Sequence[int], first: Mapping[str, int]) -> list[str]:
-    """The drive of each node; `first`: with which they begin."""
+    """The drive of each node; `first`: the first node of each drive."""
     names = list(first)
     return [names[number] for number in np.searchsorted(list(first.values()), nodes, side="right") - 1]
 
 
 def _halved(maps: Sequence[MapData]) -> MapData:
-    """One map of several; in halves, so that a cloud is a few calls away, however many there are."""
+    """One map of several, merged in halves, so that reading a cloud takes few calls, however many maps there are."""
     if len(maps) == 1:
         return maps[0]
     half = len(maps) // 2
@@ -131,7 +131,7 @@ def _halved(maps: Sequence[MapData]) -> MapData:
 
 def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
             held: Mapping[tuple[str, int], Array] | None = None) -> Region:  # fmt: skip
-    """Solve drives and their joins; `held`: (4, 4) of nodes that stay there."""
+    """Solve drives and their joins; `held`: (4, 4) poses of nodes that are fixed."""
     data, first = side_by_side(maps, joins), first_nodes(sizes_of(maps))
     graph = PoseGraph(settings)
     restore(graph, data)
@@ -146,7 +146,7 @@ def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: Robust
 
 def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mapping[int, Sequence[Join]],
              outer: Sequence[Join], settings: RobustSettings) -> tuple[dict[str, Array], list[Join]]:  # fmt: skip
-    """Poses of all drives from those of the regions, and the joins between these, checked."""
+    """Poses of all drives from those of the regions, and the checked joins between the regions."""
     ends = {(join.one, join.loop.from_node) for join in outer} | {(join.other, join.loop.to_node) for join in outer}
     graph, where = PoseGraph(settings), dict[tuple[str, int], int]()
     for region in solved:
@@ -181,7 +181,7 @@ def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mappi
 
 def _moved(maps: Mapping[str, MapData], region: Region, joins: Sequence[Join],
            held: Mapping[tuple[str, int], Array], settings: RobustSettings) -> dict[str, Array]:  # fmt: skip
-    """Poses of a region whose borders have come to be elsewhere: moved as it is, or solved again where that differs."""
+    """Poses of a region whose borders have moved: moved rigidly, or solved again if that is not enough."""
     if not held:
         return region.poses
     moves = [T @ se3.inverse(region.poses[name][node]) for (name, node), T in held.items()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a fleet on a cluster: what is whole is kept, what fails is named, and the rest goes on."""
+"""The parts of a fleet on a cluster: complete ones are kept, failed ones are named, and the rest continues."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from dpm2_core.fleet.part import Outcome, Part, figures_of, remove_attempts
 from dpm2_core.tables import FigureTable, cells_of
 
 SUMMARY = "fleet.json"
-"""In the folder of the results: what became of each drive."""
+"""The file in the folder of the results with the outcome of each drive."""
 
 
 class View:
-    """What is told as a fleet goes on; this one says nothing."""
+    """Display of the progress of a fleet; this one displays nothing."""
 
     def begun(self, names: Sequence[str]) -> None:
-        """These are to be done."""
+        """Called with the parts that are to be done."""
 
     def running(self, status: Mapping[str, Status]) -> None:
-        """Twice a second: those that have begun."""
+        """Called twice per second with the parts that have begun."""
 
     def ended(self, outcome: Outcome) -> None:
-        """This one is whole, or failed."""
+        """Called when a part is complete or has failed."""
 
 
 def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | None = None) -> list[Outcome]:
-    """Do all parts that are not whole yet and write OUT/fleet.json; Ctrl-C ends it early, and the rest is "stopped", as
-    it is in the file until it ends.
+    """Do all parts that are not complete yet and write OUT/fleet.json. Ctrl-C ends it early: the rest is "stopped", as
+    it is in the file until the end.
 
     Args:
         cluster: not entered yet.
@@ -53,7 +53,7 @@ def _write(out: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 def not_done(out: Path) -> dict[str, str]:
-    """Drives that were asked for last, but not done, with the reason: what is there of them is of other settings."""
+    """Drives of the last request that were not done, with the reason: existing files of them are of other settings."""
     try:
         rows = json.loads((out / SUMMARY).read_text(encoding="utf-8"))["drives"]
         return {row["name"]: row["reason"] or row["state"] for row in rows if row["state"] in ("failed", "stopped")}
@@ -62,7 +62,7 @@ def not_done(out: Path) -> dict[str, str]:
 
 
 def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> list[Outcome]:
-    """What became of each part, in their order; Ray is started only where there is something to do.
+    """The outcome of each part, in their order; Ray is started only if there is something to do.
 
     Args:
         out: absolute.
@@ -83,7 +83,7 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
 
 
 def _before(parts: Sequence[Part], out: Path) -> dict[str, Outcome]:
-    """What became of each part before anything is done: those that are whole are kept."""
+    """The outcome of each part before anything is done: complete ones are kept."""
     found = {part.name: figures_of(part, out) for part in parts}
     return {name: Outcome(name, "stopped" if row is None else "kept", row) for name, row in found.items()}
 

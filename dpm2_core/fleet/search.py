@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which drives share a place: what each holds, where others look like it, and the loops that are affirmed there.
+"""Search for drives that share places: the places of each, similar places of others, and the confirmed loops there.
 
-What was found is kept in DIR/.merge, drive by drive and stretch by stretch: another drive costs what it touches.
+Results are stored in DIR/.merge, drive by drive and stretch by stretch: the cost of another drive depends on what it
+touches.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ from dpm2_core.slam.settings import SlamSettings
 
 _KEPT = ".merge"
 _CANDIDATES = 8
-"""Places that look alike, of each keyframe."""
+"""Similar places that are found for each keyframe."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """Where drives are, and how joins between them are looked for.
+    """Folder of the drives, and the search for joins between them.
 
     Attributes:
-        folder: of the drives. cluster: entered. view: told of what goes on.
+        folder: of the drives. cluster: entered. view: shows the progress.
     """
 
     folder: Path
@@ -48,11 +49,11 @@ class Search:
 
     @property
     def kept(self) -> Path:
-        """Folder of what was found."""
+        """Folder of the stored results."""
         return self.folder / _KEPT
 
     def drives(self, left_out: dict[str, str]) -> dict[str, Part]:
-        """The part that reads the places of each drive that is whole, in the order of their names."""
+        """The part that reads the places of each complete drive, in the order of their names."""
         found, missing = {}, not_done(self.folder)
         for path in sorted(self.folder.glob(f"*/{MAP}")):
             name = path.parent.name
@@ -65,14 +66,14 @@ class Search:
         return found
 
     def places(self, parts: Mapping[str, Part], left_out: dict[str, str]) -> dict[str, Figures]:
-        """What the drives' maps hold, of those that are sound and of the same weights, each drive once.
+        """Figures of the drives' maps that are undamaged and of the same weights, each drive once.
 
         Raises:
-            Dpm2Error: there is none. KeyboardInterrupt: it was stopped.
+            Dpm2Error: there is no such map. KeyboardInterrupt: the search was stopped.
         """
         own = weights_id(self.settings.neural.weights)
         found: dict[str, Figures] = {}
-        drives: dict[bytes, str] = {}  # by all their places: no two look alike, but of a recording that was copied
+        drives: dict[bytes, str] = {}  # by all their places: these are equal only for copies of a recording
         outcomes = self._done(list(parts.values()))
         for name, outcome in zip(parts, outcomes, strict=True):
             if outcome.figures is None:
@@ -88,13 +89,13 @@ class Search:
         return found
 
     def index(self, parts: Mapping[str, Part]) -> FleetIndex:
-        """All these drives in one index. Candidates are found once for each drive, when it comes."""
+        """All these drives in one index. The candidates of a drive are found once, when it is added."""
         index = FleetIndex(self.kept)
         versions = {name: part.arguments["version"] for name, part in parts.items()}
         if any(
             versions.get(name) != version or not self._candidates(name).is_file() for name, version, _ in index.drives
         ):
-            index.clear()  # a drive is gone, or another one by now; or what was found for it is gone
+            index.clear()  # a drive is missing or has changed, or its candidates are missing
         new = [name for name in parts if name not in {known for known, *_ in index.drives}]
         for name in new:
             vectors = vectors_of(self.kept, name)
@@ -105,10 +106,10 @@ class Search:
         return index
 
     def joins(self, parts: Mapping[str, Part], index: FleetIndex, inside: Collection[str] = ()) -> list[Join]:
-        """Every loop that was tried between two drives, one of them at least not in `inside`.
+        """Every loop that was tried between two drives, at least one of them not in `inside`.
 
         Raises:
-            Dpm2Error: a search failed, or what is kept is damaged. KeyboardInterrupt: it was stopped.
+            Dpm2Error: a search failed, or a stored result is damaged. KeyboardInterrupt: the search was stopped.
         """
         maps = {name: part.arguments for name, part in parts.items()}
         work: dict[str, tuple[Part, str, str]] = {}
@@ -136,14 +137,14 @@ class Search:
     def _done(self, parts: Sequence[Part]) -> list[Outcome]:
         outcomes = do_parts(parts, self.kept, self.cluster, self.view)
         if any(outcome.state == "stopped" for outcome in outcomes):
-            raise KeyboardInterrupt  # or the map would lose the drives that were not looked at
+            raise KeyboardInterrupt  # else the map would lose the drives that were not examined
         return outcomes
 
     def _candidates(self, name: str) -> Path:
         return self.kept / "candidates" / f"{name}.json"
 
     def _pairs(self, name: str) -> dict[str, list[list[int]]]:
-        """As `_candidates` wrote them."""
+        """The candidates of a drive, as `index` wrote them."""
         path = self._candidates(name)
         try:
             return TypeAdapter(dict[str, list[list[int]]]).validate_json(path.read_bytes())
@@ -152,7 +153,7 @@ class Search:
 
 
 def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:
-    """Of each drive in the index: node of it and node of the new drive, where they look alike."""
+    """For each drive in the index: pairs of its node and the node of the new drive that look alike."""
     first = first_nodes({name: count for name, _, count in index.drives})
     out: dict[str, list[list[int]]] = defaultdict(list)
     for node, found in enumerate(index.similar(vectors, _CANDIDATES)):
@@ -163,7 +164,7 @@ def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]
 
 
 def affirmed(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
-    """The accepted loops of drives that have enough of them; all others, with the reason."""
+    """The accepted loops of pairs of drives that have enough of them; and all others, with the reason."""
     by_pair: dict[tuple[str, str], list[Join]] = defaultdict(list)
     rejected = []
     for join in joins:
@@ -183,10 +184,10 @@ def affirmed(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
 
 
 def component(sizes: Mapping[str, int], joins: Sequence[Join], inside: Collection[str] = ()) -> list[str]:
-    """The drives that hang together and have the most keyframes, in their order.
+    """The connected drives that have the most keyframes, in their order.
 
     Args:
-        sizes: keyframes of each. inside: that hang together already.
+        sizes: keyframes of each. inside: drives that are connected already.
     """
     root = next(iter(inside), "")
     part = {name: root if name in inside else name for name in sizes}

@@ -23,7 +23,7 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
     """KEY=VALUE of each combination of KEY=VALUE,VALUE,..., by a name that a folder can have.
 
     Raises:
-        UsageError: one has no values, or one key is given twice.
+        UsageError: a key has no values, or is given twice.
     """
     keys = [_key(setting) for setting in settings]
     if twice := {key for key in keys if keys.count(key) > 1}:
@@ -31,7 +31,7 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
     out = {}
     for values in product(*(_values(setting) for setting in settings)):
         chosen = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
-        # No two have one name: each with its whole key, and % for what a folder's name cannot have.
+        # Names are unique: each has the whole key, and % codes for characters that a folder's name cannot have.
         out[" ".join(chosen).replace("%", "%25").replace("/", "%2F")] = chosen
     return out
 
@@ -54,7 +54,7 @@ def sweep_parts(
     """A part for each drive with each combination of `variants`.
 
     Raises:
-        UsageError: a setting that there is not, or that a drive of a list has one value of its own for.
+        UsageError: an unknown setting, or one for which a drive of a list has its own value.
     """
     keys = {_key(setting) for overrides in settings.values() for setting in overrides}
     for drive in drives:
@@ -65,7 +65,7 @@ def sweep_parts(
 
 
 def sweep_table(title: str, names: Sequence[str], outcomes: Sequence[Outcome]) -> FigureTable:
-    """A row for each combination: means over the drives that are whole with all of them, the same for each."""
+    """A row for each combination: means over the drives that are complete with all of them, the same for each row."""
     found = {outcome.name: outcome.figures for outcome in outcomes if outcome.figures is not None}
     drives = dict.fromkeys(outcome.name.partition("/")[2] for outcome in outcomes)
     whole = [drive for drive in drives if all(f"{name}/{drive}" in found for name in names)]

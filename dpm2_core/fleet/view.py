@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet on the terminal: one table that shows how far each drive is; lines where there is no terminal."""
+"""A fleet on the terminal: one table with the progress of each drive; plain lines without a terminal."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dpm2_core.fleet.part import Outcome
 from dpm2_core.fleet.run import View
 
 _ROWS = 30
-"""Drives that are shown at once: those that run."""
+"""Running drives that are shown at once."""
 
 
 class TerminalView(View):
-    """A context manager; what it shows of drives that run is gone when it is left."""
+    """A context manager; the table of running drives disappears when it is left."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
