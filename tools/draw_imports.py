@@ -123,7 +123,7 @@ def _label(unit: str, arrows: Arrows) -> str:
     """The name, and for a package also the first words of its docstring."""
     path = ROOT.joinpath(*unit.split("."))
     if unit == BASE:
-        return "frame, estimates, config, errors, files, ...<br/>the nouns, settings, files"
+        return "frame, estimates, config, errors, files, ...<br/>data types, settings, files"
     if not path.is_dir():
         return f"{path.name}.py"
     doc = ast.get_docstring(ast.parse((path / "__init__.py").read_text(encoding="utf-8"))) or ""

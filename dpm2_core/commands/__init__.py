@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One module a subcommand of `dpm2`; `dpm2_core.cli` puts them together."""
+"""One module per subcommand of `dpm2`; `dpm2_core.cli` puts them together."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places found again: retrieval, registration, verification, consistency, relocalization."""
+"""Loop closing and relocalization: retrieval, registration, verification, consistency."""
