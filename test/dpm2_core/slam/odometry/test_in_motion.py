@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""On foot and on legs the velocity changes within a sweep: scans are straightened by what they show of it."""
+"""On a walking person or a legged robot, the velocity changes within a sweep: scans are deskewed with what they show of
+it."""
 
 from __future__ import annotations
 
@@ -20,36 +21,36 @@ from dpm2_core.slam.build import make_odometry
 from dpm2_core.slam.settings import SlamSettings
 
 pytestmark = pytest.mark.slow
-FRAMES = 40  # it stands during the first ten, and shakes from the 20th on
+FRAMES = 40  # standstill during the first ten frames, shaken from the 20th on
 
 
 @cache
 def block() -> World:
-    """What all of them go round."""
+    """The block that all trajectories go around."""
     return build_world("loop", "suburb", seed=1, length=300.0)
 
 
 @cache
 def sweeps(name: str) -> tuple[TurningRobot, list[Frame]]:
-    """Stamped in their middle, with the time of each point."""
+    """The robot and its frames, stamped in mid-sweep, with the time of each point."""
     lidar = LidarConfig(beams=32, columns=512, height=1.4, car_body=False)
     robot = TurningRobot(block(), FRAMES, RIDES[name], lidar)
     return robot, list(robot.frames())
 
 
 def untouched(robot: TurningRobot, frame: Frame) -> Frame:
-    """As it was measured."""
+    """The frame as measured."""
     return frame
 
 
 def backwards(robot: TurningRobot, frame: Frame) -> Frame:
-    """With times that run backwards."""
+    """The frame with reversed point times."""
     assert frame.time_offset is not None
     return replace(frame, time_offset=-frame.time_offset)
 
 
 def straightened(robot: TurningRobot, frame: Frame) -> Frame:
-    """De-skewed, by the true motion, and still with the times of its points."""
+    """The frame deskewed with the true motion, but still with its point times."""
     times, which = np.unique(frame.time_offset, return_inverse=True)
     time = robot.times[frame.index]
     T = se3.inverse(robot.pose(np.array([time]))) @ robot.pose(time + times)
@@ -69,7 +70,7 @@ def tracked(name: str, stamp_at: float, given: Given, registration: str) -> list
 
 
 def steps(name: str, stamp_at: float = 0.0, given: Given = untouched, registration: str = "geometric") -> Array:
-    """(N, 2) m and degrees by which the steps from scan to scan are off, once it moves."""
+    """Errors (N, 2), m and degrees, of the steps from scan to scan once the robot moves."""
     robot, _ = sweeps(name)
     T = np.array([result.T_odom_lidar for result in tracked(name, stamp_at, given, registration)])
     true = robot.pose(robot.times + stamp_at)
@@ -80,7 +81,7 @@ def steps(name: str, stamp_at: float = 0.0, given: Given = untouched, registrati
 @pytest.mark.parametrize("stamp_at", [0.0, -0.05])
 @pytest.mark.parametrize("name", ["walking", "waved", "legged"])
 def test_the_motion_within_a_sweep_is_found(name: str, stamp_at: float) -> None:
-    """Straightened by the motion from scan to scan alone they were off by 22 to 152 mm and 0.2 to 3.7 degrees."""
+    """Deskewed with the motion from scan to scan alone, the errors were 22 to 152 mm and 0.2 to 3.7 degrees."""
     off = np.sqrt((steps(name, stamp_at) ** 2).mean(0))
     assert off[0] < 0.012
     assert off[1] < 0.2
@@ -88,23 +89,25 @@ def test_the_motion_within_a_sweep_is_found(name: str, stamp_at: float) -> None:
 
 @pytest.mark.parametrize("stamp_at", [0.15, -0.2])
 def test_a_stamp_outside_the_sweep_has_no_pose_far_off(stamp_at: float) -> None:
-    """As of a cloud's arrival, or by another clock than that of its points. The curve of the sweep led on by its third
-    power: 55 and 99 mm, 1.4 and 3.6 degrees, as `tracking`. Now it is 31 mm, 0.55: as the twist is off there."""
+    """For example the stamp of a cloud's arrival, or of another clock than that of its points. Previously, the curve of
+    the sweep was extrapolated with its third power: 55 and 99 mm, 1.4 and 3.6 degrees off, as `tracking`. Now it is 31
+    mm and 0.55, the error of the twist there."""
     off = np.sqrt((steps("car", stamp_at) ** 2).mean(0))
     assert off[0] < 0.045
     assert off[1] < 1.0
 
 
 def test_times_that_run_backwards_lose_nothing() -> None:
-    """As a driver may have them that takes the direction of the turn for the other one: what they say of the motion
-    contradicts how the sweep began."""
+    """A driver may produce them if it assumes the wrong direction of rotation. The motion that they show contradicts
+    the start of the sweep."""
     off = steps("car", given=backwards)
     assert off[:, 0].max() < 0.15
     assert off[:, 1].max() < 0.5
 
 
 def test_times_that_the_motion_contradicts_are_not_used() -> None:
-    """Of clouds that are de-skewed already it undid the way twice: 42 mm from scan to scan, as `tracking`."""
+    """Clouds that are already deskewed. Previously, the motion was compensated twice: 42 mm off from scan to scan, as
+    `tracking`."""
     said = [result.times for result in tracked("waved", 0.0, straightened, "geometric")]
     assert not any(said[:10])
     assert "slam.preprocess.deskew" in said[-1]
@@ -117,6 +120,7 @@ def test_times_that_the_motion_contradicts_are_not_used() -> None:
 
 @pytest.mark.long
 def test_descriptors_show_no_motion_within_a_sweep_but_that_since_the_last() -> None:
-    """By which their scans are prepared anew: by the one before alone the headings were off by 0.59 degrees."""
+    """Their scans are prepared again with this motion. With the motion before it alone, the headings were off by 0.59
+    degrees."""
     off = np.sqrt((steps("walking", registration="neural") ** 2).mean(0))
     assert off[1] < 0.45

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An IMU makes fast turns harmless and the map level; one that stops, errs or lies costs no more than it gave."""
+"""An IMU makes fast rotations harmless and the map level. One that stops or is wrong costs no more than its benefit."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ run = partial(track, registration="geometric", preset="outdoor")
 
 @pytest.fixture(scope="module")
 def robot() -> tuple[list[Frame], Array]:
-    """A robot that stands for a second and then swings at up to 100 deg/s while it drives at 1.5 m/s."""
+    """A robot that stands for 1 s, then swings at up to 100 deg/s while it drives at 1.5 m/s."""
     return rooms.turning(COUNT)
 
 
 def error(tracked: list[OdometryResult], truth: Array) -> float:
-    """Root mean square of the positions' errors, m."""
+    """Root mean square of the position errors, m."""
     return float(np.sqrt((off(tracked, truth) ** 2).mean()))
 
 
@@ -43,7 +43,7 @@ def without(frames: list[Frame], since: int = 0) -> list[Frame]:
 
 
 def with_imu(frames: list[Frame], change: Callable[[Array, Array], tuple[Array, Array]]) -> list[Frame]:
-    """Other rates and forces."""
+    """Frames with changed rates and forces."""
     out = []
     for frame in frames:
         assert frame.imu is not None
@@ -53,7 +53,7 @@ def with_imu(frames: list[Frame], change: Callable[[Array, Array], tuple[Array, 
 
 
 def every_third(frames: list[Frame]) -> list[Frame]:
-    """Of the frames, with all samples."""
+    """Every third frame, with the samples of all frames."""
     out = []
     for three in zip(frames[::3], frames[1::3], frames[2::3], strict=False):
         imus = [frame.imu for frame in three if frame.imu is not None]
@@ -63,8 +63,8 @@ def every_third(frames: list[Frame]) -> list[Frame]:
 
 @pytest.mark.slow
 def test_samples_that_two_frames_share_count_once(robot: tuple[list[Frame], Array]) -> None:
-    """As those at the very time of a scan, in a loader of one's own. With them time seemed to go back in each frame:
-    neither bias nor level was kept, and turns that are none of the scans' were never named."""
+    """For example samples at the exact time of a scan, in a user's own loader. Previously, they made time go back in
+    each frame: neither bias nor level was kept, and rotations that contradict the scans were never reported."""
     wrong = with_imu(robot[0], lambda rates, forces: (rates * [1, 1, -1], forces))
     sharing = [wrong[0], *(shared(before, frame) for before, frame in pairwise(wrong))]
     plain, both = run(wrong), run(sharing)
@@ -73,7 +73,7 @@ def test_samples_that_two_frames_share_count_once(robot: tuple[list[Frame], Arra
 
 
 def shared(before: Frame, frame: Frame) -> Frame:
-    """The frame with the last two samples of the one before once more."""
+    """The frame with the last two samples of the previous frame repeated."""
     assert before.imu is not None
     assert frame.imu is not None
     parts = (
@@ -84,7 +84,8 @@ def shared(before: Frame, frame: Frame) -> Frame:
 
 @pytest.mark.slow
 def test_rates_in_degrees_do_not_bend_the_first_map(robot: tuple[list[Frame], Array]) -> None:
-    """A bias of 1 deg/s was 53: the first two scans were bent alike, all others fitted badly, and the way was lost."""
+    """Previously, a bias of 1 deg/s became 53. The first two scans were distorted alike, all others fitted badly, and
+    the trajectory was lost."""
     frames, truth = robot[0][:24], robot[1][:24]
     in_degrees = run([*with_imu(frames[:3], lambda rates, forces: (np.degrees(rates), forces)), *without(frames[3:])])
     assert all(t.registration.ok for t in in_degrees)
@@ -95,7 +96,8 @@ def test_rates_in_degrees_do_not_bend_the_first_map(robot: tuple[list[Frame], Ar
 @pytest.mark.slow
 @pytest.mark.parametrize(("end", "more"), [(30, 6), (35, 13)])
 def test_time_that_goes_back_may_be_another_drive(robot: tuple[list[Frame], Array], end: int, more: int) -> None:
-    """A looped bag, 2.1 and 2.9 m back: all poses after it were 2.2 and 2.6 m off, as `tracking`."""
+    """A looped bag that jumps back by 2.1 and 2.9 m. Previously, all later poses were 2.2 and 2.6 m off, as
+    `tracking`."""
     frames, truth = ([*part[:end], *part[:more]] for part in robot)
     tracked = run(frames, keyframes={"distance": 0.0})
     far = off(tracked, np.array(truth))
@@ -103,7 +105,7 @@ def test_time_that_goes_back_may_be_another_drive(robot: tuple[list[Frame], Arra
     if end == 30:
         assert tracked[-1].state == State.TRACKING
         return
-    # 2.9 m behind where it was: no scan shows the way there, which is anything
+    # 2.9 m behind its last position: no scan shows the motion to there, which is arbitrary
     assert tracked[-1].breaks == 1
     edges = [t.keyframe.edge for t in tracked[end:] if t.keyframe is not None]
     assert edges[0] is not None
@@ -112,7 +114,7 @@ def test_time_that_goes_back_may_be_another_drive(robot: tuple[list[Frame], Arra
 
 @pytest.mark.slow
 def test_few_scans_a_second_are_enough(robot: tuple[list[Frame], Array]) -> None:
-    """3.3: without an IMU the turns begin and end unseen."""
+    """3.3 per second: without an IMU, rotations begin and end unseen."""
     frames, truth = every_third(robot[0]), robot[1][2::3]
     plain, inertial = run(without(frames)), run(frames)
     assert all(t.registration.ok for t in inertial)
@@ -121,7 +123,8 @@ def test_few_scans_a_second_are_enough(robot: tuple[list[Frame], Array]) -> None
 
 @pytest.mark.slow
 def test_ten_samples_a_second_tell_the_turns(robot: tuple[list[Frame], Array]) -> None:
-    """Of bags of kitti2bag, 0.1036 s apart. None was of use, as if there were none: 6 of these 13 scans were lost."""
+    """Bags of kitti2bag have samples 0.1036 s apart. Previously, none of them was used, as if there were none: 6 of
+    these 13 scans were lost."""
     frames, truth = every_third(robot[0]), robot[1][2::3]
     samples = reduce(Inertial.then, [frame.imu for frame in frames if frame.imu is not None])
     some = samples[np.diff(samples.stamps // 103_600_000, prepend=-1) > 0]
@@ -138,7 +141,7 @@ def test_ten_samples_a_second_tell_the_turns(robot: tuple[list[Frame], Array]) -
 
 @pytest.fixture(scope="module")
 def plain(robot: tuple[list[Frame], Array]) -> list[OdometryResult]:
-    """Its odometry without the IMU."""
+    """Odometry of this robot without the IMU."""
     return run(without(robot[0]))
 
 
@@ -157,31 +160,32 @@ def test_one_that_stops_is_missed_and_one_that_comes_late_is_used(robot: tuple[l
     frames, truth = robot
     stops = run(without(frames, since=22))
     gone = ["no samples at the time of the scan"] * 17
-    assert [t.imu for t in stops] == [""] * 23 + gone  # the last rate is taken to go on for 0.05 s
+    assert [t.imu for t in stops] == [""] * 23 + gone  # the last rate is extrapolated for 0.05 s
     assert all(t.registration.ok for t in stops)
     assert error(stops, truth) < 0.01
     late = run([replace(frame, imu=None) if frame.index < 20 else frame for frame in frames])
     assert [t.imu for t in late[:20]] == [None] * 20
     assert {t.imu for t in late[22:]} == {""}
     poses = np.array([t.T_odom_lidar for t in late])
-    assert se3.magnitude(se3.inverse(poses[0]))[1] == 0  # no start is made level afterwards
+    assert se3.magnitude(se3.inverse(poses[0]))[1] == 0  # the start is not leveled afterwards
 
 
 @pytest.mark.slow
 def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array], plain: list[OdometryResult]) -> None:
-    """/tf_static says that it is upside down: it turns the other way."""
+    """According to /tf_static it is upside down, so it rotates the other way."""
     frames, truth = robot
     upside_down = np.diag([1.0, -1.0, -1.0])
     lies = run(with_imu(frames, lambda rates, forces: (rates @ upside_down, forces)))
     assert lies[-1].imu is not None
     assert lies[-1].imu.startswith("its turns are not those of the scans")
-    assert sum(t.imu == "" for t in lies) < 25  # while it stands nothing shows it
+    assert sum(t.imu == "" for t in lies) < 25  # nothing shows it at standstill
     assert error(lies, truth) < 3 * error(plain, truth)
 
 
 @pytest.mark.slow
 def test_where_a_sudden_turn_shows_a_wrong_orientation_no_scan_is_lost() -> None:
-    """At the first sudden turn the scan fitted nowhere, prepared by the reversed turn; none after it fitted either."""
+    """Previously, at the first sudden rotation the scan was prepared with the reversed rotation and fitted nowhere. No
+    later scan fitted either."""
     world, lidar = build_world("random", "suburb", 2), LidarConfig(beams=16, columns=900, height=1.0)
     drive = TurningRobot(world, 32, Ride(3.0, turns=60.0), lidar, ImuConfig())
     frames, truth = list(drive.frames()), drive.poses
@@ -194,7 +198,7 @@ def test_where_a_sudden_turn_shows_a_wrong_orientation_no_scan_is_lost() -> None
 
 @pytest.fixture(scope="module")
 def indoors() -> tuple[list[Frame], Array]:
-    """Frames of a robot that turns to and fro by up to 80 deg/s in a room, after a second at rest; true poses."""
+    """Frames and true poses of a robot in a room. After 1 s at rest it rotates back and forth by up to 80 deg/s."""
 
     def poses(t: Array) -> Array:
         since = np.maximum(t - 1, 0)
@@ -228,8 +232,8 @@ def indoors() -> tuple[list[Frame], Array]:
 def test_indoors_scans_know_the_heading_better(
     indoors: tuple[list[Frame], Array], change: Callable[[Array], Array]
 ) -> None:
-    """Each scan was held at the turn that was measured, and so confirmed it: 50 to 95 deg off, as `tracking`. A small
-    error entered the map turn by turn: 7 deg."""
+    """Previously, each scan was constrained to the measured rotation, and so confirmed it: 50 to 95 deg off, as
+    `tracking`. A small error accumulated in the map: 7 deg."""
     frames, truth = indoors
     sound, wrong = frames[:30], with_imu(frames[30:], lambda rates, forces: (change(rates), forces))
     tracked = run(sound + wrong, preset="auto")
@@ -242,7 +246,8 @@ def test_indoors_scans_know_the_heading_better(
 def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lost(
     robot: tuple[list[Frame], Array], plain: list[OdometryResult]
 ) -> None:
-    """In a bend of 100 deg/s, which ends; the scan that shows it is not to be bent by those rates."""
+    """The rates repeat in a bend of 100 deg/s, which ends. The scan that shows its end must not be distorted by these
+    rates."""
     frames, truth = robot
     assert frames[20].imu is not None
     last = frames[20].imu.rates[-1]
@@ -256,14 +261,14 @@ def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lo
 
 @pytest.mark.slow
 def test_a_scan_that_was_registered_without_it_is_handed_out_without_it(robot: tuple[list[Frame], Array]) -> None:
-    """In deg/s for once, stamped at the start of the sweep: the scan's pose was right, but on the way from the middle
-    of the sweep to the stamp the IMU still turned it, here by 40 degrees."""
+    """One frame has rates in deg/s and is stamped at the start of the sweep. The scan's pose was right. But between the
+    middle of the sweep and the stamp, the IMU still rotated it, here by 40 degrees."""
     frames = [frame.later(-0.05) for frame in robot[0][:17]]
     wrong = with_imu(frames[16:], lambda rates, forces: (np.degrees(rates), forces))
     told = run(without(frames[:13]) + frames[13:16] + wrong)[-1]
     plain = run(without(frames))[-1]
     assert told.registration.ok
-    # Half a sweep by two measures of one turn, at 100 deg/s and each right to some percent.
+    # Half a sweep from two measurements of one rotation at 100 deg/s, each accurate to some percent.
     assert np.degrees(se3.angle(se3.inverse(plain.T_odom_lidar) @ told.T_odom_lidar)) < 0.5
 
 
@@ -276,7 +281,7 @@ def test_forces_that_are_not_known_cost_the_level_alone(robot: tuple[list[Frame]
 
 
 def at_rest(seconds: float, T: Array, config: ImuConfig) -> tuple[Array, Array, Array]:
-    """Stamps, rates and forces along the LiDAR's axes of one that stands at a pose."""
+    """Stamps, rates and forces, in the LiDAR's axes, of an IMU at rest at pose T."""
     imu = Imu(config, np.random.default_rng(3))
     times = imu.times(0, seconds)
     rates, forces = imu.measure(times, lambda at: np.tile(T, (len(at), 1, 1)))
@@ -284,7 +289,7 @@ def at_rest(seconds: float, T: Array, config: ImuConfig) -> tuple[Array, Array, 
 
 
 def standing(T: Array, count: int, config: ImuConfig | None = None) -> list[Frame]:
-    """Frames of one second on at 10 Hz, each with the samples since the one before."""
+    """Frames from 1 s on at 10 Hz, each with the samples since the previous one."""
     stamps, rates, forces = at_rest(1 + 0.1 * count, T, config or ImuConfig())
     out = []
     for i in range(count):
@@ -321,11 +326,11 @@ def test_the_bias_is_known_from_the_first_frame_of_a_start_at_rest(up: tuple[flo
     motion.registered(T, T, first.stamp, None)
     motion.look(second)
     assert motion.turn is not None
-    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # 0.2 by the bias alone
+    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # the bias alone would be 0.2
 
 
 def test_a_slow_turn_at_the_start_is_no_bias_for_long() -> None:
-    """A robot that turns at 1 deg/s looks as one at rest; the scans show that it turns."""
+    """A robot that rotates at 1 deg/s looks as if it were at rest; the scans show its rotation."""
     motion, rate, before = InertialMotion(), np.radians(1.0), np.eye(4)
     for i, frame in enumerate(standing(np.eye(4), 100, ImuConfig(gyro_bias=0.0))):
         assert frame.imu is not None
@@ -340,7 +345,7 @@ def test_a_slow_turn_at_the_start_is_no_bias_for_long() -> None:
 @pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (np.sin(0.3), 0.0, np.cos(0.3))], ids=["LiDAR", "tilted mount"])
 def test_a_start_at_rest_is_level(axis: tuple[float, float, float], unit: float) -> None:
-    """The LiDAR nods by 0.2 rad; the axis that is to be up, that of the base, comes out upright in its own axes."""
+    """The LiDAR is pitched by 0.2 rad. The true up direction becomes the axis that must be up, that of the base."""
     motion, T = InertialMotion(), np.eye(4)
     frame = standing(se3.exp([0.05, 0.2, 0, 0, 0, 0]), 1, ImuConfig(acceleration_bias=0.02, misaligned=0.0))[0]
     assert frame.imu is not None
@@ -353,7 +358,7 @@ def test_a_start_at_rest_is_level(axis: tuple[float, float, float], unit: float)
 
 @pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
 def test_a_start_in_motion_or_without_a_known_base_is_not(unit: float) -> None:
-    """Of forces in g every motion looked like rest: odom was 4 to 9 deg tilted."""
+    """Previously, with forces in g every motion looked like rest: odom was tilted by 4 to 9 deg."""
     frame, T = standing(se3.exp([0, 0.2, 0, 0, 0, 0]), 1)[0], np.eye(4)
     assert frame.imu is not None
     shaken = frame.imu.forces + np.random.default_rng(0).normal(0, 2, frame.imu.forces.shape)
@@ -366,7 +371,7 @@ def test_a_start_in_motion_or_without_a_known_base_is_not(unit: float) -> None:
 
 @pytest.mark.parametrize("gravity", [0.0, 0.05], ids=["zeros", "taken out"])
 def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
-    """What is left of them points anywhere; the gyroscope is of use all the same."""
+    """The remaining forces point in an arbitrary direction. The gyroscope is still usable."""
     motion, T = InertialMotion(), np.eye(4)
     first, second = standing(T, 2, ImuConfig(gyro_bias=0.02))
     for frame, twist in ((first, None), (second, np.zeros(6))):
@@ -378,13 +383,14 @@ def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
             assert motion.problem == "its forces at rest are not gravity: odom is not level"
     assert motion.problem == ""
     assert motion.turn is not None
-    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # 0.2 by the bias, which is known
+    assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # the bias would be 0.2, but it is known
     np.testing.assert_array_equal(motion.T_level_odom, np.eye(4))
 
 
 @pytest.mark.parametrize("rest", [2.0, 0.0], ids=["start at rest", "start in motion"])
 def test_accelerations_without_gravity_are_not_taken_for_gravity_in_g(rest: float) -> None:
-    """One of 1.1 m/s2 looked as 1.1 g: odom was turned by up to 0.02 degrees for each meter."""
+    """Previously, an acceleration of 1.1 m/s2 looked like 1.1 g: odom was rotated by up to 0.02 degrees for each
+    meter."""
     motion, before, rng = InertialMotion(), np.eye(4), np.random.default_rng(1)
     for i in range(400):
         stamp, time = 10**9 + i * 10**8, 0.1 * i
@@ -401,7 +407,7 @@ def test_accelerations_without_gravity_are_not_taken_for_gravity_in_g(rest: floa
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["as they are", "reversed"])
 def test_a_start_upside_down_is_said(sign: float) -> None:
-    """A reversed sign and a LiDAR that hangs, of which nothing is known, look alike."""
+    """A reversed sign and a LiDAR that hangs upside down without a known mounting look alike."""
     motion, T = InertialMotion(), np.eye(4)
     frame = standing(T, 1)[0]
     assert frame.imu is not None
@@ -413,7 +419,7 @@ def test_a_start_upside_down_is_said(sign: float) -> None:
 
 
 def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
-    """A circle of 20 m; /tf_static turns the IMU by 90 degrees about the way ahead."""
+    """A circle of 20 m; /tf_static rotates the IMU by 90 degrees about the forward axis."""
     motion, twist, before = InertialMotion(), np.array([0, 0, 0.25, 5.0, 0, 0]), np.eye(4)
     rates, forces = np.tile([0, -0.25, 0], (10, 1)), np.tile([0, -9.81, 1.25], (10, 1))
     tilt, left_out = [], []
@@ -427,13 +433,13 @@ def test_one_that_is_left_out_does_not_tilt_the_frame() -> None:
         tilt.append(se3.angle(motion.T_level_odom))
         before = T
     assert left_out[10:] == [True] * 290
-    assert np.degrees(tilt[10]) < 0.1  # 5 m, of each at most 0.02 degrees
-    assert tilt[-1] == tilt[10]  # 1.3 degrees more, were its forces still believed
+    assert np.degrees(tilt[10]) < 0.1  # 5 m, at most 0.02 degrees for each
+    assert tilt[-1] == tilt[10]  # 1.3 degrees more if its forces were still used
 
 
 @pytest.mark.parametrize("unit", [1.0, 1 / GRAVITY], ids=["m/s2", "g"])
 def test_the_level_follows_a_drifting_odometry_without_a_jump(unit: float) -> None:
-    """The odometry tips over by 0.01 deg in each frame of 0.5 m, and the robot stays level."""
+    """The odometry tilts by 0.01 deg in each frame of 0.5 m, while the robot stays level."""
     motion, drift = InertialMotion(), np.radians(0.01)
     frames = with_imu(
         standing(np.eye(4), 500, ImuConfig(acceleration_bias=0.0, misaligned=0.0)),
@@ -442,7 +448,7 @@ def test_the_level_follows_a_drifting_odometry_without_a_jump(unit: float) -> No
     before, outs = np.eye(4), []
     step = se3.exp([0, drift, 0, 0.5, 0, 0])
     for i, frame in enumerate(frames):
-        # What tips is the odometry's idea of the axes alone: neither gyroscope nor forces show it.
+        # Only the axes of the odometry tilt: neither gyroscope nor forces show it.
         T = before @ step if i else before
         motion.look(frame)
         motion.registered(before, T, frame.stamp, np.r_[0, 0, 0, 5.0, 0, 0] if i else None)

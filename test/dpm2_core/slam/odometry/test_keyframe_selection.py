@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes by motion, and, as DeepPointMap spaces them, by how well scans register."""
+"""Keyframes by motion, or, as in DeepPointMap, by how well scans register."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dpm2_core.slam.preprocess import Scan
 
 
 def places(settings: KeyframeSettings, rmse: float, meters: int = 120) -> list[float]:
-    """Where keyframes are made along a straight way with a scan per meter."""
+    """Positions of the keyframes along a straight line with a scan per meter."""
     selector, scan, out = KeyframeSelector(settings), Scan(np.zeros((5, 4), np.float32)), []
     for x in range(meters):
         T = se3.make(np.eye(3), [float(x), 0, 0])
@@ -30,13 +30,13 @@ def test_by_motion_the_residual_has_no_say() -> None:
 
 @pytest.mark.parametrize(("rmse", "spacing"), [(0.0, 20.0), (0.146, 10.0), (0.5, 1.0), (np.inf, 1.0)])
 def test_by_the_residual_the_spacing_settles(rmse: float, spacing: float) -> None:
-    """At 2 (1 - rmse / 0.5)^2 of the distance, but no less than 1 m."""
+    """The spacing is 2 (1 - rmse / 0.5)^2 of the distance, but at least 1 m."""
     at = places(KeyframeSettings(distance=10, residual=0.5), rmse)
     assert np.diff(at)[-3:] == pytest.approx(spacing, abs=1.01)  # a scan per meter
 
 
 def turning(steps: list[tuple[float, float]], broken: int | None = None) -> list[int]:
-    """Of which steps (m ahead, degrees of heading), each where the robot is then, keyframes are made.
+    """Indices of the steps (m ahead, degrees of heading) at which a keyframe is made; a step is the robot's pose.
 
     `broken`: the step before which the odometry broke.
     """
@@ -51,8 +51,9 @@ def turning(steps: list[tuple[float, float]], broken: int | None = None) -> list
 
 
 def test_a_robot_that_turns_on_the_spot_makes_the_keyframes_of_one_turn() -> None:
-    """Each turn more of a LiDAR on a turntable, or of a robot that looks around, would be a map more. 30 degrees are
-    more than the angle of the settings; where the robot has been away, or the odometry broke, there is a place anew."""
+    """Otherwise each further rotation of a LiDAR on a turntable, or of a robot that looks around, would add another
+    map. 30 degrees are more than the angle in the settings. After the robot was away, or the odometry broke, new
+    keyframes are made."""
     turn = [(0.0, 30.0 * step) for step in range(12)]
     assert turning(turn * 5) == list(range(12))
     to_and_fro = [(0.0, 0.0), (0.0, 30.0)] * 20
@@ -62,8 +63,8 @@ def test_a_robot_that_turns_on_the_spot_makes_the_keyframes_of_one_turn() -> Non
 
 
 def test_keyframes_that_are_requested_at_a_halt_cost_no_later_frame_time() -> None:
-    """A robot that is looked for in a map all night asks for one a second: after 90 minutes a frame took 0.1 s, all the
-    time there is. Counted is how often poses are compared, as times vary."""
+    """A robot that is not localized requests one keyframe per second, all night. Previously, a frame took 0.1 s after
+    90 minutes, all the time available. The test counts pose comparisons, because times vary."""
     selector, scan, compared = KeyframeSelector(KeyframeSettings()), Scan(np.zeros((5, 4), np.float32)), [0]
 
     class Counted(np.ndarray):
@@ -79,12 +80,13 @@ def test_keyframes_that_are_requested_at_a_halt_cost_no_later_frame_time() -> No
         selector.request()
         assert select(0.01 * (n % 2), 90.0 * (n % 4))
     assert not select(0.0, 0.0, Counted)
-    assert 0 < compared[0] <= 4  # one of each heading
+    assert 0 < compared[0] <= 4  # one per heading
     assert [select(x, 0.0) for x in (4.0, 6.0, 10.0, 11.5)] == [False, True, False, True]
 
 
 def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
-    """Scans that leave the way open for a while enter the map; the next one fits there, and knows no more."""
+    """Scans that leave a direction open for a while are added to the map. The next scan fits them, but has no more
+    information."""
     selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
     worst = []
     for meter in range(16):
@@ -98,7 +100,7 @@ def test_an_edge_is_no_firmer_than_a_registration_on_its_way() -> None:
 
 
 def test_an_edge_is_as_uncertain_as_the_way_that_scenes_have_left_open() -> None:
-    """0.5 m in each of five steps are 2.5 m, as it is the velocity that is not known; the next edge begins anew."""
+    """0.5 m in each of five steps are 2.5 m, because the velocity is not known. The next edge starts anew."""
     selector, scan = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32))
     edges = []
     for meter in range(11):
@@ -112,9 +114,10 @@ def test_an_edge_is_as_uncertain_as_the_way_that_scenes_have_left_open() -> None
 
 
 def fixes_on_the_way(fixes: dict[int, Fix], failed: int | None = None, start: float = 0.0) -> dict[int, Fix]:
-    """Those of keyframes, by their frame; the robot goes 1 m a second forward, turned by 90 degrees to the left.
+    """Fixes of keyframes, by their frame. The robot moves forward at 1 m/s, rotated by 90 degrees to the left.
 
-    `fixes`: by the frame with which they come. `failed`: a frame that is not registered. `start`: m, of the way there.
+    `fixes`: by the frame with which they arrive. `failed`: a frame that is not registered. `start`: start position
+    along the path, m.
     """
     selector, scan, out = KeyframeSelector(KeyframeSettings(distance=5)), Scan(np.zeros((5, 4), np.float32)), {}
     for second in range(13):
@@ -132,22 +135,23 @@ def measured(seconds: float) -> Fix:
 
 
 def test_a_fix_travels_with_the_next_keyframe_as_seen_from_there() -> None:
-    """It comes late: the antenna is where it was when the fix was measured, between two scans."""
+    """It arrives late. The antenna position is that at the time of the fix, between two scans."""
     found = fixes_on_the_way({2: measured(0.5), 4: measured(3.25), 9: measured(9.0)})
     assert list(found) == [5, 10]  # 5 m apart
     assert found[5].stamp == 3_250_000_000  # the later of the two
-    np.testing.assert_allclose(found[5].antenna, [-1.75, 0, 1.5], atol=1e-9)  # behind, where it is looked back from
+    np.testing.assert_allclose(found[5].antenna, [-1.75, 0, 1.5], atol=1e-9)  # behind the keyframe
     np.testing.assert_allclose(found[10].antenna, [-1.0, 0, 1.5], atol=1e-9)
 
 
 def test_far_from_the_start_of_the_drive_fixes_are_taken_as_near_it() -> None:
-    """Their antennas were put into the odometry frame, where one beyond 1 km was refused: the frame was an error."""
+    """Previously, antenna positions were in the odometry frame, where one beyond 1 km was rejected: the frame was an
+    error."""
     near, far = (fixes_on_the_way({4: measured(3.25)}, start=start)[5] for start in (0.0, 5000.0))
     np.testing.assert_allclose(far.antenna, near.antenna, atol=1e-9)  # 1e-12 m is the last digit of 5 km
 
 
 def test_a_fix_without_a_known_way_is_left_out() -> None:
     assert fixes_on_the_way({2: measured(-0.5)}) == {}  # from before the drive
-    assert fixes_on_the_way({2: measured(2.5)}) == {}  # of the future
+    assert fixes_on_the_way({2: measured(2.5)}) == {}  # in the future
     assert fixes_on_the_way({2: measured(1.5)}, failed=3) == {}
     assert fixes_on_the_way({4: measured(1.5)}, failed=3) == {}

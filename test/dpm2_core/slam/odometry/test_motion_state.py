@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What registered frames say of the next one."""
+"""Prediction of the next frame from the registered frames."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ TWIST = np.array([0, 0, 0.2, 10, 0, 0])
 
 
 def registered(T: np.ndarray, sigma: float = 0.01, along: float = 0.01) -> Registration:
-    """At T, by a scene that shows x to `along` m."""
+    """Registration at T in a scene that constrains x to `along` m."""
     of_scene = np.diag([1e-3, 1e-3, 1e-3, along, sigma, sigma]) ** 2
     return Registration(T, of_scene, 1.0, 0.0, "points")
 
 
 def driven(frames: int, period: float = 0.1, along: float = 0.01) -> MotionState:
-    """After so many frames at a steady motion."""
+    """State after `frames` frames with a steady motion."""
     motion = MotionState(OdometrySettings())
     motion.register(registered(np.eye(4)), None, moved=False)
     for i in range(1, frames):
@@ -51,7 +51,8 @@ def test_frames_that_are_not_registered_follow_the_motion_ever_less_certain() ->
 
 
 def test_a_frame_that_is_not_registered_is_as_uncertain_as_the_motion_was_unsteady() -> None:
-    """A LiDAR that swings by 60 deg/s and back: after three frames its roll is up to 9 degrees off; 0.5 were stated."""
+    """A LiDAR swings by 60 deg/s and back. After three frames its roll is up to 9 degrees off; previously, 0.5 were
+    reported."""
     motion = MotionState(OdometrySettings())
     motion.register(registered(np.eye(4)), None, moved=False)
     T = np.eye(4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Along what scans leave open an IMU leads where it contradicts them, and only there."""
+"""In directions that scans leave open, an IMU leads where it contradicts the scans, and only there."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from ....helpers.drives import off, track
 
 KNOWN = 60
-"""Frames for which another odometry tells the way in the tunnel; from then on none."""
+"""Frames for which another odometry measures the motion in the tunnel; after them there is none."""
 AHEAD = np.diag([1.0, 0, 0])
 
 
 def reckoned(acceleration: float, seconds: float = 0.1) -> Reckoned:
-    """A step from which an acceleration ahead is known, m/s2."""
+    """A step with a known forward acceleration, m/s2."""
     gained = acceleration * np.array([[0.5 * seconds**2, 0, 0], [seconds, 0, 0]])
     return Reckoned(np.eye(4), np.eye(6), gained, 0.05)
 
 
 def driven(way: OpenWay, steps: Array, acceleration: float) -> Array:
-    """How far the IMU leads after each step of scans, m ahead in 0.1 s."""
+    """How far the IMU leads after each step of the scans; a step is m ahead in 0.1 s."""
     places, offs = np.r_[0.0, np.cumsum(steps)], []
     for before, now in pairwise(places):
         T_before, T = (se3.make(np.eye(3), np.array([x, 0, 0])) for x in (before, now))
@@ -43,7 +43,7 @@ def driven(way: OpenWay, steps: Array, acceleration: float) -> Array:
 
 
 def test_scans_that_agree_are_believed_and_show_the_speed() -> None:
-    """At 5 m/s, with 5 cm of noise; the speed that was known first is 0.2 m/s off."""
+    """5 m/s with 5 cm of noise; the initial speed is 0.2 m/s off."""
     way = OpenWay(np.eye(4), np.array([5.2, 0, 0]))
     driven(way, 0.5 + 0.05 * np.random.default_rng(1).standard_normal(60), 0.0)
     assert not way.leads
@@ -68,7 +68,7 @@ def test_braking_that_the_imu_feels_is_no_contradiction() -> None:
 
 @pytest.mark.parametrize("pull", [0.05, 0.15, 0.25, 0.4, 1.0, 3.0])
 def test_its_sigma_covers_scans_that_pull_to_one_side(pull: float) -> None:
-    """By so many m/s, for 5 s: unnoticed, or until it leads; and where they do not, it is no larger than that."""
+    """Scans pull by `pull` m/s for 5 s: unnoticed, or until the IMU leads. Sigma is not larger than its gains."""
     way, off, whole = OpenWay(np.eye(4), np.array([5.0, 0, 0])), 0.0, 0.0
     for n, lead in enumerate(driven(way, np.full(50, 0.5 - 0.1 * pull), 0.0)):
         off = abs(0.1 * pull * (n + 1) - lead)
@@ -82,8 +82,8 @@ def test_its_sigma_covers_scans_that_pull_to_one_side(pull: float) -> None:
 
 
 def left_open(speaks: list[bool]) -> float:
-    """Standard deviation, m, along what has been open since the second of these scans at 5 m/s, in the end; of which
-    an IMU knows the way or does not."""
+    """Final standard deviation, m, along a direction that has been open since the second of these scans at 5 m/s.
+    `speaks`: whether an IMU measures the motion of each further scan."""
     motion, sigma = MotionState(OdometrySettings()), np.array([0.01, 0.01, 0.01, 1.0, 0.01, 0.01])
     for n, known in enumerate([False, False, *speaks]):
         T = se3.make(np.eye(3), np.array([0.5 * n, 0, 0]))
@@ -94,7 +94,7 @@ def left_open(speaks: list[bool]) -> float:
 
 
 def test_an_imu_that_falls_silent_and_speaks_again_does_not_know_the_way_meanwhile() -> None:
-    """Nor the speed, which scans alone say by then: they may have been pulled back for seconds."""
+    """Nor does it know the speed, which then only the scans show: they may have been pulled back for seconds."""
     known, unknown = left_open([True] * 30), left_open([False] * 30)
     assert known < 0.2 * unknown
     again = left_open([True] * 10 + [False] * 10 + [True] * 10)
@@ -102,7 +102,7 @@ def test_an_imu_that_falls_silent_and_speaks_again_does_not_know_the_way_meanwhi
 
 
 def smooth(preset: PresetName, seed: int, count: int) -> tuple[list[Frame], Array]:
-    """A car without intensities, whose speed varies by up to 2 m/s2; and its true poses."""
+    """Frames without intensities of a car whose speed varies by up to 2 m/s2, and its true poses."""
     world = build_world("straight", preset, seed=seed, length=200.0)
     car = TurningRobot(world, count, Ride(10.0, slows=0.8), LidarConfig(beams=16, columns=512), ImuConfig())
     frames = [replace(frame, points=frame.points * np.array([1, 1, 1, 0], np.float32)) for frame in car.frames()]
@@ -119,7 +119,7 @@ def without_forces(frames: list[Frame]) -> list[Frame]:
 
 @pytest.mark.slow
 def test_it_leads_through_a_smooth_tunnel() -> None:
-    """The points fit best where the map is as dense as they are, which is where the car was."""
+    """The points fit best where the map is as dense as they are, which is at the previous position of the car."""
     frames, truth = smooth("tunnel", 7, KNOWN + 40)
     frames = [replace(frame, guess=Guess(T)) for frame, T in zip(frames[:KNOWN], truth[:KNOWN], strict=True)] + frames[
         KNOWN:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Another odometry leads where the scene is silent, is outweighed where it slips or jumps, and is missed by nobody."""
+"""Another odometry leads where the scene is uninformative and is outweighed where it slips or jumps. The drive
+continues without it."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def beside(drive: Drive, **wrong: float) -> list[Frame]:
 
 
 def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
-    """Where points do not: 2 % of slip is all that is left of the error, and the state says what it is."""
+    """Where the points do not: only the 2 % of slip remain of the error, and each result shows that it was used."""
     truth = tunnel_drive[1]
     alone, led = run(tunnel_drive[0]), run(beside(tunnel_drive, slip=0.02))
     way = np.linalg.norm(truth[-1, :3, 3])
@@ -44,9 +45,10 @@ def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
 
 
 def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
-    """As of a driver that goes on sending: where all is open the speed is soon unknown, and the halt was believed."""
+    """As of a driver that keeps sending. Where all directions are open, the speed is soon unknown, and previously the
+    halt was accepted."""
     other, twist = OtherMotion(steadiness=10.0), np.array([0, 0, 0, 8.0, 0, 0])
-    sent, sigmas = [0.0, 0.8, 0.8, 0.8, 1.6], [0.1, 0.1, 0.1, 1.0, 1.0]  # m; of the way by the motion before
+    sent, sigmas = [0.0, 0.8, 0.8, 0.8, 1.6], [0.1, 0.1, 0.1, 1.0, 1.0]  # m; sigma: of the previous motion
     led = []
     for x, sigma in zip(sent, sigmas, strict=True):
         other.look(Guess(se3.make(np.eye(3), [x, 0, 0])), twist, 0.1, sigma**2 * np.eye(6))
@@ -57,7 +59,8 @@ def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
 
 @pytest.mark.parametrize(("sent", "used"), [(0.0, False), (-0.05, False), (0.05, True)])
 def test_of_a_slow_robot_it_is_judged_over_a_longer_way(sent: float, used: bool) -> None:
-    """0.05 m per scan is what a step may be off: wheels that stand, or turn backwards, were believed for good."""
+    """A step may be 0.05 m off per scan. Previously, wheels that stand still or rotate backwards were therefore always
+    accepted."""
     other, step = OtherMotion(steadiness=10.0), se3.make(np.eye(3), [0.05, 0, 0])
     known = 0.01**2 * np.eye(6)
     for i in range(60):
@@ -69,7 +72,7 @@ def test_of_a_slow_robot_it_is_judged_over_a_longer_way(sent: float, used: bool)
 
 @pytest.mark.parametrize("jump", [0.5, 1000.0])
 def test_slip_and_jumps_are_outweighed_and_told(suburb_drive: Drive, jump: float) -> None:
-    """The error is that without another odometry; the jump, and no other frame, is said to be one."""
+    """The error is that without another odometry. The jump, and no other frame, is reported as one."""
     truth = suburb_drive[1]
     alone, led = run(suburb_drive[0]), run(beside(suburb_drive, slip=0.02, jump=jump))
     assert off(led, truth).max() < off(alone, truth).max() + 0.01
@@ -84,7 +87,7 @@ def test_slip_and_jumps_are_outweighed_and_told(suburb_drive: Drive, jump: float
 
 
 def test_one_that_turns_wheels_on_the_spot_is_doubted(suburb_drive: Drive) -> None:
-    """Half as long again, at every step: within what a vehicle can do, and wrong by 0.4 m a frame."""
+    """Each step is half as long again: within what a vehicle can do, and wrong by 0.4 m per frame."""
     truth = suburb_drive[1]
     led = run(beside(suburb_drive, slip=0.5))
     assert off(led, truth).max() < 0.05
@@ -102,7 +105,7 @@ def test_without_it_the_drive_goes_on(suburb_drive: Drive, present: Callable[[in
 
 
 def test_scans_that_fail_are_bridged_by_it(suburb_drive: Drive) -> None:
-    """The pose follows the wheels while no scan can be read, with the uncertainty that they have."""
+    """The pose follows the wheels while no scan can be read, with the uncertainty of the wheels."""
     truth = suburb_drive[1]
     frames = beside(suburb_drive)
     blind = [replace(f, points=f.points[:0], problem="unreadable") if 8 <= f.index < 13 else f for f in frames]
@@ -116,7 +119,8 @@ def test_scans_that_fail_are_bridged_by_it(suburb_drive: Drive) -> None:
 
 @pytest.mark.parametrize(("since", "jump"), [(8, 50.0), (10, 3.0), (10, 50.0)])
 def test_one_that_jumps_while_no_scan_can_be_read_is_not_followed(suburb_drive: Drive, since: int, jump: float) -> None:
-    """Ever less is known of the motion before, and a jump was soon possible: 10 m off at a stated 0.3 m."""
+    """Less and less is known of the previous motion, and a jump was soon plausible. Previously, the pose was 10 m off
+    at a stated 0.3 m."""
     frames, truth = suburb_drive
     back = se3.exp([0, 0, 0, -jump, 0, 0])
     guesses = [Guess(T if i < since else T @ back) for i, T in enumerate(truth)]
@@ -124,11 +128,11 @@ def test_one_that_jumps_while_no_scan_can_be_read_is_not_followed(suburb_drive: 
     led = run([replace(f, guess=guess) for f, guess in zip(blind, guesses, strict=True)])
     for result, T in list(zip(led, truth, strict=True))[8:]:
         error = se3.way(T, result.T_odom_lidar)
-        assert error @ np.linalg.solve(result.covariance, error) < 20  # of 6 degrees of freedom
+        assert error @ np.linalg.solve(result.covariance, error) < 20  # with 6 degrees of freedom
 
 
 def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> None:
-    """It states a covariance that grows by 9 m2 a frame: the motion before knows more."""
+    """It reports a covariance that grows by 9 m2 per frame: the previous motion is more certain."""
     frames = beside(suburb_drive)[:8]
     unsure = [
         replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * (f.index + 1) * np.eye(6))) for f in frames if f.guess
@@ -136,7 +140,7 @@ def test_one_that_says_it_does_not_know_is_not_followed(suburb_drive: Drive) -> 
     told = [t.comparison for t in run(unsure) if t.comparison][1:]
     assert [(c.used, c.unsure) for c in told] == [(False, True)] * 6
     constant = [replace(f, guess=Guess(f.guess.T_other_lidar, 9.0 * np.eye(6))) for f in frames if f.guess]
-    assert [t.comparison.used for t in run(constant) if t.comparison] == [True] * 7  # what does not grow says nothing
+    assert [t.comparison.used for t in run(constant) if t.comparison] == [True] * 7  # a constant one shows nothing
 
 
 @pytest.mark.parametrize(
@@ -149,7 +153,7 @@ def test_what_is_no_pose_is_refused(T: Array, covariance: Array | None) -> None:
 
 
 def test_from_rest_in_a_tunnel_it_leads() -> None:
-    """The map was made at a standstill, and 99 % of each scan fit there: it was 10 of 23 m off."""
+    """The map was made at standstill, and 99 % of each scan fit there. Previously, the pose was 10 of 23 m off."""
     world, lidar = build_world("straight", "tunnel", seed=11, length=200.0), Lidar(LidarConfig(beams=32, columns=240))
     rng, times = np.random.default_rng(0), 2 + np.cumsum(np.minimum(0.02 * np.maximum(np.arange(25) - 4, 0), 0.1))
     poses = np.array([world.drive_pose(time) for time in times])
@@ -163,7 +167,8 @@ def test_from_rest_in_a_tunnel_it_leads() -> None:
 
 @pytest.mark.parametrize("wrong", ["still", "backwards"])
 def test_one_that_is_wrong_from_the_start_does_not_lead(suburb_drive: Drive, wrong: str) -> None:
-    """An encoder without a cable, a sign the wrong way round: it held each scan where it led, and then its map did."""
+    """An encoder without a cable, or with a reversed sign. Previously, it held each scan at its prediction, and then
+    its map did."""
     frames, truth = suburb_drive
     guesses = [np.eye(4) if wrong == "still" else se3.inverse(T) for T in wheel_odometry(truth)]
     alone, led = run(frames), run([replace(f, guess=Guess(T)) for f, T in zip(frames, guesses, strict=True)])
@@ -178,7 +183,8 @@ def test_one_that_is_wrong_from_the_start_does_not_lead(suburb_drive: Drive, wro
 def test_a_cloud_that_is_sent_again_to_a_slow_robot_is_no_halt(
     suburb_drive: Drive, step: list[float], sensor: str
 ) -> None:
-    """At 1 m/s, or 10 deg/s on the spot, the scans alone may show a halt; wheels and an IMU say that it moves on."""
+    """At 1 m/s, or 10 deg/s on the spot, the scans alone may show a halt. Wheels and an IMU show that the robot
+    moves."""
     first, truth, frames = suburb_drive[0][0], [se3.exp(i * np.array(step)) for i in range(20)], []
     for i, T in enumerate(truth):
         seen, stamps = se3.inverse(truth[min(i, 8)]), (np.arange(-9, 1) + 10 * i) * 10**7
@@ -192,5 +198,5 @@ def test_a_cloud_that_is_sent_again_to_a_slow_robot_is_no_halt(
         assert "same cloud as before" in result.registration.reason
         assert result.state is not State.TRACKING
     meters, degrees = se3.apart(truth[-1], results[-1].T_odom_lidar)
-    assert meters < 0.35  # what it takes to be seen; 1.1 m or 11 deg if the robot were to stand
-    assert degrees < (3.5 if sensor == "wheels" else 6)  # until then the halt passes for a bias of the gyroscope
+    assert meters < 0.35  # the motion needed to detect it; 1.1 m or 11 deg if the robot were assumed to stand
+    assert degrees < (3.5 if sensor == "wheels" else 6)  # until then, the halt is taken for a gyroscope bias

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""With default settings a small room with 16 beams works, and a street is as if there were no rooms."""
+"""With default settings a small room with 16 beams works, and a street is processed as if there were no rooms."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def geometric(preset: str) -> SlamSettings:
 
 
 def away(preset: str, drive: list[Frame], poses: np.ndarray) -> tuple[np.ndarray, list[bool], str]:
-    """Distances (N,) m from the true places, which frames were registered, and the scale at the end."""
+    """Distances (N,) m from the true positions, which frames were registered, and the scale at the end."""
     odometry = make_odometry(geometric(preset))
     results = [odometry.process(frame) for frame in drive]
     T = np.stack([result.T_odom_lidar for result in results])
@@ -39,7 +39,7 @@ def away(preset: str, drive: list[Frame], poses: np.ndarray) -> tuple[np.ndarray
 
 @pytest.mark.slow
 def test_a_small_room_with_16_beams_works_unasked() -> None:
-    """5 x 4 m, furnished: every scan registered, to 3 cm; the settings for streets register none of them."""
+    """5 x 4 m, furnished: every scan is registered, to 3 cm. The settings for streets register none of them."""
     poses = walk(40)
     off, registered, scale = away("auto", frames(poses), poses)
     assert scale == "indoor"
@@ -62,7 +62,7 @@ def test_a_street_is_as_if_there_were_no_rooms() -> None:
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, -1.0), (-0.5, 0.0, 0.75**0.5)])
 def test_the_frame_is_level_by_how_the_lidar_is_mounted(up: tuple[float, float, float]) -> None:
-    """All poses are those of the LiDAR's own frame, turned once."""
+    """All poses are those in the LiDAR's own frame, rotated once."""
     poses = se3.exp(np.outer(np.arange(8), [0, 0, 0.01, 0.6, 0, 0])) @ se3.make(np.eye(3), [0, 0, 1.7])
     T_mount = se3.make(leveled((0, 0, 1), up), np.zeros(3))  # level axes in those of the LiDAR
     street = [replace(f, points=se3.transform(T_mount, f.points)) for f in frames(poses, street=True)]
@@ -71,14 +71,14 @@ def test_the_frame_is_level_by_how_the_lidar_is_mounted(up: tuple[float, float, 
         T_own = own.process(frame).T_odom_lidar
         T = level.process(replace(frame, up=up)).T_odom_lidar
         np.testing.assert_allclose(T[:3, :3] @ up, [0, 0, 1], atol=1e-9 if not count else 0.01)
-        # The voxels lie otherwise: as far off as the noise of 1 cm lets them.
+        # The voxels lie differently: the poses differ by what the noise of 1 cm allows.
         np.testing.assert_allclose(T, se3.make(leveled(up), np.zeros(3)) @ T_own, atol=0.02)
     level.reset()
     np.testing.assert_array_equal(level.process(street[0]).T_odom_lidar, np.eye(4))
 
 
 def test_a_start_that_may_be_of_either_is_decided_without_a_jump() -> None:
-    """A long hall; then half of the view is covered, and what is left is a room's."""
+    """A long hall. Then half of the view is covered, and the rest looks like a room."""
     hall = np.array([[-11.3, -3.8, 0], [11.3, 3.8, 4.3]])
     things = boxes((-6, -2.5), (6, 2.5), 4, np.array([1.0, 1.0, 2.0]))
     poses = se3.make(np.eye(3), [[-3 + 0.15 * i, 0, 1.2] for i in range(16)])
@@ -96,8 +96,8 @@ def test_a_start_that_may_be_of_either_is_decided_without_a_jump() -> None:
 
 @pytest.mark.slow
 def test_dust_in_a_corridor_does_not_hold_the_robot() -> None:
-    """What meets 3 in 10 pulses moves along, and fitted the map: 3.2 m off after 6.3 m, as `tracking`, once no end of
-    the corridor was within the 8 m that one sees."""
+    """Dust that hits 3 in 10 pulses moves with the robot and fitted the map. Previously, the pose was 3.2 m off after
+    6.3 m, as `tracking`, once no end of the corridor was within the visible 8 m."""
     hull, things = np.array([[-5, -2, 0], [40, 2, 2.6]]), boxes((-4, -1.9), (38, 1.6), 8, np.array([0.5, 0.3, 1.0]), 3)
     way = np.cumsum(np.minimum(np.arange(50) * 0.01, 0.15))
     odometry = make_odometry(geometric("auto"))
@@ -111,7 +111,7 @@ def test_dust_in_a_corridor_does_not_hold_the_robot() -> None:
 
 @pytest.mark.slow
 def test_a_robot_that_leaves_its_room_goes_on() -> None:
-    """After 20 scans of the street, without a jump of the pose; ids of keyframes count on."""
+    """The scale changes after 20 scans of the street, without a jump of the pose. Keyframe ids continue."""
     inside, outside = walk(15), np.tile(np.eye(4), (45, 1, 1))
     outside[:, 0, 3], outside[:, 2, 3] = 0.3 * np.arange(45), 0.6
     odometry = make_odometry(geometric("auto"))
@@ -135,7 +135,7 @@ def test_a_robot_that_leaves_its_room_goes_on() -> None:
 
 
 def test_a_glance_changes_nothing() -> None:
-    """A person before the LiDAR, a lorry beside it: rooms for a second and a half."""
+    """A person in front of the LiDAR, a truck next to it: it looks like a room for 1.5 s."""
     poses = np.tile(se3.make(np.eye(3), [0, 0, 1.7]), (6, 1, 1))
     odometry = make_odometry(geometric("auto"))
     for frame in frames(poses, street=True):
@@ -148,7 +148,7 @@ def test_a_glance_changes_nothing() -> None:
 
 
 def test_short_sight_on_a_street_is_no_room() -> None:
-    """10 m, as in fog or dust: all that is left is as near as in a room, but less than a room has."""
+    """10 m, as in fog or dust: all remaining points are as near as in a room, but fewer than in a room."""
     poses = np.tile(np.eye(4), (31, 1, 1))
     poses[:, 0, 3], poses[:, 2, 3] = 0.6 * np.arange(31), 1.7
     clear, odometry = frames(poses, street=True), make_odometry(geometric("auto"))
@@ -162,7 +162,8 @@ def test_short_sight_on_a_street_is_no_room() -> None:
 
 
 def test_a_second_lidar_of_half_the_rate_does_not_hide_a_room() -> None:
-    """Every second scan has 60 % of the points, fewer than rooms show: no four scans in a row were of a room."""
+    """Every second scan has 60 % of the points, fewer than in a room. Previously, no four scans in a row showed a
+    room."""
     poses = np.tile(standing(0, 0, 0), (56, 1, 1))
     poses[:, 0, 3] = 0.1 * np.arange(56) - 4.0
     odometry = make_odometry(geometric("auto"))
@@ -186,7 +187,7 @@ def test_frames_that_say_nothing_decide_nothing() -> None:
 def test_presets_are_under_what_is_set(preset: str) -> None:
     chosen = SlamSettings.model_validate({"preset": preset, "keyframes": {"distance": 2.5}})
     assert chosen.keyframes.distance == 2.5
-    assert SlamSettings.model_validate(chosen.model_dump()) == chosen  # what a run has written is read back as it was
+    assert SlamSettings.model_validate(chosen.model_dump()) == chosen  # a run's settings are read back unchanged
     usual = SlamSettings(preset="outdoor", keyframes=chosen.keyframes.model_copy(update={"distance": 2.5}))
     assert (chosen.preprocess == usual.preprocess) == (preset == "outdoor")
 
@@ -212,7 +213,7 @@ def test_what_is_allowed_on_streets_is_allowed_in_rooms(given: dict[str, float],
 
 
 def test_a_robot_that_begins_turning_on_the_spot_is_followed() -> None:
-    """By 30 degrees a frame from the first one on, and then slower."""
+    """By 30 degrees per frame from the first one on, and then slower."""
     yaws = np.radians(30.0 * np.array([0, 1, 2, 3, 4, 4.5]))
     poses = np.array([se3.make(np.eye(3), [0.3, 0.2, 0.6]) @ se3.exp([0, 0, yaw, 0, 0, 0]) for yaw in yaws])
     odometry = make_odometry(geometric("indoor"))

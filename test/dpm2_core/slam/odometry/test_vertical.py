@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of an IMU's forces is gravity, and how far the accelerations are off that are left."""
+"""Which part of an IMU's forces is gravity, and the errors of the remaining accelerations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GRAVITY = 9.81 * UP
 def driven(
     vertical: Vertical, seconds: float, forces: np.ndarray, acceleration: np.ndarray, speed: float = 0.0
 ) -> None:
-    """Steps of 0.1 s of which the scans show the velocities of an acceleration, from a speed ahead on."""
+    """Add steps of 0.1 s, in which the scans show the velocities of an acceleration that starts at a forward speed."""
     for i in range(round(10 * seconds)):
         vertical.add(forces, speed * np.array([1.0, 0, 0]) + 0.1 * i * acceleration, 0.1)
 
@@ -31,7 +31,7 @@ def test_after_a_start_at_rest_accelerations_are_what_gravity_leaves(unit: float
 @pytest.mark.parametrize("stood", [True, False])
 @pytest.mark.parametrize("unit", [1.0, 1 / 9.81], ids=["m/s2", "g"])
 def test_a_bump_is_no_other_unit(unit: float, stood: bool) -> None:
-    """Of one period the mean force may be 0.8 or 1.3 g, on a rough road: the unit is that of all before."""
+    """On a rough road, the mean force of one period may be 0.8 or 1.3 g. The unit is that of all samples before."""
     vertical = Vertical()
     if stood:
         vertical.start(unit * GRAVITY, UP)
@@ -67,7 +67,7 @@ def test_scans_that_confirm_them_make_them_surer_and_others_doubtful() -> None:
 
 @pytest.mark.parametrize(("speed", "force", "stood"), [(0.0, 0.0, True), (0.2, 4.0, True), (10.0, 0.0, False)])
 def test_a_start_on_the_way_that_seemed_at_rest_proves_little(speed: float, force: float, stood: bool) -> None:
-    """A bend that is taken at constant speed looks like a slope; a robot that sets off at once has stood."""
+    """A bend at constant speed looks like a slope. A robot that sets off at once has stood still."""
     vertical = Vertical()
     vertical.start(GRAVITY, UP)
     vertical.add(GRAVITY + np.array([force, 0, 0]), np.array([speed, 0, 0]), 0.1)
