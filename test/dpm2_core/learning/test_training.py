@@ -464,7 +464,8 @@ def test_it_overfits_four_pairs_to_two_centimeters(packed: Path) -> None:
     """The same 4 pairs, repeated, are registered to 2 cm within 160 steps: nothing in the chain blocks the gradient.
 
     With so small a network an unlucky initialization may leave one pair unmatched. Which initialization that is depends
-    on the order of sums (threads, processor): one of three must succeed. """
+    on the order of sums (threads, processor): one of three must succeed.
+    """
     assert any(_overfits(packed, seed) for seed in (1, 2, 0))
 
 

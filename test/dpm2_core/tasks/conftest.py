@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small drives: a street with and without a car as a small sensor sees it, and one in the layout of SemanticKITTI."""
+"""Small drives: a street with and without a car, as seen by a small sensor, and one in the layout of SemanticKITTI."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ...helpers.scenes import boxes
 MOTION = se3.exp([0, 0, 0.01, 0.6, 0.0, 0.0])
 BUILDING, CAR, ROAD, UNLABELLED = 50, 10, 40, 0
 SENSOR = RangeImageSettings(beams=((2.0, -14.0, 16),), first=0, rows=16, columns=64, scale=60.0)
-"""Small enough for tests; what `pairs` writes fits it."""
+"""Small enough for tests; the output of `write_pairs` matches it."""
 
 
 def street_image(along: float, car: bool) -> np.ndarray:
-    """(2, 16, 64) d and z, m: a road between walls with doors, seen `along` m down it; a car 8 m ahead drives along."""
+    """(2, 16, 64) d and z, m: a road between walls with doors, seen `along` m down it; a car stays 8 m ahead."""
     elevation = np.radians(np.linspace(2.0, -14.0, 16))[:, None]
     azimuth = (np.arange(64) + 0.5) * (2 * np.pi / 64)
     wall = np.minimum(6.0 / np.abs(np.sin(azimuth)), 50.0)
@@ -53,8 +53,8 @@ def pairs(tmp_path: Path) -> Path:
 def labelled_drive(folder: Path, numbers: Iterable[int] = range(6), points: int = 1500, seed: int = 0) -> Path:
     """A sequence folder; returns it.
 
-    Scans 0.6 m apart of a flat road and boxes: every 50th point unlabelled, the last 100 those of a car, which the twin
-    in static/ lacks. The number of an object is in the upper half of its labels.
+    Scans 0.6 m apart of a flat road and boxes: every 50th point is unlabelled; the last 100 are of a car, which the
+    twin in static/ lacks. The upper half of a label is the object's number.
     """
     noise = np.random.default_rng(seed)
     world = boxes(noise, points).astype(np.float64)
@@ -76,5 +76,5 @@ def labelled_drive(folder: Path, numbers: Iterable[int] = range(6), points: int 
 
 @pytest.fixture
 def write_drive() -> Callable[..., Path]:
-    """`labelled_drive`."""
+    """The function `labelled_drive`."""
     return labelled_drive

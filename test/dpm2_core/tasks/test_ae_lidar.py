@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AE_lidar: its size, the variational one by its definition, and both in small."""
+"""AE_lidar: its size, the variational one by its definition, and small trainings of both."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_size_is_that_of_the_paper() -> None:
 
 @pytest.mark.parametrize(("rows", "columns"), [(16, 64), (24, 128), (32, 512), (64, 64)])
 def test_other_sensors_fit(rows: int, columns: int) -> None:
-    """An odd and an even number of rows after three halvings."""
+    """This includes odd and even numbers of rows after three halvings."""
     image = RangeImageSettings(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
     assert LidarAutoencoder(network(image=image)).eval()(torch.rand(2, 2, rows, columns))[0].shape[2:] == (
         rows,
@@ -59,7 +59,7 @@ def test_rows_that_cannot_be_halved_are_rejected(rows: int) -> None:
 
 
 def test_divergence_of_the_vae_is_that_of_its_distributions() -> None:
-    """Against torch.distributions; codes are drawn in training, and the mean otherwise."""
+    """It equals that of torch.distributions; codes are sampled in training, and are the mean otherwise."""
     torch.manual_seed(0)
     net = LidarAutoencoder(network(variational=True)).eval()
     images = torch.rand(3, 2, 16, 64)
@@ -74,7 +74,7 @@ def test_divergence_of_the_vae_is_that_of_its_distributions() -> None:
 
 
 def test_divergence_counts_for_more_with_every_epoch(pairs: Path) -> None:
-    """The same scans and noise, one epoch against the last of the warm-up."""
+    """The same scans and noise, in one epoch compared with the last epoch of the warm-up."""
     task = AeLidarTask(training(network=network(variational=True), divergence_warmup=4)).train()
     scans = [open_scans(pairs)[i] for i in range(8)]
     values = []
@@ -84,13 +84,13 @@ def test_divergence_counts_for_more_with_every_epoch(pairs: Path) -> None:
         values.append(task.losses(scans)[0].item())
     assert values[0] < values[1]
     assert values[1] == pytest.approx(values[2])
-    assert values[1] - values[0] == pytest.approx(0.75 * 5.0, rel=0.05)  # an untrained one is below the least
+    assert values[1] - values[0] == pytest.approx(0.75 * 5.0, rel=0.05)  # an untrained one is below the minimum
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variational", [False, True])
 def test_learns_and_can_be_loaded(pairs: Path, tmp_path: Path, variational: bool) -> None:
-    """The loss falls to less than half with the SLAM loss on; figures, clouds and an image of what was written."""
+    """The loss falls to less than half with the SLAM loss on; the saved weights give figures, clouds and an image."""
     scans = open_scans(pairs)
     settings = training(network=network(variational=variational), slam=ScheduleSettings(gamma=1.0, every=5))
     task = train_task(new_task("ae_lidar", settings), scans, tmp_path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chamfer distance against brute force, in both of its forms."""
+"""Chamfer distance compared with brute force, in both of its forms."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ B = torch.rand(55, 3, generator=torch.Generator().manual_seed(1)) + 0.2
 
 
 def test_is_what_all_distances_give() -> None:
-    """All pairs by cdist, in double: equal to rounding of the float32 input."""
+    """All pairs by cdist, in double: equal to the rounding of the float32 input."""
     distance = torch.cdist(A.double(), B.double())
     forth, back = distance.min(1)[0], distance.min(0)[0]
     figures = chamfer_figures(A, B)
@@ -25,7 +25,7 @@ def test_is_what_all_distances_give() -> None:
 
 
 def test_is_symmetric_and_zero_for_the_same() -> None:
-    """Whichever comes first."""
+    """The order of the clouds does not matter."""
     assert chamfer_figures(A, B) == pytest.approx(chamfer_figures(B, A))
     assert chamfer_figures(A, A[torch.randperm(len(A))]) == {"chamfer_m": 0, "chamfer": 0}
 
@@ -38,7 +38,7 @@ def test_a_shift_of_well_separated_points_is_the_distance() -> None:
 
 
 def test_clouds_without_a_distance() -> None:
-    """An empty one has none; one that is not finite is an error."""
+    """An empty cloud has none; a cloud that is not finite is an error."""
     assert all(math.isnan(value) for value in chamfer_figures(torch.empty(0, 3), B).values())
     with pytest.raises(UsageError, match="points that are not finite"):
         chamfer_figures(A, torch.full((2, 3), torch.nan))

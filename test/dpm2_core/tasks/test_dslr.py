@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DSLR: sizes, what each stage trains and what it leaves alone, where the SLAM loss goes, and all of it in small."""
+"""DSLR: sizes, what each stage trains and does not change, the target of the SLAM loss, and a small training."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NETWORK = DslrSettings(image=SENSOR, channels=8, latent=16)
 
 
 def training(**changes: object) -> DslrTraining:
-    """Small, and fast."""
+    """Settings of a small, fast training."""
     small: dict[str, object] = {
         "network": NETWORK, "window": 4, "every": 1, "batch": 2, "optimiser": {"warmup": 5, "rate": 3e-3},
         "slam_loss": SlamLossSettings(points=300), "autoencoder_epochs": 1, "discriminator_epochs": 1, "epochs": 3,
@@ -50,7 +50,7 @@ def test_sizes_are_those_of_the_paper() -> None:
 
 @pytest.mark.parametrize(("rows", "columns"), [(16, 64), (24, 512), (41, 128), (42, 64), (4, 64)])
 def test_other_sensors_fit(rows: int, columns: int) -> None:
-    """Whatever the rows up to 42 and the columns in steps of 64; the values are in -1..1."""
+    """Any number of rows up to 42, and columns in multiples of 64; the values are in -1..1."""
     image = RangeImageSettings(beams=((2, -25, 64),), first=0, rows=rows, columns=columns)
     made = Dslr(DslrSettings(image=image, channels=4, latent=8)).eval()(torch.rand(2, 2, rows, columns))
     assert made.shape == (2, 2, rows, columns)
@@ -58,13 +58,13 @@ def test_other_sensors_fit(rows: int, columns: int) -> None:
 
 
 def test_too_many_rows_are_rejected() -> None:
-    """The decoder makes 42."""
+    """The decoder makes 42 rows."""
     with pytest.raises(UsageError, match="images of 64 rows; want at most 42"):
         Dslr(DslrSettings(image=RangeImageSettings(first=0, rows=64)))
 
 
 def gradients(task: DslrTask) -> set[str]:
-    """Networks that the loss of one step reaches."""
+    """Names of the networks that the loss of one step reaches."""
     return {
         name
         for name, part in task.network.named_children()
@@ -81,7 +81,7 @@ def gradients(task: DslrTask) -> set[str]:
     ],
 )
 def test_each_stage_trains_its_own_part(pairs: Path, epoch: int, reached: set[str]) -> None:
-    """Gradients, and in the third stage running means, of everything that is frozen stay as they were."""
+    """Frozen parts receive no gradients, and in the third stage their running means do not change."""
     torch.manual_seed(0)
     task = DslrTask(training())
     scans = open_scans(pairs)
@@ -93,11 +93,11 @@ def test_each_stage_trains_its_own_part(pairs: Path, epoch: int, reached: set[st
     assert gradients(task) == reached
     assert (slam is not None) == (epoch == 2)
     changed = {name for name, value in task.network.state_dict().items() if not torch.equal(value, before[name])}
-    assert {name.partition(".")[0] for name in changed} <= reached  # of batch normalization
+    assert {name.partition(".")[0] for name in changed} <= reached  # running means of batch normalization
 
 
 def test_third_stage_begins_with_the_static_encoder(pairs: Path) -> None:
-    """Its copy, once: an epoch later the dynamic encoder is its own."""
+    """It is copied once: an epoch later the dynamic encoder has its own weights."""
     task = DslrTask(training())
     nn.init.ones_(task.network.static_encoder.layers[0].weight)
     task.start_epoch(2)
@@ -110,7 +110,7 @@ def test_third_stage_begins_with_the_static_encoder(pairs: Path) -> None:
 def test_slam_loss_reaches_the_dynamic_encoder_and_is_zero_for_the_truth(
     pairs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By its gradient; and a translation that is right costs nothing."""
+    """Its gradient reaches it; a correct translation costs nothing."""
     torch.manual_seed(0)
     task = DslrTask(training())
     scans = open_scans(pairs)
@@ -131,9 +131,9 @@ def test_slam_loss_reaches_the_dynamic_encoder_and_is_zero_for_the_truth(
 
 @pytest.mark.long
 def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
-    """The loss falls to less than half; stopped in its third stage and resumed it writes the same weights.
+    """The loss falls to less than half; stopped in its third stage and resumed, it writes the same weights.
 
-    What it wrote can be loaded, measured and drawn, and translates a scan of points.
+    These can be loaded, measured and drawn, and translate a scan of points.
     """
     settings = training(
         autoencoder_epochs=13, discriminator_epochs=1, epochs=22, batch=1, slam=ScheduleSettings(gamma=1.0, every=10)
@@ -154,7 +154,7 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
         "chamfer_m", "chamfer", "moved_m", "input_chamfer_m", "input_chamfer", "input_moved_m", "varies_m",
         "target_varies_m",
     }  # fmt: skip
-    assert figures["moved_m"] < figures["input_moved_m"]  # the car is taken away
+    assert figures["moved_m"] < figures["input_moved_m"]  # the car is removed
     twins = torch.stack([RangeReader(SENSOR).read([scans[i]], static=True).images[0, 0] for i in range(len(scans))])
     assert figures["target_varies_m"] == pytest.approx(float(twins.std(0, correction=0).mean()) * 60.0, rel=1e-5)
     assert 0 < figures["varies_m"] < 2 * figures["target_varies_m"]
@@ -165,11 +165,12 @@ def test_learns_and_survives_being_stopped(pairs: Path, tmp_path: Path) -> None:
     assert points.shape[1] == 3
     assert bool(points.isfinite().all())
     with torch.no_grad():
-        torch.testing.assert_close(points, task.clouds(scans[3])["output"], atol=0.5, rtol=0)  # projected anew
+        torch.testing.assert_close(points, task.clouds(scans[3])["output"], atol=0.5, rtol=0)  # projected again
 
 
 def test_still_points_are_those_that_the_static_scan_has_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wall at 20 m is predicted: it stays, a car at 8 m before it does not; what is outside the image stays too."""
+    """A wall at 20 m is predicted: it is kept, a car at 8 m in front of it is not; points outside the image are
+    kept."""
     network = Dslr(NETWORK)
     static = torch.full((1, 2, 16, 64), 20.0 / SENSOR.scale)
     monkeypatch.setattr(network, "forward", lambda images: static)
@@ -178,7 +179,7 @@ def test_still_points_are_those_that_the_static_scan_has_too(monkeypatch: pytest
 
 
 def test_a_scan_without_points_in_the_image_is_none_and_spoils_nothing() -> None:
-    """Beside a truck nothing may be left: the losses stay finite, and figures are means over the others."""
+    """Next to a truck nothing may be left: the losses stay finite, and figures are means over the other scans."""
     generator = torch.Generator().manual_seed(0)
     full = torch.rand(4000, 4, generator=generator) * torch.tensor([40.0, 40, 3, 1]) - torch.tensor([20.0, 20, 3, 0])
     near = torch.rand(100, 4, generator=generator)
@@ -197,7 +198,7 @@ def test_a_scan_without_points_in_the_image_is_none_and_spoils_nothing() -> None
 
 
 def test_the_authors_weights(pairs: Path) -> None:
-    """Stage 1 on both kinds of scans; in stage 3 the cross entropy counts for 10 over the scans of a step."""
+    """Stage 1 uses both kinds of scans; in stage 3 the cross entropy has weight 10, over the scans of a step."""
     scans = open_scans(pairs)
     window = [scans[i] for i in range(4)]
     losses = {}

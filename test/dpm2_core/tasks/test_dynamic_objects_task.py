@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dynamic objects' task: it learns cars from walls, its figures are counts, and what does not fit is
-rejected."""
+"""The dynamic objects' task: it learns cars and walls, its figures are counts, and invalid input is rejected."""
 
 from __future__ import annotations
 
@@ -33,7 +32,8 @@ SMALL = DynamicObjectTraining(
 
 
 class Drive:
-    """6 scans of a plane with boxes as low as cars, 10 or (moving) 252, and as high as houses, 50, at random places."""
+    """6 scans of a plane with boxes as low as cars (10, or 252 if moving) or as high as houses (50), at random
+    positions."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -61,9 +61,9 @@ class Drive:
 
 @pytest.mark.long
 def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
-    """From an IoU of chance to over 0.7, on scans that it has not seen; saved and loaded it says the same."""
+    """From an IoU of chance to over 0.7, on unseen scans; after saving and loading it predicts the same."""
     train, val = TaskScans([Drive(seed) for seed in range(4)]), TaskScans([Drive(99)])
-    torch.manual_seed(0)  # chance, but in any order of the tests the same
+    torch.manual_seed(0)  # random, but the same for any order of the tests
     untrained = DynamicObjectTask(SMALL).eval()
     with torch.no_grad():
         before = untrained.evaluate(val)
@@ -80,7 +80,7 @@ def test_it_learns_what_can_move_parked_or_not(tmp_path: Path) -> None:
 
 
 def test_figures_are_counts_of_points() -> None:
-    """Everything found: precision is the fraction of what can move, unlabelled points apart; nothing can move: NaN."""
+    """If all is found, precision is the fraction of movable points among labelled ones; with none movable, NaN."""
     task, scan = DynamicObjectTask(SMALL).eval(), Drive(1)[0]
     assert scan.labels is not None
     with torch.no_grad():
@@ -103,7 +103,7 @@ def test_scans_without_classes_are_an_error_of_use() -> None:
 
 
 def test_dynamic_objects_of_one_scan_are_put_into_another() -> None:
-    """A network that takes everything for dynamic: the more of it there is, the lower its loss."""
+    """With a network that predicts everything as dynamic, the loss falls with the number of dynamic objects."""
     cars = Drive(3)[0]
     assert cars.labels is not None
     empty = TaskScan(cars.points, torch.full_like(cars.labels, 50), None, "drive", 1)
@@ -119,7 +119,7 @@ def test_dynamic_objects_of_one_scan_are_put_into_another() -> None:
 
 
 def test_a_training_ends_with_the_statistics_of_whole_scans() -> None:
-    """Whatever they were before; what was learned stays, and the same scans give the same answer."""
+    """Earlier statistics do not matter; what was learned is kept, and the same scans give the same result."""
     scans = TaskScans([Drive(5)])
     torch.manual_seed(0)
     task = DynamicObjectTask(SMALL).eval()
@@ -140,7 +140,7 @@ def test_a_training_ends_with_the_statistics_of_whole_scans() -> None:
 
 
 def test_the_average_of_the_weights_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
-    """The same training ends elsewhere, but nearer to its last weights than to its first."""
+    """The same training ends with other weights, but closer to its last weights than to its first."""
     scans = TaskScans([Drive(5)])
 
     def settings(average: float) -> DynamicObjectTraining:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GndNet as a task: its SLAM loss says what the paper means it to say, and its figures are those of the labels."""
+"""GndNet as a task: its SLAM loss behaves as the paper intends, and its figures are those of the labels."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SHIPPED = Path(__file__).resolve().parents[3] / "dpm2_core" / "weights" / "gndne
 
 
 class Known(nn.Module):
-    """In place of the network: an elevation that is the truth, raised by `offset`, m."""
+    """Replaces the network: the true elevation, raised by `offset`, m."""
 
     def __init__(self, scans: list[TaskScan], offset: Tensor) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ def scans(write_drive: Callable[..., Path], tmp_path: Path) -> TaskScans:
 
 
 def with_elevation(scans: TaskScans, offset: float) -> tuple[GroundTask, list[TaskScan], Any]:
-    """A task that finds the true elevation, raised; the window; its parameter."""
+    """A task that finds the true elevation plus an offset; the window; its parameter."""
     window = [scans[i] for i in range(3)]
     task = GroundTask(SETTINGS)
     known = Known(window, torch.tensor(offset))
@@ -59,7 +59,7 @@ def with_elevation(scans: TaskScans, offset: float) -> tuple[GroundTask, list[Ta
 
 
 def test_the_true_elevation_costs_nothing(scans: TaskScans) -> None:
-    """Neither the task, but for its curvature, nor the SLAM; and no gradient."""
+    """Neither the task, except for its curvature, nor the SLAM has a loss; and there is no gradient."""
     task, window, offset = with_elevation(scans, 0.0)
     loss, slam = task.losses(window)
     assert float(loss.detach()) < 0.01
@@ -70,7 +70,7 @@ def test_the_true_elevation_costs_nothing(scans: TaskScans) -> None:
 
 
 def test_the_slam_loss_sees_a_wrong_elevation(scans: TaskScans) -> None:
-    """A ground 0.3 m too low turns the road into obstacles, and the trajectory is another one; with a finite slope."""
+    """A ground 0.3 m too low turns the road into obstacles, which changes the trajectory; the gradient is finite."""
     task, window, offset = with_elevation(scans, -0.3)
     value = task.losses(window)[1]()
     value.backward()
@@ -80,7 +80,7 @@ def test_the_slam_loss_sees_a_wrong_elevation(scans: TaskScans) -> None:
 
 
 def test_figures_of_the_true_elevation(scans: TaskScans) -> None:
-    """No error of the height; what is not labelled ground is found, what is labelled ground is not."""
+    """The height has no error; points that are not labelled as ground are found, points labelled as ground are not."""
     task, _, _ = with_elevation(scans, 0.0)
 
     def of_its_own(clouds: list[Tensor]) -> Tensor:
@@ -90,7 +90,7 @@ def test_figures_of_the_true_elevation(scans: TaskScans) -> None:
     found = measure(task, scans)
     assert found["mse"] < 1e-4 + 2e-4  # the noise of 1 cm, of cells with few points
     assert found["precision"] > 0.99
-    high = []  # half of the boxes is below the road, and cannot be found
+    high = []  # half of the boxes is below the road and cannot be found
     for scan in (scans[i] for i in range(3)):
         ground, counted = ground_of(scan)
         inside = scan.points[:, :2].abs().amax(1) < 48
@@ -99,7 +99,7 @@ def test_figures_of_the_true_elevation(scans: TaskScans) -> None:
 
 
 def test_gaps_count_as_much_as_they_are_told_to(scans: TaskScans) -> None:
-    """An elevation that is wrong where no ground was seen costs nothing, unless the gaps count."""
+    """An elevation that is wrong where no ground was seen costs nothing, unless the gaps have a weight."""
     task, window, _ = with_elevation(scans, 0.0)
     plain = float(task.losses(window)[0].detach())
     known = torch.stack([elevation_labels(s.points, ground_of(s)[0], SETTINGS.network)[1] for s in window])
@@ -107,7 +107,7 @@ def test_gaps_count_as_much_as_they_are_told_to(scans: TaskScans) -> None:
     task.net.truth = task.net.truth + 2.0 * ~known  # type: ignore[operator]
     costs = []
     for gaps in (0.0, 0.1, 1.0):
-        # Without the curvature, which sees the steps at the borders of the gaps.
+        # Without the curvature, which responds to the steps at the borders of the gaps.
         network = SETTINGS.network.model_copy(update={"smoothness": 0.0})
         task.settings = SETTINGS.model_copy(update={"gaps": gaps, "network": network})
         costs.append(float(task.losses(window)[0].detach()))
@@ -118,7 +118,7 @@ def test_gaps_count_as_much_as_they_are_told_to(scans: TaskScans) -> None:
 
 
 def test_tilt_is_a_rotation_of_the_whole_window(scans: TaskScans) -> None:
-    """By roll and pitch within the bound; the labels turn along, and it is another one each time."""
+    """It has roll and pitch within the bound; the labels are rotated as well, and it differs each time."""
     torch.manual_seed(0)
     turns = [random_tilt(0.1) for _ in range(20)]
     for turn in turns:
@@ -137,7 +137,7 @@ def test_tilt_is_a_rotation_of_the_whole_window(scans: TaskScans) -> None:
 
 
 def test_gaps_take_the_nearest_cell_that_is_known() -> None:
-    """And stay zero where none is."""
+    """They stay zero if no cell is known."""
     elevation, known = torch.zeros(6, 6), torch.zeros(6, 6, dtype=torch.bool)
     assert torch.equal(filled(elevation, known), elevation)
     known[0, 0] = known[5, 5] = True
@@ -148,7 +148,7 @@ def test_gaps_take_the_nearest_cell_that_is_known() -> None:
 
 
 def test_a_scan_without_obstacles_or_without_classes_counts_in_no_figure_of_them(scans: TaskScans) -> None:
-    """The ground is known exactly: each figure is that of the scans that have it, and not lower for an empty road."""
+    """The ground is known exactly: each figure is over the scans that have it, and is not lower for an empty road."""
     task, window, _ = with_elevation(scans, 0.0)
     usual = measure(task, TaskScans([window[:1]]))
     assert usual["recall"] > 0
@@ -166,8 +166,8 @@ def test_a_scan_without_obstacles_or_without_classes_counts_in_no_figure_of_them
 @pytest.mark.slow
 @pytest.mark.weights
 def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:
-    """The file is small, loads strictly, finds the ground of another world to 30 cm (RMS, out to 50 m), and most of
-    what stands on it."""
+    """The file is small, loads strictly, finds the ground of another world to 30 cm (RMS, out to 50 m), and most of the
+    obstacles on it."""
     assert SHIPPED.stat().st_size < 5e6
     assert load(SHIPPED).settings.cells == 100
     drives = {"train": 1, "train_frames": 2, "val": 1, "val_frames": 2, "first_seed": 31_000, "presets": ["suburb"]}
@@ -178,8 +178,8 @@ def test_the_shipped_weights_know_an_unseen_suburb(tmp_path: Path) -> None:
 
 
 def test_a_scan_without_labels_teaches_by_its_slam_alone(scans: TaskScans, tmp_path: Path) -> None:
-    """Its own loss is the curvature; the reference sees all its points, so that a ground that hides them costs. Without
-    a SLAM loss there is nothing to learn from it; a labelled scan's loss is as it was."""
+    """Its own loss is the curvature; the reference uses all its points, so that a ground that hides them is penalized.
+    Without a SLAM loss it gives nothing to learn; the loss of a labelled scan is unchanged."""
     task, window, offset = with_elevation(scans, 0.0)
     labelled, _ = task.losses(window)
     bare = [replace(scan, labels=None) for scan in window]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CARLA-64 and ARD-16 in small: the names and shapes that DSLR's arrays have, and what is wrong with others."""
+"""Small versions of CARLA-64 and ARD-16: the names and shapes of DSLR's arrays, and errors of other arrays."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def carla64(folder: Path, prefix: str = "") -> None:
 
 @pytest.mark.parametrize("prefix", ["", "test"])
 def test_carla64_is_read_as_pairs_of_range_images(tmp_path: Path, prefix: str) -> None:
-    """A sequence an array; the points are those of the image, and the tasks get the rows and columns they ask for."""
+    """An array is a sequence; points are those of the image, and tasks receive the rows and columns that they
+    request."""
     carla64(tmp_path, prefix)
     scans = open_scans(tmp_path, needs=["static"])
     assert scans.lengths == [3, 2]
@@ -62,7 +63,7 @@ def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
     scan = open_scans(tmp_path)[1]
     assert isinstance(scan, ImageScan)
     low, high = np.percentile(xyz[..., :3].reshape(-1, 3), [1, 99], axis=0)
-    usual = ((xyz[1][..., :3] >= low) & (xyz[1][..., :3] <= high)).all(-1)  # as the authors take outliers out
+    usual = ((xyz[1][..., :3] >= low) & (xyz[1][..., :3] <= high)).all(-1)  # the authors remove outliers in this way
     usual[3, 100:110] = False
     assert 0.92 < usual.mean() < 0.97
     np.testing.assert_array_equal(scan.mask.numpy(), usual)
@@ -70,11 +71,11 @@ def test_ard16_as_points_in_slots(tmp_path: Path) -> None:
     assert (scan.image[0] > 0).all()
     settings = RangeImageSettings(beams=((15.0, -15.0, 16),), first=0, rows=16, columns=512, scale=60.0)
     read = RangeReader(settings).read([scan])
-    near = scan.mask.numpy() & (d[1] < 60)  # what lies beyond the scale counts as empty, and is filled
+    near = scan.mask.numpy() & (d[1] < 60)  # points beyond the scale count as empty, and are filled
     np.testing.assert_array_equal(read.masks[0].numpy(), near)
     assert 0 < float(read.images[0, 0].min()) <= float(read.images[0, 0].max()) < 1
     np.testing.assert_allclose(read.images[0, 0].numpy()[near] * 60.0, d[1][near], rtol=1e-5)
-    result = read.clouds()[0]  # the columns' own azimuths: the points are where they were
+    result = read.clouds()[0]  # with the columns' own azimuths, the points do not move
     np.testing.assert_allclose(result.numpy(), xyz[1][near][:, :3], atol=1e-3)
 
 
@@ -92,7 +93,7 @@ def in_slots(scans: int = 2, columns: int = 512) -> np.ndarray:
 def test_points_in_slots_stay_where_they_are_in_whatever_order_the_columns_come(
     tmp_path: Path, start: int, mirrored: bool
 ) -> None:
-    """Of arrays that begin elsewhere, or turn to the right, the points were turned or mirrored."""
+    """Points of arrays that begin at another azimuth, or go to the right, were rotated or mirrored."""
     plain = in_slots()
     other = np.roll(plain[:, :, ::-1] if mirrored else plain, start, axis=2)
     for name, xyz in (("plain", plain), ("other", other)):
@@ -108,7 +109,7 @@ def test_points_in_slots_stay_where_they_are_in_whatever_order_the_columns_come(
 
 
 def test_columns_that_do_not_go_around_evenly_are_named(tmp_path: Path) -> None:
-    """Shuffled, or of a sector: no shift puts the points where they are. Without any point there is nothing to say."""
+    """Shuffled, or from a sector: no shift matches the points to the columns. Without any points there is no error."""
     plain = in_slots()
     shuffled = plain[:, :, np.random.default_rng(0).permutation(512)]
     for xyz in (shuffled, plain[:, :, :100]):
@@ -122,7 +123,7 @@ def test_columns_that_do_not_go_around_evenly_are_named(tmp_path: Path) -> None:
 
 
 def test_pairs_by_number_and_their_poses(tmp_path: Path) -> None:
-    """Those that are named, whatever the zeros before them; poses beside them, one a scan or an error."""
+    """Numbers select pairs, with or without leading zeros; poses next to them have one per scan, or are an error."""
     carla64(tmp_path)
     assert open_scans(tmp_path, sequences=["08"]).lengths == [2]
     with pytest.raises(UsageError, match="no sequence 3; there are 0, 8"):
@@ -138,7 +139,7 @@ def test_pairs_by_number_and_their_poses(tmp_path: Path) -> None:
 
 
 def test_damage_is_named(tmp_path: Path) -> None:
-    """A missing twin, twins of different shapes, a pickle, another shape, NaN, and rows that are not there."""
+    """A missing twin, twins of different shapes, a pickle, another shape, NaN, and rows that do not exist."""
     carla64(tmp_path / "a")
     (tmp_path / "a" / "s8.npy").unlink()
     with pytest.raises(UsageError, match=r"d8.npy: no static twin"):

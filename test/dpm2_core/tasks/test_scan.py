@@ -20,7 +20,7 @@ SEMANTIC = Path(__file__).resolve().parents[3].parent / "shared" / "kitti" / "se
 
 
 def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """Points, classes without the number of the object, the twin, and which scan it is."""
+    """Points, classes without the number of the object, the twin, and the scan's sequence and number."""
     write_drive(tmp_path / "sequences" / "08", range(3, 6))
     scans = open_scans(tmp_path, ("labels", "static"))
     assert len(scans) == 3
@@ -37,7 +37,7 @@ def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_pat
 
 
 def test_points_that_are_none_are_left_out_with_their_classes(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """And an intensity that is not known is 0: GndNet learned nothing from such scans, or stopped in the middle."""
+    """An unknown intensity becomes 0: GndNet learned nothing from such scans, or its training stopped."""
     folder = write_drive(tmp_path / "00", range(2))
     path = folder / "velodyne" / "000000.bin"
     raw = np.fromfile(path, "<f4").reshape(-1, 4)
@@ -57,7 +57,7 @@ def test_points_that_are_none_are_left_out_with_their_classes(write_drive: Calla
 
 
 def test_folders_of_every_depth_and_gaps(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """A sequence, a data set, a folder of data sets; a missing number ends a window's sequence."""
+    """A sequence, a data set, a folder of data sets; a missing number starts a new sequence for windows."""
     one = write_drive(tmp_path / "a" / "sequences" / "00", [0, 1, 2, 5, 6])
     write_drive(tmp_path / "b" / "sequences" / "00", range(4))
     write_drive(tmp_path / "b" / "sequences" / "01", range(2))
@@ -71,7 +71,7 @@ def test_folders_of_every_depth_and_gaps(write_drive: Callable[..., Path], tmp_p
 
 
 def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """They are None, which a task that needs them says before it begins."""
+    """They are None; a task that needs them reports it before it begins."""
     folder = write_drive(tmp_path / "00")
     for kind in ("labels", "static"):
         for path in (folder / kind).iterdir():
@@ -104,7 +104,8 @@ def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Pat
 def test_damaged_files_are_named_at_once(
     write_drive: Callable[..., Path], tmp_path: Path, kind: str, name: str, keep: int | None, message: str
 ) -> None:
-    """A label file of the wrong length, a scan cut off, a missing twin: file and reason, when the folder is opened."""
+    """A label file of the wrong length, a truncated scan, a missing twin: file and reason, when the folder is
+    opened."""
     folder = write_drive(tmp_path / "00")
     path = folder / kind / name
     data = path.read_bytes()
@@ -117,7 +118,7 @@ def test_damaged_files_are_named_at_once(
 
 
 def test_a_name_is_that_of_the_outermost_folders_that_have_it(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """Each drive of `dpm2 train tasks-data` is a data set of its own with a sequence 00: that name took all of them."""
+    """Each drive of `dpm2 train tasks-data` is a data set with a sequence 00: that name selected all of them."""
     for drive in ("00", "01"):
         write_drive(tmp_path / drive / "sequences" / "00")
     assert open_scans(tmp_path, sequences=["00"]).lengths == open_scans(tmp_path / "00").lengths
@@ -126,7 +127,7 @@ def test_a_name_is_that_of_the_outermost_folders_that_have_it(write_drive: Calla
 
 
 def test_no_scans(tmp_path: Path) -> None:
-    """An empty folder, a folder that is not there, velodyne/ without scans."""
+    """An empty folder, a folder that does not exist, velodyne/ without scans."""
     with pytest.raises(UsageError, match="no such folder"):
         open_scans(tmp_path / "nowhere")
     with pytest.raises(UsageError, match="no scans; want sequences"):
@@ -138,7 +139,7 @@ def test_no_scans(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_synthetic_drives(tmp_path: Path) -> None:
-    """Train and validation apart, of exact labels and twins; a second call changes nothing."""
+    """Train and validation are separate, with exact labels and twins; a second call changes nothing."""
     settings = TaskDriveSettings.model_validate(
         {"train": 2, "train_frames": 2, "val": 1, "val_frames": 2, "lidar": {"columns": 64, "beams": 16}}
     )
@@ -158,7 +159,7 @@ def test_synthetic_drives(tmp_path: Path) -> None:
 
 
 def test_two_real_scans(tmp_path: Path) -> None:
-    """Of SemanticKITTI, in its layout: the road under the car is labelled ground, 1.7 m below the sensor."""
+    """Two scans of SemanticKITTI, in its layout: the road under the car is labelled ground, 1.7 m below the sensor."""
     if not SEMANTIC.is_dir():
         pytest.skip("the two labelled scans are not beside this repository")
     for kind, ending in (("velodyne", "bin"), ("labels", "label")):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry on the clouds that a task makes, evaluated by the true poses of a small synthetic drive."""
+"""Odometry on the clouds that a task makes, evaluated with the ground truth of a small synthetic drive."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def task() -> AeLidarTask:
-    """Untrained."""
+    """An untrained task."""
     torch.manual_seed(0)
     image = RangeImageSettings(scale=50, columns=128)
     return AeLidarTask(AeLidarTraining(network=AeLidarSettings(image=image, channels=4, latent=8))).eval()
 
 
 def test_a_folder_above_sequences_chooses_them(drives: Path) -> None:
-    """What is learned from and what is tested on may be two folders of drives whose sequences are all called 00."""
+    """Training and test data may be two folders of drives whose sequences are all called 00."""
     assert len(open_scans(drives)) == 2 * len(open_scans(drives, sequences=["1"])) == 8
     assert [names_of(folder, drives) for folder in folders_of(drives, ["00"])] == [["0", "00"], ["1", "00"]]
     with pytest.raises(UsageError, match="no sequence 2; there are 0, 00, 1"):
@@ -53,9 +53,9 @@ def test_a_folder_above_sequences_chooses_them(drives: Path) -> None:
 def test_a_perfect_network_is_as_good_as_its_input(
     drives: Path, task: AeLidarTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Identity in place of the network: equal figures, and those of a drive of 3 m: under 0.1 m; untrained: worse.
+    """Identity replaces the network: equal figures, under 0.1 m as for a drive of 3 m; untrained, they are worse.
 
-    128 columns put a point of a wall 20 m away up to 0.5 m from where it was, so centimeters are all there is.
+    128 columns move a point of a wall 20 m away by up to 0.5 m, so the accuracy is in centimeters.
     """
     untrained = slam_figures(task, drives / "0")
     monkeypatch.setattr(task.network, "forward", lambda images: (images, images.new_zeros(len(images))))
@@ -71,9 +71,10 @@ def test_a_perfect_network_is_as_good_as_its_input(
 
 @pytest.mark.slow
 def test_missing_scans_are_a_pause_and_no_step(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
-    """Numbers 0 to 3 and 20 to 23: the clouds come at their times, and the step across is none of the RPE.
+    """Numbers 0 to 3 and 20 to 23: the clouds have their stamps, and the step across the gap does not count for the
+    RPE.
 
-    Both parts are the same scans at the same places: a pose that stands still errs in each step as in the one part.
+    Both parts are the same scans at the same poses: an odometry that stands still has the same error in each step.
     """
     copied = tmp_path / "00"
     shutil.copytree(drives / "0" / "sequences" / "00", copied)
@@ -92,7 +93,7 @@ def test_missing_scans_are_a_pause_and_no_step(drives: Path, task: AeLidarTask, 
 
 @pytest.mark.slow
 def test_what_cannot_be_checked_is_rejected(drives: Path, task: AeLidarTask, tmp_path: Path) -> None:
-    """No poses, a task that makes no clouds."""
+    """Without poses, or with a task that makes no clouds."""
     copied = tmp_path / "00"
     shutil.copytree(drives / "0" / "sequences" / "00", copied)
     (copied / "poses.txt").unlink()

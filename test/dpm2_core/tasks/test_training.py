@@ -36,7 +36,7 @@ TINY = {"cells": 32, "cell": 2.0, "channels": 4}
 
 
 def settings(**changes: Any) -> GroundTraining:
-    """Two windows of three scans an epoch, a small network, the SLAM loss in every second epoch."""
+    """Two windows of three scans per epoch, a small network, the SLAM loss in every second epoch."""
     tree = {
         "network": TINY, "epochs": 4, "window": 3, "every": 1, "optimiser": {"warmup": 2, "rate": 3e-3}, "tilt": 2.0,
         "slam": {"gamma": 0.5, "every": 2, "most": None}, "slam_loss": {"points": 300},
@@ -52,7 +52,7 @@ def scans(write_drive: Callable[..., Path], tmp_path: Path) -> TaskScans:
 
 @pytest.mark.slow
 def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
-    """The loss of the task falls by half in 40 steps; both losses are logged, that of the SLAM where it counts."""
+    """The task loss falls by half in 40 steps; both losses are logged, the SLAM loss in the epochs that use it."""
     out = tmp_path / "out"
     train_task(new_task("gndnet", settings(epochs=20)), scans, out, val=scans)
     log = read_log(out)
@@ -71,8 +71,8 @@ def test_it_learns_and_logs(scans: TaskScans, tmp_path: Path) -> None:
 def test_scans_are_contiguous_only_where_the_slam_loss_counts(
     scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Elsewhere a step has scans of all places, all different ones within an epoch, in another order in each; and the
-    weight of the SLAM loss, zero included, changes nothing about which scans a training sees."""
+    """In other epochs, a step has scans of all places. Within an epoch each scan occurs once, in an order that differs
+    between epochs. The weight of the SLAM loss, even zero, does not change which scans a training uses."""
     original = GroundTask.losses
     seen: list[list[int]] = []
 
@@ -124,7 +124,7 @@ def test_gamma_zero_is_the_task_alone(scans: TaskScans, tmp_path: Path, monkeypa
 def test_what_is_not_finite_never_reaches_a_checkpoint(
     scans: TaskScans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    """A step whose loss or gradient is NaN is skipped, its running means included; the others go on learning."""
+    """A step whose loss or gradient is NaN is skipped, including its running means; the other steps still learn."""
     original = GroundTask.losses
     calls = []
 
@@ -133,12 +133,12 @@ def test_what_is_not_finite_never_reaches_a_checkpoint(
         if len(calls) != 4:  # the second step of an epoch with the SLAM loss
             return original(self, window)
         if where == "task":
-            with torch.no_grad():  # what a damaged scan would do to the running means
+            with torch.no_grad():  # as a damaged scan would do to the running means
                 next(b for b in self.buffers() if b.is_floating_point()).fill_(math.nan)
         loss, slam = original(self, window)
         if where == "slam":
             return loss, lambda: slam() * math.nan
-        if where == "gradient":  # finite itself: the slope of a root at zero is not
+        if where == "gradient":  # finite itself, but the gradient of a root at zero is not
             return loss + (loss - loss.detach()).abs().sqrt(), slam
         return loss * math.nan, slam
 
@@ -154,7 +154,7 @@ def test_what_is_not_finite_never_reaches_a_checkpoint(
 
 
 def test_measuring_changes_nothing(scans: TaskScans) -> None:
-    """Running means and mode stay; figures are those of the scans."""
+    """Running means and mode do not change; figures are those of the scans."""
     torch.manual_seed(0)
     task = GroundTask(settings()).train()
     before = {name: value.clone() for name, value in task.state_dict().items()}
@@ -167,7 +167,7 @@ def test_measuring_changes_nothing(scans: TaskScans) -> None:
 
 @pytest.mark.slow
 def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
-    """With the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
+    """They include the settings of the network, for the task and for the SLAM; in fp16 to its precision."""
     task = train_task(new_task("gndnet", settings()), scans, tmp_path / "out")
     requested = measure(task, scans)
     assert measure(load_task("gndnet", tmp_path / "out" / WEIGHTS), scans) == requested
@@ -196,7 +196,7 @@ def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_weights_are_rejected(tmp_path: Path, name: str, load: Callable[[Path], nn.Module], tensor: str) -> None:
-    """No file, a pickle, another task's, no settings, wrong ones, other shapes, NaN: each says so."""
+    """No file, a pickle, another task's, no settings, wrong ones, other shapes, NaN: each error names its cause."""
     path = tmp_path / "w.safetensors"
     kind = task_type(name)
     task = kind(kind.training_type(network={"channels": 8}))  # type: ignore[arg-type]
@@ -225,7 +225,7 @@ def test_wrong_weights_are_rejected(tmp_path: Path, name: str, load: Callable[[P
 
 
 def test_windows_that_do_not_fit(scans: TaskScans, tmp_path: Path) -> None:
-    """Longer than any sequence; a checkpoint of another network."""
+    """A window longer than any sequence; a checkpoint of another network."""
     with pytest.raises(UsageError, match="no sequence has the 13 scans"):
         train_task(new_task("gndnet", settings(window=7, every=2)), scans, tmp_path / "out")
     train_task(new_task("gndnet", settings()), scans, tmp_path / "out", until=1)
