@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of fusions: every alternative trains and is measured, and a stopped comparison goes on."""
+"""The comparison of fusions: every alternative is trained and evaluated, and a stopped comparison continues."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ...helpers.networks import tiny
 
 
 def quick(packed: Path) -> RegistrationTrainingSettings:
-    """One step of a tiny network."""
+    """Settings of one step with a tiny network."""
     return RegistrationTrainingSettings(
         network=tiny().model_dump(),
         data=DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, workers=0, images=True),
@@ -35,7 +35,7 @@ def quick(packed: Path) -> RegistrationTrainingSettings:
 
 @pytest.mark.long
 def test_every_alternative_is_trained_and_measured_once(packed: Path, tmp_path: Path) -> None:
-    """All of tables 3 and 4; a second call trains and measures nothing and finds the same figures."""
+    """All of tables 3 and 4; a second call trains and evaluates nothing and returns the same figures."""
     training = quick(packed)
     settings = AblationSettings(training=training, measure={"same": str(packed)}, pairs=2)
     table = ablation(settings, tmp_path)
@@ -48,8 +48,8 @@ def test_every_alternative_is_trained_and_measured_once(packed: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_seeds_are_trainings_of_their_own(packed: Path, tmp_path: Path) -> None:
-    """The second seed begins with other weights, and another number of pairs is measured anew without a training. They
-    count from that of the settings: `--set training.optimiser.seed=1` gave the figures of seed 0 once more."""
+    """The second seed begins with other weights; another number of pairs is evaluated without a new training. Seeds
+    count from that of the settings: `--set training.optimiser.seed=1` returned the figures of seed 0 again."""
     variants = {"no camera": {"image": {"backbone": "none"}}}
     settings = AblationSettings(
         training=quick(packed), variants=variants, seeds=2, measure={"same": str(packed)}, pairs=2
@@ -76,7 +76,7 @@ def test_seeds_are_trainings_of_their_own(packed: Path, tmp_path: Path) -> None:
 def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
     packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside its weights lay the figures of the training before it, which were printed as its own."""
+    """Figures of the previous training were next to its weights, and were printed as its own."""
     variants = {"no camera": {"image": {"backbone": "none"}}}
     settings = AblationSettings(
         training=quick(packed), variants=variants, seeds=1, measure={"same": str(packed)}, pairs=2
@@ -100,7 +100,7 @@ def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
 def test_other_drives_in_a_folder_are_learned_from_and_measured_anew(
     packed: Path, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """The record had the figures of drives that were no longer there."""
+    """The record contained figures of drives that no longer existed."""
     measured, out = tmp_path / "val", tmp_path / "out"
     write_packed(measured / "world", samples, {"source": "boxes"})
     variants = {"no camera": {"image": {"backbone": "none"}}}
@@ -120,7 +120,7 @@ def test_other_drives_in_a_folder_are_learned_from_and_measured_anew(
 
 
 def test_a_gain_is_of_the_same_seeds() -> None:
-    """Each seed of a variant is compared with that seed of the first one; an error gains by falling."""
+    """Each seed of a variant is compared with the same seed of the first variant; an error improves by falling."""
     table = {
         "first": {"town": {"near_m": [0.2, 0.4], "near_success": [0.5, 0.7], "chi2": [1.0, 1.0]}},
         "other": {"town": {"near_m": [0.1, 0.2], "near_success": [0.6, 0.8], "chi2": [9.0, 9.0]}},
@@ -130,7 +130,7 @@ def test_a_gain_is_of_the_same_seeds() -> None:
     assert found["other"]["town"].keys() == {"near_m", "near_success"}
     success = found["other"]["town"]["near_success"]
     assert success["mean"] == pytest.approx(0.1 / 0.6)
-    assert success["low"] == pytest.approx(success["high"])  # both seeds gain alike
+    assert success["low"] == pytest.approx(success["high"])  # both seeds have the same gain
     assert found["other"]["town"]["near_m"]["mean"] == pytest.approx(0.5)
     console = Console(width=120, record=True, file=io.StringIO())
     for shown in ablation_tables(table):

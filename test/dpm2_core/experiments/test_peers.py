@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of other programs are compared with the truth of the same moment."""
+"""Poses of other programs are compared with the ground truth at the same time."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ...helpers.layouts import kitti_360
 
 
 def speeding_up(seconds: Array) -> Array:
-    """Poses (N, 4, 4) of a car that sets off, 4 m/s2."""
+    """Poses (N, 4, 4) of a car that starts to drive, 4 m/s2."""
     return np.array([se3.make(np.eye(3), [2 * t**2, 0, 0]) for t in seconds])
 
 
 class SpeedingUp:
-    """Knows the way, and gives the pose at the last point of each sweep, as programs do that move all points to it."""
+    """Returns the true pose at the last point of each sweep, as programs do that move all points to that time."""
 
     at_end = True
 
@@ -40,8 +40,8 @@ class SpeedingUp:
 def test_poses_at_the_end_of_sweeps_are_compared_at_their_stamps(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """KITTI-360's true poses are of the middle of a sweep: for whoever is at its end half a sweep of the car's way was
-    an error, which differs from step to step where it speeds up."""
+    """KITTI-360's true poses are at the middle of a sweep. For a program with poses at the end, the car's motion in
+    half a sweep counted as an error, which differs from step to step if the car accelerates."""
     root = kitti_360(recording, tmp_path / "data", ("0007",), 12)
     truth = enumerate(speeding_up(np.arange(12) / 10))
     rows = "".join(f"{k} {' '.join(map(str, T[:3].ravel()))}\n" for k, T in truth)
@@ -50,12 +50,12 @@ def test_poses_at_the_end_of_sweeps_are_compared_at_their_stamps(
     drive, out = Drive(data=root, settings=[], frames=(0, None), lengths=(0.5, 1.0)), tmp_path / "out"
     out.mkdir()
     figures = peer(out, lambda done, total: None, drive, "other")
-    assert figures["t_err_percent"] < 2  # 11 at the ends; the way between two is a screw: up to 5 mm of 0.5 m
+    assert figures["t_err_percent"] < 2  # 11 at the ends; the motion between two is a screw: up to 5 mm of 0.5 m
 
 
 def test_poses_lie_on_the_way_from_the_end_of_the_sweep_before() -> None:
-    """Exact along a screw, also across a pause, and before the first of them; one pose, or a clock that stands, tells
-    of no way."""
+    """Exact along a screw motion, also across a pause, and before the first pose; one pose, or a clock that stands
+    still, determines no motion."""
     twist = np.array([0.0, 0.0, 0.3, 8.0, 0.2, 0.0])
     stamps = np.array([0.0, 0.1, 0.2, 1.7, 1.8])
     truth, at_end = (np.array([se3.exp(twist * t) for t in times]) for times in (stamps, stamps + 0.05))
@@ -76,7 +76,7 @@ def test_the_end_of_a_sweep_is_its_last_point_that_is_a_measurement() -> None:
 
 
 def test_kiss_icp_moves_points_to_the_last_one() -> None:
-    """What `Peer.at_end` says of it: versions before 1.2 moved them to the middle."""
+    """This is what `Peer.at_end` states: versions before 1.2 moved them to the middle."""
     pytest.importorskip("kiss_icp")
     from kiss_icp.preprocess import get_preprocessor
 

@@ -33,7 +33,7 @@ def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_measured_otherwise_than_in_the_paper_is_said(tmp_path: Path) -> None:
-    """Only KITTI's table said that the paper's rows are no comparison, and none of which segments its figures are."""
+    """Only KITTI's table stated that the paper's rows are not comparable, and none stated which segments were used."""
     request, paper = Request(tmp_path, tmp_path), ("06", "10")
     assert (paper_notes(request, paper, paper), segments(request)) == ([], "all segments")
     (missing,) = paper_notes(request, ("10",), paper)
@@ -48,7 +48,7 @@ def test_what_is_measured_otherwise_than_in_the_paper_is_said(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
-    """Table 1 with a peer, a trajectory from a file, which is the truth shifted, and the paper's row; then again."""
+    """Table 1 with a peer, a trajectory from a file (the shifted ground truth), and the paper's row; then again."""
     out = tmp_path / "out"
     for name in ("06", "10"):
         truth = read_trajectory(kitti / "poses" / f"{name}.txt").poses
@@ -89,7 +89,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_program_that_was_lost_has_no_better_row_without_a_word(kitti: Path, tmp_path: Path) -> None:
-    """Its figures are of the frames until then: of half a drive, they stood beside those of whole ones."""
+    """Its figures cover the frames before that: figures of half a drive were listed with those of whole drives."""
     truth = read_trajectory(kitti / "poses" / "06.txt").poses
     for name, count in (("whole", 6), ("lost", 4)):
         write_tum(tmp_path / f"{name}.tum", np.arange(count) * 10**8, truth[:count])
@@ -120,7 +120,7 @@ def test_kitti_360_by_mean_position_error(recording: Path, tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
-    """Both kinds, with the change against the drive that is whole."""
+    """Both kinds, with the change relative to the unmodified drive."""
     done = dpm2("experiment", "robustness", kitti, "--out", tmp_path, "--sequences", "10", "--lengths", "2",
                 "--frames", "0:4", *QUICK)  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -162,7 +162,7 @@ def test_what_cannot_be_done_is_said_in_one_line(
 
 
 def test_two_peers_in_one_folder_are_refused(kitti: Path, tmp_path: Path) -> None:
-    """The second would overwrite the first, and both rows show its figures."""
+    """The second would overwrite the first, and both rows would show its figures."""
     peers = ("--peer", "my slam=a.txt", "--peer", "my_slam=b.txt")
     done = dpm2("experiment", "kitti", kitti, "--out", tmp_path, "--sequences", "10", *peers)
     assert (done.returncode, "two results of one name (my_slam/10)" in done.stderr) == (2, True)
@@ -178,12 +178,12 @@ def test_a_peer_or_a_file_that_is_not_there_is_named_with_its_part(kitti: Path, 
 
 
 def ahead(t: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) of a car that gathers speed, at times s."""
+    """(N, 4, 4) poses of a car that accelerates, at times in s."""
     return se3.make(np.eye(3), np.column_stack([10 * t**2, 0 * t, 0 * t]))
 
 
 def gathering_speed(root: Path) -> tuple[Drive, np.ndarray]:
-    """Its drive of twelve frames in KITTI's layout, and their times, s."""
+    """A drive with twelve frames of that car in KITTI's layout, and their times, s."""
     folder, t = root / "sequences" / "10", np.arange(12) * 0.1
     (folder / "velodyne").mkdir(parents=True)
     for n in range(12):
@@ -195,7 +195,7 @@ def gathering_speed(root: Path) -> tuple[Drive, np.ndarray]:
 
 
 def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None:
-    """As of a program that leaves the poses of its keyframes: it was refused, one of two frames of three was not."""
+    """A program may write the poses of its keyframes: such a file was rejected, one of two of three frames was not."""
     drive, t = gathering_speed(tmp_path)
     write_tum(tmp_path / "peer.tum", np.round(t * 1e9).astype(np.int64)[::2], ahead(t[::2]))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
@@ -205,17 +205,17 @@ def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None
 
 
 def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -> None:
-    """Each pose 8 ms after a frame, as of a program that stamps otherwise: of a car that gathers speed the nearest pose
+    """Each pose is 8 ms after a frame, as from a program with other stamps: for an accelerating car the nearest pose
     was up to 0.2 m off."""
     drive, t = gathering_speed(tmp_path)
     write_tum(tmp_path / "peer.tum", np.round((t + 0.008) * 1e9).astype(np.int64), ahead(t + 0.008))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
     assert (found["frames"], found["failed_frames"]) == (12, 1)  # none at or before the first
-    assert found["ape_rmse_m"] < 1e-3  # a line between poses is 7 mm off at this acceleration, at each frame the same
+    assert found["ape_rmse_m"] < 1e-3  # linear interpolation is 7 mm off at this acceleration, equally at each frame
 
 
 def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path: Path) -> None:
-    """Scans 3 to 8 of twelve, of which frames 1 to 4 are asked for: it was an error whose advice did not apply."""
+    """Scans 3 to 8 of twelve, of which frames 1 to 4 are selected: it was an error whose advice did not apply."""
     folder, at = tmp_path / "sequences" / "10", np.arange(12.0) ** 2
     (folder / "velodyne").mkdir(parents=True)
     for n in range(3, 9):
@@ -230,8 +230,8 @@ def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path
 
 
 def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_path: Path) -> None:
-    """Of a sequence that was still being downloaded the figures of the first scans stood there as those of the whole,
-    also beside the row of a peer that had all of them."""
+    """While a sequence was still being downloaded, the figures of its first scans were listed as those of the whole,
+    also next to the row of a peer that had all of them."""
     folder, request = tmp_path / "sequences" / "06", Request(tmp_path, tmp_path / "out", peers=("kiss-icp", "x=x.txt"))
     (folder / "velodyne").mkdir(parents=True)
     (tmp_path / "poses").mkdir()
@@ -251,7 +251,7 @@ def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_pat
 
 
 def test_weights_in_the_home_folder_are_an_input_of_the_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where they changed, the figures of those before stayed."""
+    """If the weights changed, the figures of the earlier ones were kept."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "sequences" / "06" / "velodyne").mkdir(parents=True)
     np.zeros(4, "<f4").tofile(tmp_path / "sequences" / "06" / "velodyne" / "000000.bin")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A table of a paper with our rows beside its own."""
+"""A paper's table with our rows next to its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dpm2_core.experiments.table import MEAN, ResultTable
 
 
 def test_a_mean_is_of_all_columns_or_there_is_none() -> None:
-    """A mean over the sequences that happened to be there would compare different drives."""
+    """A mean over only the available sequences would compare different drives."""
     table = ResultTable("t", ["06", "07", MEAN], {"a": ".1f", "b": ".2f"})
     table.add("ours", {"06": {"a": 1.0, "b": None}, "07": {"a": 2.0, "b": 1.0}})
     table.add("theirs", {"06": {"a": 1.0}}, "the paper")

@@ -41,14 +41,14 @@ RANGE = (
 
 
 def options(*settings: str) -> Iterator[str]:
-    """`--set` before each."""
+    """`--set` before each setting."""
     for setting in settings:
         yield from ("--set", setting)
 
 
 @pytest.mark.slow
 def test_gndnet_in_three_arms(tmp_path: Path) -> None:
-    """Trained on one sequence, tested on another, an unlabelled one beside them; a second call only reads."""
+    """Trained on one sequence, tested on another, next to an unlabelled one; a second call only reads."""
     data, out = tmp_path / "semantic", tmp_path / "out"
     for name in ("00", "05"):
         labelled_drive(data / "sequences" / name, range(4), points=600, seed=int(name))
@@ -61,10 +61,10 @@ def test_gndnet_in_three_arms(tmp_path: Path) -> None:
     assert list(found)[:3] == ["without SLAM loss", "with SLAM loss", "with that of another window"]
     assert found["GndNet with SLAM loss"]["ground_recall"] == {"mean": 0.97}
     arms = [found[name]["mse"]["mean"] for name in list(found)[:3]]
-    assert len(set(arms)) == 3  # the placebo differs from the loss, and both from nothing
+    assert len(set(arms)) == 3  # the placebo differs from the loss, and both from training without
     record = json.loads((out / "gndnet.json").read_text())
     gain = record["gains"]["with"]["mse"]
-    assert gain["low"] is None  # of one seed
+    assert gain["low"] is None  # with one seed
     assert gain["mean"] == pytest.approx((arms[0] - arms[1]) / arms[0])
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
     assert len(before) == 1 + 3  # the epochs that the arms share, and the arms
@@ -82,7 +82,7 @@ def test_gndnet_in_three_arms(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
-    """Chamfer distances, then the odometry, by poses beside the pairs; Table 3 trains nothing anew."""
+    """Chamfer distances, then the odometry, by poses next to the pairs; Table 3 needs no new training."""
     data, out = write_pairs(tmp_path / "pairs", scans=3), tmp_path / "out"
     along = "".join(f"1 0 0 {0.5 * i} 0 1 0 0 0 0 1 0\n" for i in range(3))
     for number in (0, 1):
@@ -101,7 +101,7 @@ def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
     assert figures["still_rpe_m"] == pytest.approx(0.5)
     assert figures["target_rpe_m"] < figures["still_rpe_m"]
     assert (out / "trajectories_pairs_d1.png").stat().st_size > 5000
-    for arm in ("without", "with"):  # as if other sequences had been asked for before
+    for arm in ("without", "with"):  # as if other sequences had been requested before
         slam = out / "dslr/seed_0" / arm / "slam"
         shutil.copytree(slam / "pairs_d1", slam / "pairs_d0")
     assert dpm2("experiment", "dslr-slam", *rest).returncode == 0
@@ -126,11 +126,11 @@ def test_ae_lidar_says_that_its_last_epoch_has_the_slam_loss(tmp_path: Path) -> 
 
 
 def test_arms_are_trained_and_measured_again_on_other_scans(tmp_path: Path) -> None:
-    """Only what has read them: with more scans to be tested on, nothing is trained."""
+    """Only parts that read them run again: with more scans for testing, nothing is trained."""
     request = Request(tmp_path, tmp_path / "out", learn=("00",), sequences=("05",), seeds=1)
 
     def contents() -> list[set[str]]:
-        """Of the shared epochs, the arms, and their measuring."""
+        """Contents of the shared epochs, the arms, and their evaluation."""
         return [{part.content for part in stage} for stage in GNDNET.parts(request)]
 
     for name in ("00", "05"):
@@ -144,12 +144,12 @@ def test_arms_are_trained_and_measured_again_on_other_scans(tmp_path: Path) -> N
     assert after[:2] == before[:2]
     assert after[2] != before[2]
     shutil.rmtree(tmp_path / "sequences" / "05")
-    with pytest.raises(UsageError, match="no sequence 05"):  # it was said after the trainings
+    with pytest.raises(UsageError, match="no sequence 05"):  # this was reported only after the trainings
         GNDNET.parts(request)
 
 
 def test_a_gain_by_hand() -> None:
-    """Paired differences of 0.3 and 0.1 of a mean of 2: 10 % on average, t(1) = 12.7 makes the interval wide."""
+    """Paired differences of 0.3 and 0.1 of a mean of 2: 10 % on average; t(1) = 12.7 makes the interval wide."""
     gain = paired_gain([1.0, 3.0], [0.7, 2.9], lower_is_better=True)
     assert gain is not None
     assert gain.mean == pytest.approx(0.1)
@@ -174,7 +174,7 @@ def test_without_any_slam_loss_there_is_nothing_to_compare(tmp_path: Path, setti
 
 
 def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_left_out(tmp_path: Path) -> None:
-    """train/00 is both `train` and `00`; of two seeds one has no recall, as where nothing stands on the ground."""
+    """train/00 is both `train` and `00`; one of two seeds has no recall, as if there were no obstacles."""
     for name in ("train/00", "train/01", "val/02"):
         labelled_drive(tmp_path / name, range(2), points=300)
     request = Request(tmp_path, tmp_path / "out", learn=("train",), sequences=("00", "val"), seeds=2)
@@ -192,7 +192,7 @@ def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_lef
 
 
 def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: Path) -> None:
-    """At this rate the weights are beyond float32 after one step."""
+    """At this rate the weights exceed float32 after one step."""
     labelled_drive(tmp_path / "data/sequences/00", range(4), points=300)
     far = ("epochs=2", "optimiser.kind=sgd", "optimiser.rate=1e30", "optimiser.clip=1e38")
     settings = ["network={cells: 32, cell: 3, channels: 4}", *QUICK, *far]
@@ -204,8 +204,8 @@ def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: 
 
 
 def test_seeds_count_from_that_of_the_settings(tmp_path: Path) -> None:
-    """`--set optimiser.seed=100` trained seeds 0, 1, 2 once more, and the second table was the first to the last digit,
-    as if both were sure."""
+    """`--set optimiser.seed=100` trained seeds 0, 1, 2 again, and the second table equaled the first to the last digit,
+    as if the result were certain."""
 
     def seeds(*settings: str) -> list[int]:
         of = (Training(task="gndnet", data=tmp_path, learn=[], config=None, settings=settings, seed=seed, arm="with")
@@ -230,8 +230,8 @@ def test_the_last_loss_of_a_part_of_the_epochs_is_of_the_last_that_was_trained(t
     ("gndnet", [1e-2, 1e-2, 8e-3, 1e-2 * 0.8**5, 1e-2 * 0.8**9]), ("dslr", [1e-3] * 5), ("ae_lidar", [5e-4] * 5)
 ])  # fmt: skip
 def test_the_authors_recipes_have_the_authors_rates(name: str, rates: list[float]) -> None:
-    """In steps for GndNet, the same all along for the others; the third stage of DSLR, where the SLAM loss counts,
-    began at a tenth of it and ended at a hundredth, by a cosine that is not theirs."""
+    """GndNet's has steps, the others' are constant. DSLR's third stage, which uses the SLAM loss, began at a tenth of
+    it and ended at a hundredth, by a cosine schedule that is not theirs."""
     path = Path(__file__).resolve().parents[3] / "config" / f"{name}_authors.yaml"
     settings = load_settings(task_type(name).training_type, path)
     of_epochs = OptimizerSettings(**settings.optimiser.model_dump(), steps=settings.epochs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables 3 and 4 and figure 7 on a small tree: drives packed, every variant fine-tuned from weights, judged by SLAM."""
+"""Tables 3 and 4 and figure 7 on a small tree: drives packed, every variant fine-tuned from weights, tested in SLAM."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a tiny network."""
+    """Weights of a tiny network."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
     save_weights(DeepPointMap2(tiny()), path, {"phase": "1"})
@@ -51,7 +51,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 def test_fusion_then_its_attention_maps(kitti: Path, weights: Path, tmp_path: Path) -> None:
-    """Every variant starts from what fits it, the biased one from all; figure 7 needs no training of its own."""
+    """Every variant starts from the weights that fit it, the biased one from all; figure 7 needs no further
+    training."""
     call = (kitti, "--out", tmp_path, "--weights", weights, *QUICK)
     done = dpm2("experiment", "fusion", *call, "--lengths", "1", "--frames", "0:3")
     assert done.returncode == 0, done.stderr
@@ -61,7 +62,8 @@ def test_fusion_then_its_attention_maps(kitti: Path, weights: Path, tmp_path: Pa
                      "without spatial"]  # fmt: skip
     parts = record["parts"]
     assert parts["packed/00"]["frames"] == 4
-    # What the tiny network has beyond the paper's is left out; only the first layer of the reference points differs.
+    # Parts of the tiny network that the paper's lacks are left out; only the first layer of the reference points
+    # differs.
     random = {name: parts[f"trained/{name.replace(' ', '_')}"]["random_at_start"] for name in names}
     assert set(random["biased attention"]) < set(random["PointPainting"])
     assert "encoder.points.patch.paint.weight" in random["PointPainting"]
@@ -80,7 +82,7 @@ def trainings(request: Request) -> list[Part]:
 
 
 def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights: Path, tmp_path: Path) -> None:
-    """Of other sequences, or by a YAML file with other content under the same name, every variant is trained anew."""
+    """With other sequences, or a YAML file with other content under the same name, every variant is trained again."""
     config = tmp_path / "training.yaml"
     config.write_text("pairs: 1\n")
     request = Request(kitti, tmp_path / "out", learn=("00",), weights=str(weights), config=config)
@@ -107,15 +109,16 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
 def test_settings_that_no_variant_is_trained_by_are_errors(
     asked: str, said: str, kitti: Path, weights: Path, tmp_path: Path
 ) -> None:
-    """Another preset, and other weights to start from, changed nothing, without a word: the table was of `small`. What
-    is mistyped was an error only after all drives had been packed. With weights to drive all rows were of these."""
+    """Another preset, or other weights to start from, had no effect and no message: the table was of `small`.
+    Misspelled settings were reported only after packing all drives. With weights to drive, all rows were of these."""
     with pytest.raises(UsageError, match=said):
         fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=(asked,)))
-    fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=("preset=tiny",)))  # what it is anyway
+    fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=("preset=tiny",)))  # the network's preset
 
 
 def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, weights: Path, tmp_path: Path) -> None:
-    """`--set input...` changed the second alone: a data set that needs it was packed otherwise, or not at all."""
+    """`--set input...` affected only the test drives: a data set that needs it was packed differently, or not at
+    all."""
     asked = ("input.images=false", "optimiser.steps=1", "slam.threads=1")
     packs, _, driven = fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=asked))
     assert [part.arguments["settings"] for part in packs] == [["input.sequence='00'", "input.images=false"]]
@@ -131,7 +134,7 @@ def test_table_4_has_as_many_reference_points_as_the_papers(kitti: Path, tmp_pat
 
 
 def test_a_row_of_table_3_has_as_many_reference_points_as_its_name_says(kitti: Path, tmp_path: Path) -> None:
-    """Two rows of 256 had those of the weights: 320 of `small`, a quarter more than the rows that they stand beside."""
+    """Two rows of 256 had the number of the weights: 320 of `small`, a quarter more than the rows to compare with."""
     _, trained, _ = reference_points.parts(Request(kitti, tmp_path, weights="small"))
     found = {}
     for part in trained:
@@ -143,7 +146,7 @@ def test_a_row_of_table_3_has_as_many_reference_points_as_its_name_says(kitti: P
 
 @pytest.mark.long
 def test_reference_points(kitti: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every row; 4,096 points would take minutes here."""
+    """This covers every row; 4,096 points would take minutes here."""
     for name in ("uniform", "normal"):
         monkeypatch.setitem(TABLE_3, f"{name} 4096", {"fusion": {"reference": name, "points": 96}})
     call = ("experiment", "reference-points", kitti, "--out", tmp_path, "--weights", weights, *QUICK, "--lengths", "1")
