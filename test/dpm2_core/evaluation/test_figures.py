@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image of a run shows what it is given, to scale, and is written whole."""
+"""The plot of a run shows its data to scale and is written completely."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def _orange(make_image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_trajectory_is_drawn_to_scale_and_the_map_beneath_it(tmp_path: Path) -> None:
-    """A quarter circle is as wide as it is high; the map lights up what is dark without it."""
+    """A quarter circle is as wide as it is high; the map makes dark areas brighter."""
     trajectory_png(tmp_path / "with.png", _arc(), cloud=_cloud(), title="")
     trajectory_png(tmp_path / "without.png", _arc(), title="")
     make_image, bare = _picture(tmp_path / "with.png"), _picture(tmp_path / "without.png")
-    # The legend, in the upper right, holds samples of the same color.
+    # The legend, in the upper right, contains samples of the same color.
     points = _orange(make_image)
     points = points[(points[:, 0] > 0.25 * make_image.shape[0]) | (points[:, 1] < 0.7 * make_image.shape[1])]
     height, width = np.ptp(points, axis=0)
@@ -58,7 +58,7 @@ def test_the_ground_truth_is_brought_into_the_map_frame(tmp_path: Path) -> None:
     trajectory_png(tmp_path / "near.png", _arc(), gt, _cloud())
     trajectory_png(tmp_path / "far.png", _arc(), se3.exp([0, 0, 2, 5000, -300, 40]) @ gt, _cloud())
     difference = np.abs(_picture(tmp_path / "near.png") - _picture(tmp_path / "far.png"))
-    assert (difference > 8).mean() < 1e-3  # alignment leaves 1e-9 m, which may turn a pixel at an edge
+    assert (difference > 8).mean() < 1e-3  # alignment leaves 1e-9 m, which may change a pixel at an edge
 
 
 @pytest.mark.slow

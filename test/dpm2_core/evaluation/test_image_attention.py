@@ -25,7 +25,7 @@ def frame() -> Frame:
 
 
 def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Frame) -> None:
-    """Even untrained, by the distance from rays: the image's brightest place is near the point's projection."""
+    """Even untrained, due to the distance from rays: the attention is highest near the point's projection."""
     looked = image_attention(model, frame)
     height, width = model.settings.image.size
     assert looked.heat.shape == looked.pixels.shape[:2] == (height, width)
@@ -40,15 +40,15 @@ def test_a_point_attends_around_where_it_is_seen(model: DeepPointMap2, frame: Fr
 
 
 def test_it_leaves_the_network_as_it_was(model: DeepPointMap2, frame: Frame) -> None:
-    """No hook stays behind, and descriptors are the same as before."""
+    """No hook remains, and descriptors are the same as before."""
     before = model.describe(frame).features
     image_attention(model, frame)
-    pickle.dumps(model)  # the hook, a function without a name, could not be
+    pickle.dumps(model)  # this would fail with the hook, an anonymous function
     assert np.array_equal(model.describe(frame).features, before)
 
 
 def test_what_cannot_be_shown_is_said(model: DeepPointMap2, frame: Frame) -> None:
-    """No image, no such point, no camera."""
+    """Without an image, without the point in it, or without a camera, an error gives the reason."""
     with pytest.raises(UsageError, match="has no image"):
         image_attention(model, Frame(0, frame.points))
     behind = int(np.flatnonzero(~image_attention(model, frame).seen)[0])

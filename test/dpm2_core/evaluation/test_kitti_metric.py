@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The metric equals the development kit on published results, and the kit's algorithm written as its loops are."""
+"""The metric equals the development kit's on published results, and the kit's algorithm with its loops."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_the_development_kit_prints_the_same(kitti_excerpt: Path, name: str, t_e
 
 
 def _walk(count: int, noise: float, seed: int = 0) -> np.ndarray:
-    """A drive of about a meter per frame through gentle turns, every step disturbed by `noise` (rad and m)."""
+    """A drive of about a meter per frame with gentle turns; every step has errors of `noise` (rad and m)."""
     turns = np.cumsum(np.random.default_rng(7).normal(scale=0.01, size=count))
     xi = np.column_stack([np.zeros((count, 2)), turns * 0.05, np.ones(count), np.zeros((count, 2))])
     steps = se3.exp(xi + np.random.default_rng(seed).normal(scale=noise, size=(count, 6)))
@@ -39,7 +39,7 @@ def _walk(count: int, noise: float, seed: int = 0) -> np.ndarray:
 
 
 def _as_the_kit_does(gt: np.ndarray, est: np.ndarray, lengths: list[float], step: int) -> list[tuple[float, ...]]:
-    """evaluate_odometry.cpp, loop by loop, with numpy's matrix inverse in place of its own."""
+    """evaluate_odometry.cpp, loop by loop, with numpy's matrix inverse instead of its own."""
     travelled = [0.0]
     for a, b in pairwise(gt):
         travelled.append(travelled[-1] + float(np.sqrt(((a[:3, 3] - b[:3, 3]) ** 2).sum())))
@@ -63,7 +63,7 @@ def test_agrees_with_the_algorithm_written_as_loops(lengths: list[float], step: 
     expected = np.array(_as_the_kit_does(gt, est, lengths, step))
     errors = segment_errors(gt, est, lengths)
     assert len(errors) > 20
-    # The kit's arc cosine loses half the digits near zero: 1e-8 rad.
+    # The kit's arc cosine loses half of the digits near zero: 1e-8 rad.
     np.testing.assert_allclose(np.column_stack([errors.length, errors.t_err, errors.r_err]), expected, atol=1e-7)
 
 
@@ -73,7 +73,7 @@ def test_a_known_scale_error_and_a_known_turn_come_out() -> None:
     est = gt.copy()
     est[:, 0, 3] *= 1.02
     mean = segment_errors(gt, est, [50.0]).mean()
-    # The segment ends at the first frame beyond 50 m, 51 m, and its error is divided by the 50: as the kit does.
+    # As in the kit, the segment ends at the first frame beyond 50 m, at 51 m, and its error is divided by 50 m.
     assert mean == pytest.approx((0.02 * 51 / 50, 0.0), abs=1e-12)
     turning = gt @ se3.exp(np.column_stack([np.zeros((200, 2)), 0.001 * np.arange(200), np.zeros((200, 3))]))
     mean = segment_errors(gt, turning, [50.0]).mean()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows, read back from its recording."""
+"""What a run shows, read from its recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_view_that_is_of_no_use_is_rejected(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def recorded(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 9 frames, recorded."""
+    """A recorded run of 9 frames."""
     pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
     folder = tmp_path_factory.mktemp("view")
     drive = first_scans(recording, FRAMES, folder / "drive")
@@ -35,7 +35,7 @@ def recorded(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_without_a_display_a_view_is_an_error_at_once(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rerun said nothing, and the run never ended."""
+    """Rerun reported nothing, and the run never ended."""
     pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -63,7 +63,7 @@ def test_a_recording_that_cannot_be_written_is_said_before_the_run(recording: Pa
 
 
 def entities(path: Path) -> dict[str, int]:
-    """Rows of each entity of a recording."""
+    """Number of rows of each entity in a recording."""
     from rerun.chunk import RrdReader
 
     counts: dict[str, int] = {}

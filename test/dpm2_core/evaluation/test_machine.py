@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is missing is found, named, and told from what is broken."""
+"""Missing parts of a machine are found, named, and distinguished from broken ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOOD = SelfTest(frames=9, error_m=0.01, failed=0, start_s=3.0, odometry_ms=20.0,
 
 
 def test_a_full_disk() -> None:
-    """Nothing can be written to /proc; what is enough is a question of the threshold."""
+    """Nothing can be written to /proc; other checks depend on the threshold."""
     found = machine.disk(Path("/proc"))
     assert found.level == "error"
     assert "cannot be written" in found.found
@@ -55,7 +55,7 @@ def test_a_package_that_is_missing_is_an_error() -> None:
 
 @pytest.mark.slow
 def test_a_missing_ros_is_a_warning() -> None:
-    """In a Python that finds no rclpy."""
+    """In a Python that does not find rclpy."""
     program = (
         "import json, sys; from importlib.machinery import PathFinder\n"
         "find = PathFinder.find_spec\n"
@@ -96,7 +96,7 @@ def test_a_scan_hits_the_ground_and_the_nearer_of_two_walls(noise: np.random.Gen
     boxes = np.array([[[10.0, -50, 0], [11, 50, 20]], [[20.0, -50, 0], [21, 50, 20]]])
     points = street_scan(boxes, se3.make(np.eye(3), [0, 0, 1.7]), noise)
     ahead = points[(points[:, 0] > 9) & (np.abs(points[:, 1]) < 5)]
-    assert ahead[:, 0].max() < 10.2  # five times the noise and more
+    assert ahead[:, 0].max() < 10.2  # more than five times the noise
     ground = points[points[:, 0] < 0]
     assert np.abs(ground[:, 2] + 1.7).max() < 0.2
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as a page: small enough, right in a real browser, and harmless whatever is in the map."""
+"""A map as a page: small enough, correct in a real browser, and harmless for any content of the map."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_positions_come_back(noise: np.random.Generator) -> None:
     np.testing.assert_allclose(at, data.poses[:, :3, 3], atol=2e-3)
     yaw = np.radians([keyframe["yaw"] for keyframe in found["keyframes"]])
     ahead = np.column_stack([np.cos(yaw), np.sin(yaw)])
-    np.testing.assert_allclose(ahead, data.poses[:, :2, 0], atol=1e-3)  # the page says 0.1 degrees
+    np.testing.assert_allclose(ahead, data.poses[:, :2, 0], atol=1e-3)  # the page's resolution is 0.1 degrees
     points = np.frombuffer(base64.b64decode(found["points"]), "<i2").reshape(-1, 3) * found["scale"] + found["middle"]
     away = np.abs(np.hypot(points[:, 0], points[:, 1]) - np.hypot(*data.poses[0, :2, 3]))
     np.testing.assert_allclose(away, 8.0, atol=0.1)  # of the walls, in clouds that are packed to half a centimeter
@@ -43,7 +43,7 @@ def test_positions_come_back(noise: np.random.Generator) -> None:
 
 
 def test_every_beginning_shows_the_whole(noise: np.random.Generator) -> None:
-    """A hundredth of the points is nowhere farther from the others than the coarse level says, and none is lost."""
+    """The first hundredth of the points covers the area at the coarse level's resolution, and no point is lost."""
     cloud = np.column_stack([noise.uniform(-50, 50, (40000, 2)), np.zeros((40000, 2))]).astype(np.float32)
     order = by_detail(cloud, 0.4)
     assert sorted(map(tuple, order)) == sorted(map(tuple, cloud))
@@ -53,7 +53,7 @@ def test_every_beginning_shows_the_whole(noise: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_500_keyframes_with_images_are_less_than_20_mb(tmp_path: Path) -> None:
-    """Noise is what a JPEG can least compress, and there are more points than are shown."""
+    """Noise is hardest to compress as a JPEG, and there are more points than are shown."""
     write_map_page(tmp_path / "ring.html", ring(500, 2500, (320, 240)), 0.05)
     assert (tmp_path / "ring.html").stat().st_size < 20e6
     found = content((tmp_path / "ring.html").read_text())
@@ -64,7 +64,7 @@ def test_images_that_are_none_are_left_out() -> None:
     data = ring(4, 50)
     bomb = bytearray(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
     at = bomb.index(b"\xff\xc0")
-    bomb[at + 5 : at + 9] = b"\xff\xff\xff\xff"  # says 65535 x 65535
+    bomb[at + 5 : at + 9] = b"\xff\xff\xff\xff"  # claims 65535 x 65535
     pictures = [b"<svg onload=alert(1)>", b"\xff\xd8 cut off", bytes(bomb), None]
     found = content(map_page(replace(data, thumbnail=lambda node: pictures[node]), 0.3, "t"))
     assert [keyframe["image"] for keyframe in found["keyframes"]] == [None] * 4
@@ -105,7 +105,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
         assert page.evaluate("dpm2.project(0)") == pytest.approx(a, abs=1)
         wait(page, "dpm2.drawn === dpm2.points")
 
-        # From above, the outer wall at keyframe 0 and at keyframe 12 are two radii and twice 8 m from each other.
+        # From above, the outer wall at keyframe 0 and at keyframe 12 are two radii plus twice 8 m apart.
         page.mouse.click(400, 590)
         page.click("#measure")
         radius = float(np.hypot(*data.poses[0, :2, 3]))
@@ -114,7 +114,7 @@ def test_in_a_browser(tmp_path: Path) -> None:
             page.mouse.click(x, y)
         page.wait_for_selector("#distance", state="visible")
         length = float(page.inner_text("#distance").split(" m")[0])
-        assert length == pytest.approx(2 * (radius + 8), abs=3.0)  # a click is 8 pixels wide, of 0.2 m each
+        assert length == pytest.approx(2 * (radius + 8), abs=3.0)  # a click has a tolerance of 8 pixels, of 0.2 m each
         page.click("#measure")
         page.wait_for_selector("#distance", state="hidden")
         assert said == []

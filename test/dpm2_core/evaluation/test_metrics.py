@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures against evo, against hand-made trajectories whose errors are known, and on incomplete input."""
+"""The figures compared with evo and with trajectories of known errors, and on incomplete input."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_evo_finds_the_same_ape_and_rpe_on_published_results(kitti_excerpt: Path
         return metric.get_statistic(statistic)
 
     trans, rot = rpe(gt, est)
-    # The files hold 7 to 10 digits: rotations are off by 1e-7, and two ways to take an angle differ by as much.
+    # The files have 7 to 10 digits: rotations are off by 1e-7, and two formulas for an angle differ by as much.
     translation, degrees = PoseRelation.translation_part, PoseRelation.rotation_angle_deg
     assert trans == pytest.approx(figure(RPE(translation, 1, Unit.frames), StatisticsType.mean), rel=1e-5)
     assert rot == pytest.approx(figure(RPE(degrees, 1, Unit.frames), StatisticsType.mean), rel=1e-3)
@@ -69,11 +69,11 @@ def test_a_perfect_estimate_in_another_world_frame_has_no_error() -> None:
 
 def test_known_errors_come_out_as_defined() -> None:
     gt, est = _straight(), _straight()
-    est[:, 0, 3] *= 1.01  # 1 cm too far each meter
+    est[:, 0, 3] *= 1.01  # 1 cm too far per meter
     metrics = evaluate(gt, est, [10.0])
     assert metrics.rpe_trans_m == pytest.approx(0.01)
     assert metrics.final_drift_percent == pytest.approx(1.0)
-    assert metrics.t_err_percent == pytest.approx(1.1)  # 11 m segments over 10 m: see test_kitti_metric
+    assert metrics.t_err_percent == pytest.approx(1.1)  # 11 m segments divided by 10 m: see test_kitti_metric
     # Residuals after alignment are 0.01 * (i - 50), i = 0..100.
     assert metrics.ape_rmse_m == pytest.approx(0.01 * np.sqrt(np.mean((np.arange(101) - 50.0) ** 2)))
     turned = gt @ se3.exp(np.outer(np.arange(101), np.radians([0, 0, 0.5, 0, 0, 0])))
@@ -126,14 +126,14 @@ def test_what_cannot_be_compared_is_rejected() -> None:
 
 
 def test_the_fixed_keys_are_there() -> None:
-    """Scripts rely on these names in metrics.json."""
+    """Scripts depend on these names in metrics.json."""
     keys = set(evaluate(_straight(), _straight()).model_dump())
     assert keys >= {"frames", "failed_frames", "fps", "t_err_percent", "r_err_deg_per_100m", "lengths_m"}
     assert keys >= {"ape_rmse_m", "rpe_trans_m", "rpe_rot_deg", "final_drift_percent"}
 
 
 def test_errors_by_speed_add_up_to_all_segments() -> None:
-    """100 frames at 10 m/s, then 100 at 20 m/s, by the steps of the way; a scale error of 2 % shows at both."""
+    """100 frames at 10 m/s, then 100 at 20 m/s, by the distance between frames; a scale error of 2 % shows at both."""
     steps = np.r_[np.zeros(1), np.full(100, 1.0), np.full(100, 2.0)]
     truth = np.tile(np.eye(4), (201, 1, 1))
     truth[:, 0, 3] = np.cumsum(steps)
@@ -142,12 +142,12 @@ def test_errors_by_speed_add_up_to_all_segments() -> None:
     found = evaluate(truth, est, (10.0, 20.0))
     assert sum(row.segments for row in found.per_speed) == found.segments
     assert {row.speed_mps for row in found.per_speed} >= {8.0, 16.0}
-    # 10 m at 1 m a frame end at the first frame beyond: 11 m or 12 frames, as the development kit counts
+    # 10 m at 1 m per frame end at the first frame beyond: 11 m or 12 frames, as the development kit counts
     assert all(row.t_err_percent == pytest.approx(2.0, rel=0.25) for row in found.per_speed)
 
 
 def test_mean_and_root_mean_square_of_the_position_error() -> None:
-    """A zigzag of 1 and 3 m across the way: aligned, its mean is below its root mean square."""
+    """A zigzag of 1 and 3 m across the direction of motion: after alignment, its mean is below its root mean square."""
     truth, est = _straight(), _straight()
     est[:, 1, 3] = np.tile([1, -1, 3, -3], 26)[:101]
     found = evaluate(truth, est)
@@ -156,7 +156,7 @@ def test_mean_and_root_mean_square_of_the_position_error() -> None:
 
 
 def test_a_speed_between_two_classes_is_in_one() -> None:
-    """Half to even put 5 m/s, of every segment of a steady drive, into the class that ends there."""
+    """Rounding half to even put 5 m/s, the speed of every segment in a steady drive, into the class that ends there."""
     gt = np.tile(np.eye(4), (201, 1, 1))
     gt[:, 0, 3] = np.arange(201)
     found = evaluate(gt, gt, [9.9], stamps=np.arange(201) * 180_000_000)  # 10 steps count as 11 frames
@@ -164,7 +164,7 @@ def test_a_speed_between_two_classes_is_in_one() -> None:
 
 
 def test_gaps_of_the_ground_truth_make_no_drive_faster() -> None:
-    """10 m/s all the way; with every other 4 frames without a truth it seemed to be 16 to 20 m/s."""
+    """10 m/s throughout; with every other 4 frames without ground truth it seemed to be 16 to 20 m/s."""
     gt, est = _straight(), _straight()
     gt[np.arange(101) // 4 % 2 == 1] = np.nan
     found = evaluate(gt, est, [20.0])
@@ -174,8 +174,8 @@ def test_gaps_of_the_ground_truth_make_no_drive_faster() -> None:
 
 
 def test_a_gap_of_the_frames_makes_no_drive_faster() -> None:
-    """10 m/s; without frames 20 to 69 the segments across these seemed to be up to 70 m/s fast. Nor is the step across
-    them one from a frame to the next: the estimate is wrong there alone."""
+    """10 m/s; without frames 20 to 69 the segments across them seemed to be up to 70 m/s fast. The step across them is
+    not one between consecutive frames, either: only there, the estimate is wrong."""
     there = np.r_[0:20, 70:101]
     gt, est = _straight()[there], _straight()[there]
     est[20:, 0, 3] += 5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page is one file, and what comes from elsewhere cannot become markup or script."""
+"""A page is one file, and external content cannot become markup or script."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOSTILE = "</script><script>alert(1)</script><!-- <b onclick='x'> & \u2028 \"quo
 
 
 class Reader(HTMLParser):
-    """The elements of a page, and the text in each kind."""
+    """The elements of a page, and the text in each kind of element."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of frames to measure a network on: near and far ones, or an error that says which there are none of."""
+"""Pairs of frames for evaluating a network: near and far ones, or an error that names the kind that is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ...helpers.networks import tiny
 
 
 def packed(folder: Path, at: np.ndarray, **about: object) -> Path:
-    """A drive with frames at such places, m."""
+    """A drive with frames at the given positions along x, m."""
     cloud = np.random.default_rng(0).uniform(-40, 40, (50, 3)).astype(np.float32)
     write_packed(
         folder / "drive", [Sample(cloud, se3.make(np.eye(3), [x, 0, 0])) for x in at], {"source": "test", **about}
@@ -43,13 +43,13 @@ def test_half_of_the_pairs_are_near(tmp_path: Path, farthest: float) -> None:
     ids=["a room", "far apart", "one frame"],
 )
 def test_drives_without_such_pairs_are_named(tmp_path: Path, at: np.ndarray, missing: str) -> None:
-    """The search for them never ended, and a training with such a validation never began."""
+    """The search for such pairs never ended, and a training with such a validation never began."""
     with pytest.raises(UsageError, match=rf"{tmp_path}: no two frames of a drive are {missing} apart"):
         PairSet(packed(tmp_path, at), 20, preset("small"), False)
 
 
 def test_errors_in_a_room_are_those_of_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is packed five times as large, and the table of a fine-tuning said 0.015 m where it was 0.003 m."""
+    """It is packed five times as large, and the table of a fine-tuning showed 0.015 m instead of 0.003 m."""
     rows = np.array([[1.0 if i % 2 == 0 else 6.0, 0, 0.015, 0.1, 1.0] for i in range(20)])
     monkeypatch.setattr(PairSet, "errors", lambda self, model: rows)
     found = PairSet(packed(tmp_path, np.arange(40.0), scale=5.0), 20, preset("small"), False).measure(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A record names the commit of the program, never that of a user's own repository."""
+"""A record contains the program's commit, never that of a user's own repository."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.evaluation import record
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """A user's, with one commit."""
+    """A user's repository with one commit."""
     for command in (
         ("init", "-q"),
         ("-c", "user.name=a", "-c", "user.email=a@b", "commit", "-q", "--allow-empty", "-mx"),
@@ -23,7 +23,7 @@ def repository(tmp_path: Path) -> Path:
 
 
 def test_the_commit_is_that_of_the_programs_own_repository(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Installed into a virtual environment below a user's repository the program has no commit."""
+    """Installed into a virtual environment below a user's repository, the program has no commit."""
     monkeypatch.setattr(record, "REPOSITORY", repository)
     commit = record.git_commit()
     assert commit is not None
@@ -41,7 +41,7 @@ def test_the_commit_is_that_of_the_programs_own_repository(repository: Path, mon
 def test_a_changed_benchmark_and_a_new_module_are_no_clean_commit(
     repository: Path, monkeypatch: pytest.MonkeyPatch, file: str, marked: bool
 ) -> None:
-    """Only files of dpm2_core that git knew counted, though a benchmark says what a success is."""
+    """Only tracked files of dpm2_core counted, although a benchmark defines what a success is."""
     monkeypatch.setattr(record, "REPOSITORY", repository)
     path = repository / file
     path.parent.mkdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves is read back as it was; what is missing is left out, what is damaged is named."""
+"""The files of a run are read back as written; missing ones are left out, damaged ones are named."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STAMPS = [10**18 + i * 10**8 for i in range(4)]
 
 
 def test_frames_loops_and_truth_read_back(tmp_path: Path) -> None:
-    """A reason may hold commas and quotes; a true pose that is not known is left out."""
+    """A reason may contain commas and quotes; an unknown true pose is left out."""
     write_tum(tmp_path / TRAJECTORY, STAMPS, POSES)
     keys = [(i, s, "tracking", "geometric") for i, s in enumerate(STAMPS)]
     write_frames(tmp_path / FRAMES, keys, {"register": [0.01, 0.02, 0.03, 0.04], "map": [0.0, 0.0, 0.5, 0.0]})
@@ -82,7 +82,7 @@ def test_another_folder_is_no_run(tmp_path: Path) -> None:
 
 
 def test_results_that_are_set_aside_again_replace_none(tmp_path: Path) -> None:
-    """A run that is resumed twice from one keyframe, as after a Ctrl-C: the first results are the longest."""
+    """A run is resumed twice from one keyframe, as after Ctrl-C: the first results are the longest."""
     for count in (3, 1, 1):
         write_tum(tmp_path / "trajectory.tum", range(count), np.tile(np.eye(4), (count, 1, 1)))
         into = set_aside(tmp_path, "before_358")

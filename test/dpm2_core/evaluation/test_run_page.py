@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report: what is on the page, and that a real browser shows it without an error and without the network."""
+"""The report: its content, and that a real browser shows it without an error and without the network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVIL = "</script><script>fetch('http://example.org')</script>"
 
 
 def write_run(folder: Path, frames: int, scale: float = 1.0) -> Path:
-    """A drive in a circle whose estimate is a scaled truth, turned, with two loops, of which one was rejected."""
+    """A drive in a circle whose estimate is the scaled and rotated truth, with two loops, of which one was rejected."""
     folder.mkdir(parents=True)
     angle = np.linspace(0, 6, frames)
     truth = se3.exp(angle[:, None] * np.array([0, 0, 1.0, 200, 0, 0]))
@@ -51,14 +51,14 @@ def write_run(folder: Path, frames: int, scale: float = 1.0) -> Path:
 
 
 def data_of(text: str) -> list[dict[str, object]]:
-    """What the script of a page reads."""
+    """The data that the script of a page reads."""
     (held,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     found: list[dict[str, object]] = json.loads(held)
     return found
 
 
 def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path: Path) -> None:
-    """Another drive stands alone; what a file says is text."""
+    """Another drive has its own group; the text of a file is escaped."""
     for name, frames, scale in (("ours", 120, 1.0), ("theirs", 120, 1.02), ("another", 60, 1.0)):
         write_run(tmp_path / name, frames, scale)
     runs = find_runs([tmp_path])
@@ -81,7 +81,7 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
 
 
 def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Path) -> None:
-    """What was measured over 20 and 50 m stood in the column of what was over 100 to 800 m, and looked twice as bad."""
+    """Errors over 20 and 50 m were in the column of errors over 100 to 800 m, and looked twice as large."""
     short, official = (write_run(tmp_path / name, 240, 1.02) for name in ("short", "official"))
     truth, est = (read_trajectory(official / f"{name}.tum").poses for name in ("ground_truth", "trajectory"))
     whole = evaluate(truth, est)
@@ -99,7 +99,7 @@ def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Pat
 
 @pytest.mark.parametrize("known", [False, True])
 def test_a_run_without_a_pose_is_on_the_page(tmp_path: Path, known: bool) -> None:
-    """As a localization leaves it that found nothing; it cost the page of all others."""
+    """A localization without a result leaves such a run; it prevented the page for all other runs."""
     write_run(tmp_path / "found", 5)
     (tmp_path / "none").mkdir()
     write_tum(tmp_path / "none" / "trajectory.tum", [], np.zeros((0, 4, 4)))
@@ -118,7 +118,7 @@ def test_a_whole_kitti_sequence_of_four_methods_is_below_five_megabytes(tmp_path
 
 
 def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
-    """A baseline and a change over the same sequences; a run that is given twice is one."""
+    """A baseline and a change over the same sequences have distinct names; a run that is given twice is listed once."""
     runs = [write_run(tmp_path / which / name, 5) for which in ("base", "new") for name in ("04", "05")]
     for given in ([tmp_path / "base", tmp_path / "new"], [*runs, tmp_path / "new"]):
         found = find_runs(given)
@@ -138,7 +138,7 @@ def test_no_folder_and_no_run_are_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH")
 def test_a_real_browser_shows_it(tmp_path: Path) -> None:
-    """No error in the console, nothing fetched; the wheel zooms, a drag moves, rejected loops appear when asked for."""
+    """No error in the console, nothing fetched; the wheel zooms, a drag moves, rejected loops can be shown."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     write_run(tmp_path / "runs" / "ours", 300)
     write_run(tmp_path / "runs" / "theirs", 300, 1.05)

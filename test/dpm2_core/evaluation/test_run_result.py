@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run notes of its frames."""
+"""What a run records about its frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dpm2_core.slam.settings import Config, SlamSettings
 
 
 def test_frames_with_a_bad_image_or_bad_times_are_counted(recording: Path) -> None:
-    """In timing.json; nothing is there where nothing was wrong."""
+    """They are in timing.json, which has no such entry if there was no problem."""
     source = open_source(recording, InputSettings(images=False))
     result = Result(source, Config(), make_mapper(SlamSettings()), None, "")
     found = Registration(np.eye(4), np.eye(6))
@@ -34,7 +34,7 @@ def test_frames_with_a_bad_image_or_bad_times_are_counted(recording: Path) -> No
 
 @pytest.mark.parametrize("numbered", [False, True])
 def test_speeds_are_those_of_the_drive_where_frames_are_missing(recording: Path, numbered: bool) -> None:
-    """20 m/s at 20 scans a second; four seconds without a scan made it 70 m/s."""
+    """20 m/s at 20 scans per second; four seconds without a scan made it 70 m/s."""
     frames = np.r_[0:60, 140:300]
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, 0, 3] = frames

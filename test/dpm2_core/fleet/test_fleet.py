@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet on a real Ray cluster: results are those of `dpm2 run`, and no fault costs more than what it hits."""
+"""A fleet on a real Ray cluster: results equal those of `dpm2 run`, and a fault affects only its own drive."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def divide(folder, advance, value):
         os.kill(os.getpid(), signal.SIGKILL)
     return {"quotient": 10 // value}
 """
-"""A drive on a disk on which no file can grow beyond 50 kB; one whose first worker dies half-way; a work that kills
-its worker, has a bug, or neither."""
+"""A drive on a disk where no file can exceed 50 kB; a drive whose first worker dies half-way; a work that kills its
+worker, has a bug, or neither."""
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def alone(drives: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def equal(one: Path, other: Path) -> None:
-    """Every file that holds no times is the same, byte for byte; and every row of the maps."""
+    """Every file without times is equal byte for byte, and so is every row of the maps."""
     for name in SAME:
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
     with MapStore.open(one / MAP) as a, MapStore.open(other / MAP) as b:
@@ -121,7 +121,7 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
     monkeypatch.setattr(tempfile, "tempdir", "/tmp")
     with subprocess.Popen("true") as ended:
         pass
-    left = Path(f"/tmp/.ray.{ended.pid}.part")  # as of a fleet that was killed
+    left = Path(f"/tmp/.ray.{ended.pid}.part")  # as left by a fleet that was killed
     left.mkdir()
     with pytest.raises(UsageError, match=r"^Ray: The current node timed out during startup\.$"):
         Cluster().start()
@@ -133,7 +133,7 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
 def test_a_fleet_gives_what_runs_give_and_goes_on_where_it_was(
     cluster: Cluster, drives: list[Path], alone: Path, tmp_path: Path
 ) -> None:
-    """A drive that cannot be read is named; what is whole stays as it is, what is damaged is done again."""
+    """A drive that cannot be read is named; complete results are kept, damaged ones are made again."""
     out = tmp_path / "out"
     done = dpm2("fleet", "run", *drives, "--out", out, *SET)
     assert done.returncode == 1
@@ -157,7 +157,8 @@ def test_a_fleet_gives_what_runs_give_and_goes_on_where_it_was(
 
 @pytest.mark.slow
 def test_a_sweep_has_a_row_for_each_combination(cluster: Cluster, drives: list[Path], tmp_path: Path) -> None:
-    """Each as it would be by itself; one that a drive fails with is counted, and compared on the others alone."""
+    """Each equals a single run; a combination that fails on a drive is counted, and compared on the other drives
+    only."""
     config, out = tmp_path / "config.yaml", tmp_path / "out"
     config.write_text("slam: {registration: geometric, threads: 1, loops: {descriptors: false}}")
     values = ["--set", "slam.map.voxel=0.3,0.6", "--set", "slam.preprocess.max_range=30,60"]
@@ -181,7 +182,7 @@ def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) 
 
 
 def test_a_drive_with_its_own_value_of_what_is_swept_is_an_error_of_use(tmp_path: Path) -> None:
-    """Its own counts for more, so all its rows were the same: as if the setting made no difference."""
+    """A drive's own value takes precedence, so all its rows were equal, as if the setting made no difference."""
     drives = [ManifestDrive(path="x", name="x", set=("slam.map.voxel=0.3", "slam.keyframes.distance = 5"))]
     with pytest.raises(UsageError, match=r"^x: has slam\.keyframes\.distance = 5 of its own"):
         list(sweep_parts(drives, tmp_path / "base.yaml", variants(["slam.keyframes.distance=4,6"])))
@@ -199,7 +200,7 @@ def test_values_of_a_sweep_may_be_lists() -> None:
     ("slam.neural.weights=a/b", "slam.neural.weights=a%2Fb"),
 ])  # fmt: skip
 def test_other_settings_have_another_folder(one: str, other: str) -> None:
-    """Else the second of two sweeps replaced the runs of the first, and of two such values one was left out."""
+    """Otherwise the second of two sweeps replaced the runs of the first, or one of two such values was left out."""
     assert not variants([one]).keys() & variants([other]).keys()
 
 
@@ -210,7 +211,7 @@ def test_the_folder_of_a_setting_is_one_name() -> None:
 
 @pytest.mark.slow
 def test_faults_cost_only_what_they_hit(cluster: Cluster, drives: list[Path], alone: Path, tmp_path: Path) -> None:
-    """A worker that is killed with -9 is replaced, a full disk leaves no drive behind; all in one fleet."""
+    """A worker that is killed with -9 is replaced; a full disk leaves no drive behind; all in one fleet."""
     parts = parts_of(read_drives(drives[:2]), None, FAST)
     names = ("killed_once", "full_disk")
     parts = [replace(part, work=f"fleet_work:{name}") for part, name in zip(parts, names, strict=True)]
@@ -226,7 +227,7 @@ def test_faults_cost_only_what_they_hit(cluster: Cluster, drives: list[Path], al
 def test_what_kills_every_worker_ends_with_a_reason(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And a bug is one line, with its place; the other parts go on."""
+    """A bug is reported as one line with its position; the other parts continue."""
     monkeypatch.setattr(ray_cluster, "MEMORY", 10**15)  # bytes that no machine has
     parts = [Part(str(value), "fleet_work:divide", {"value": value}) for value in (-1, 0, 2)]
     found = {ended.name: ended for ended in cluster.run(parts, tmp_path)}
@@ -290,7 +291,7 @@ def test_a_drive_is_done_again_when_the_weights_of_its_filter_or_its_truth_chang
 
 @pytest.mark.long
 def test_a_cluster_of_this_machine_is_not_reached_from_others(tmp_path: Path) -> None:
-    """In a process of its own, as a command is: Ray reads once, when it is imported, where it is to listen."""
+    """In a separate process, as a command is: Ray reads the address to listen on only once, when it is imported."""
     pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
     program = """
 from dpm2_core.fleet.cluster import Cluster

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map grows by a drive: as if all had been solved at once, at the cost of what the drive touches, whole or not."""
+"""A map grows by a drive: the result equals a full solution, costs only what the drive touches, and is all or
+nothing."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ SETTINGS = RobustSettings()
 
 
 def _made(path: Path, maps: Mapping[str, MapData], joins: Sequence[Join]) -> dict[str, int]:
-    """A map file of drives, solved at once; returns the keyframes of each."""
+    """Make a map file of drives, solved at once; returns the number of keyframes of each."""
     region = solve(maps, joins, SETTINGS)
     with MapStore.create(path) as store:
         add_drives(store, {}, Growth({name: _at(maps[name], T) for name, T in region.poses.items()}, region.joins))
@@ -59,7 +60,8 @@ def _poses(path: Path) -> np.ndarray:
 
 
 def test_drives_one_by_one_come_to_lie_where_all_at_once_would_put_them(tmp_path: Path) -> None:
-    """Also one that has joins to the map by another new one alone; false joins are told, and the file is sound."""
+    """This includes a drive with joins to the map only through another new one; false joins are rejected; the file is
+    sound."""
     _, maps, joins = fleet_maps(6)
     names = list(maps)
     whole, path = solve(maps, joins, SETTINGS), tmp_path / "map"
@@ -86,7 +88,7 @@ def test_drives_one_by_one_come_to_lie_where_all_at_once_would_put_them(tmp_path
 
 
 def test_what_a_new_drive_does_not_touch_is_neither_read_nor_moved(tmp_path: Path) -> None:
-    """Of 20 drives one at the end; the rows of far ones are damaged, which a reader would complain of."""
+    """Of 20 drives, one at the end is added; the rows of far ones are damaged, which any reader would report."""
     _, maps, joins = fleet_maps(20)
     names, path = list(maps), tmp_path / "map"
     inside = _made(path, {name: maps[name] for name in names[:-1]}, _of(joins, names[:-1]))
@@ -100,7 +102,7 @@ def test_what_a_new_drive_does_not_touch_is_neither_read_nor_moved(tmp_path: Pat
 
 
 def test_a_drive_that_meets_hundreds_of_others_is_added(tmp_path: Path) -> None:
-    """As the way to a depot. SQLite took no question about more than 500 drives."""
+    """As the road to a depot does. SQLite accepted no query about more than 500 drives."""
     poses, names, path = fleet_maps(1)[0]["d0"][:3], [f"d{number:03}" for number in range(502)], tmp_path / "map"
     maps = {name: _at(drive_map(poses, number), poses) for number, name in enumerate(names)}
     same = Registration(np.eye(4), FIRM)
@@ -157,7 +159,7 @@ def test_a_damaged_map_is_an_error_that_names_it(tmp_path: Path, damage: str) ->
 
 
 def test_a_ring_that_closes_moves_what_it_must(tmp_path: Path) -> None:
-    """A last drive ties the first to the last: the whole way between gives in, as when all is solved at once."""
+    """A last drive connects the first to the last: all drives in between are moved, as in a full solution."""
     truth, maps, joins = fleet_maps(6, turn=2 * np.pi / 240)
     names, path = list(maps), tmp_path / "map"
     T = se3.inverse(truth["d0"][:20]) @ truth["d5"][40:]
@@ -173,7 +175,8 @@ def test_a_ring_that_closes_moves_what_it_must(tmp_path: Path) -> None:
 
 
 def test_a_drive_that_the_map_contradicts_stays_out(tmp_path: Path) -> None:
-    """Its joins agree with two places of the map that are not one: none of both remains, or what remains is right."""
+    """Its joins agree with two different places of the map: either none of both remain, or the remaining ones are
+    right."""
     _, maps, joins = fleet_maps(3)
     path = tmp_path / "map"
     inside = _made(path, {name: maps[name] for name in ("d0", "d1")}, _of(joins, ["d0", "d1"]))
@@ -203,7 +206,7 @@ ORIGIN = np.array([49.0, 8.4, 110.0])
 
 
 def _with_fixes(data: MapData, true: np.ndarray) -> MapData:
-    """The map of a drive with a fix at each of its true places (N, 4, 4) about ORIGIN, which knows where it is."""
+    """The map of a drive with a fix at each of its true poses (N, 4, 4) about ORIGIN, and with its georeference."""
     places = geodesy.geodetic((geodesy.enu_frame(ORIGIN) @ true)[:, :3, 3])
     fixes = [Fix(i, place, np.eye(3) * 0.02**2, np.zeros(3)) for i, place in enumerate(places)]
     keyframes = [replace(keyframe, fix=fix) for keyframe, fix in zip(data.keyframes, fixes, strict=True)]
@@ -212,7 +215,7 @@ def _with_fixes(data: MapData, true: np.ndarray) -> MapData:
 
 @pytest.mark.parametrize("late", [False, True])
 def test_a_map_takes_over_where_it_is_from_the_first_drive_that_knows(tmp_path: Path, late: bool) -> None:
-    """The first two of three do not; `late`: the third comes into a map that is there."""
+    """The first two of three drives have none; `late`: the third is added to an existing map."""
     truth, maps, joins = fleet_maps(3)
     maps["d2"] = _with_fixes(maps["d2"], truth["d2"])
     names, path = list(maps), tmp_path / "map"
@@ -232,4 +235,4 @@ def test_a_map_takes_over_where_it_is_from_the_first_drive_that_knows(tmp_path: 
     T_ecef_map = geodesy.enu_frame(data.georeference.origin) @ data.georeference.T_enu_map
     own = se3.inverse(geodesy.enu_frame(ORIGIN)) @ T_ecef_map @ data.poses[120:]
     off = np.linalg.norm((own - truth["d2"])[:, :2, 3], axis=1)
-    assert off.max() < 1.0  # m: the odometry of 120 m has drifted, by 1 mrad a keyframe
+    assert off.max() < 1.0  # m: the odometry of 120 m has drifted, by 1 mrad per keyframe

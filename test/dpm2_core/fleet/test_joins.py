@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops between two drives that were driven in laps: what is seen once, by one cloud, counts once."""
+"""Loops between two drives in laps: what one cloud has seen once is counted once."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ LIDAR = Lidar(LidarConfig(columns=1024))
 
 
 class Asked(LoopCloser):
-    """Finds no loop, and notes for which keyframe it was asked, and which it was told that are their own."""
+    """Finds no loop, and records for which keyframe it was called, and which keyframes it was told have their own
+    clouds."""
 
     channels = None
 
@@ -50,7 +51,7 @@ class Asked(LoopCloser):
 def test_the_search_for_loops_and_the_index_know_which_keyframes_borrow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, noise: np.random.Generator
 ) -> None:
-    """Two drives of three laps past four places, all of whose later keyframes show what the first lap has seen."""
+    """Two drives of three laps past four places: all later keyframes show what the first lap has seen."""
     clouds = [noise.normal(size=(50, 4)).astype(np.float32) for _ in range(4)]
     looks = [Descriptors.of(*(noise.normal(size=(80, n)).astype(np.float32) for n in (3, 32))) for _ in range(4)]
     save_as(in_laps(clouds, np.tile(np.eye(4), (12, 1, 1)), 3, looks), path := tmp_path / "map.dpm2map")
@@ -73,8 +74,8 @@ def test_the_search_for_loops_and_the_index_know_which_keyframes_borrow(
 @pytest.mark.weights
 @pytest.mark.slow
 def test_a_drive_is_not_joined_where_another_place_that_was_passed_once_looks_alike(tmp_path: Path) -> None:
-    """The street stands twice in the map of the first drive, driven eight times, and once, where the other drive was:
-    all its keyframes were joined to the first, 500 m off."""
+    """The street is twice in the map of the first drive: at one place driven eight times, and once where the other
+    drive was. All keyframes of the other drive were joined to the first place, 500 m off."""
     at, world, describe = np.arange(55.0, 66.0, 5.0), street("suburb", 8), PlaceRecognition(load_network("small", 1))
 
     def seen(s: float, lateral: float, time: float) -> Points:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives become one map without any prior; what does not belong stays out, with its reason; a later drive is added."""
+"""Drives become one map without a prior; drives that do not fit are left out, with the reason; later ones are added."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from test.helpers.maps import ring
 
 @pytest.mark.long
 def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: Path) -> None:
-    """A drive of another town, a poisonous map and one that is not whole are named; what is added later is found."""
+    """A drive of another town, a poisonous map and an incomplete one are named; what is added later is found."""
     pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     town, other = (build_world("straight", "suburb", seed=seed, length=60.0) for seed in (3, 8))
@@ -93,7 +93,7 @@ def test_a_file_that_is_no_merge_is_not_replaced(tmp_path: Path) -> None:
 
 
 class Found:
-    """A search that knows what there is."""
+    """A search that returns known joins."""
 
     version = 1
 
@@ -117,7 +117,7 @@ class Found:
 def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
     tmp_path: Path, noise: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where only the last step fails, too: all of the new map is in FILE-wal then, but not in the file."""
+    """This includes a failure of the last step only: all of the new map is then in FILE-wal, but not in the file."""
     _, maps, joins = fleet_maps(3)
     for name, data in maps.items():
         (tmp_path / name).mkdir()
@@ -127,8 +127,8 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
     out.parent.mkdir()
     merge(tmp_path, out, SlamSettings(), nullcontext())
     before, size = check_map(out), out.stat().st_size
-    assert size > CHECKPOINT + 600_000  # else FILE-wal would be too large first, which is another error
-    monkeypatch.setattr(Found, "version", 2)  # all drives are others by now
+    assert size > CHECKPOINT + 600_000  # otherwise FILE-wal would be too large first, which is another error
+    monkeypatch.setattr(Found, "version", 2)  # all drives have changed by now
     with largest_file(size - 300_000), pytest.raises(Dpm2Error, match=r"town: not written: .*is the disk full"):
         merge(tmp_path, out, SlamSettings(), nullcontext())
     with largest_file(size // 4), pytest.raises(Dpm2Error, match="/town: "):  # not the hidden file in which it is made
@@ -142,7 +142,7 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
 def test_a_merge_that_is_stopped_at_its_end_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
-    """The map had its name, and no record of what it was: it counted as a file of another program from then on."""
+    """The map had its name, but no record of its content: from then on it counted as a file of another program."""
     out = _fleet(tmp_path, monkeypatch)
 
     def stopped(source: Path, target: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_merge_that_is_stopped_at_its_end_goes_on(
 
 
 def _fleet(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Three drives of 60 keyframes each that hang together; returns where their map is to be."""
+    """Three connected drives of 60 keyframes each; returns the path for their map."""
     _, maps, joins = fleet_maps(3)
     for name, data in maps.items():
         (folder / name).mkdir()
@@ -175,7 +175,7 @@ def _fleet(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _interrupt() -> None:
-    """As Ctrl-C while Ray ends."""
+    """Acts as Ctrl-C while Ray ends."""
     raise KeyboardInterrupt
 
 
@@ -183,7 +183,8 @@ def _interrupt() -> None:
 def test_a_drive_that_was_added_to_a_merge_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replaced: bool
 ) -> None:
-    """As by `dpm2 run --extend`, or `replaced`: another map altogether, beside the record of the merge before it."""
+    """It was added by `dpm2 run --extend`, or (`replaced`) the map is a different one, next to an older merge's
+    record."""
     out = _fleet(tmp_path, monkeypatch)
     merge(tmp_path, out, SlamSettings(), nullcontext())
     if replaced:
@@ -197,7 +198,7 @@ def test_a_drive_that_was_added_to_a_merge_is_not_lost(
 
 
 def test_a_log_that_a_map_was_moved_without_is_not_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a drive that was killed: the last keyframes of the moved map were gone with it."""
+    """The log of a drive that was killed: the last keyframes of the moved map were lost with it."""
     out = _fleet(tmp_path, monkeypatch)
     log = out.with_name(f"{out.name}-wal")
     log.write_bytes(bytes(5000))
@@ -216,7 +217,7 @@ def test_a_map_whose_record_is_damaged_is_not_replaced(tmp_path: Path, drives: s
 
 
 class Stopped(Cluster):
-    """One part ends, then Ctrl-C."""
+    """One part ends, then Ctrl-C follows."""
 
     def run(self, parts: Iterable[Part], out: Path, watch: object = None) -> Iterator[Outcome]:
         weights = SlamSettings().weights_id()
@@ -225,7 +226,7 @@ class Stopped(Cluster):
 
 
 def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
-    """It became a map of the drives that had been looked at, in place of the one of all."""
+    """It became a map of only the drives that had been processed, in place of the map of all."""
     for name, data in fleet_maps(3)[1].items():
         (tmp_path / name).mkdir()
         save_as(data, tmp_path / name / MAP)
@@ -236,7 +237,7 @@ def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
 
 
 class AtOnce(Cluster):
-    """Does its parts here, until one is interrupted."""
+    """Runs its parts in this process, until one is interrupted."""
 
     def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
         for part in parts:
@@ -247,7 +248,7 @@ class AtOnce(Cluster):
 
 
 def leave_a_map(folder: Path, advance: Advance, voxel: float, end: str) -> Figures:
-    """The work of a part: all that a merge looks at, or what keeps it from that."""
+    """The work of a part: writes all that a merge reads, or fails."""
     if end == "stopped":
         raise KeyboardInterrupt
     if end == "failed":
@@ -257,8 +258,8 @@ def leave_a_map(folder: Path, advance: Advance, voxel: float, end: str) -> Figur
 
 
 def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tmp_path: Path) -> None:
-    """Drives that failed or were not reached when they were asked for with other settings had their old maps still, and
-    these were joined with those of the new settings without a word."""
+    """Drives that failed or were not reached with other settings still had their old maps. These were joined with the
+    maps of the new settings without a message."""
 
     def run(voxel: float, ends: dict[str, str]) -> list[str]:
         work = f"{__name__}:leave_a_map"
@@ -281,14 +282,14 @@ def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tm
 
 
 def describe_as(folder: Path, name: str, vectors: Vector) -> Vector:
-    """Leave the vectors of a drive's places where its part does."""
+    """Write the vectors of a drive's places where its part does."""
     (folder / "places" / name).mkdir(parents=True)
     np.save(folder / "places" / name / "places.npy", vectors)
     return vectors
 
 
 class Described(Cluster):
-    """The places of every drive are there."""
+    """A cluster for which the places of every drive exist already."""
 
     def run(self, parts: Iterable[Part], out: Path, watch: Watch = lambda status: None) -> Iterator[Outcome]:
         for part in parts:
@@ -296,7 +297,7 @@ class Described(Cluster):
 
 
 def test_a_drive_under_two_names_is_joined_once(tmp_path: Path, noise: np.random.Generator) -> None:
-    """A recording that had been copied was in the map twice, joined with itself, without a word."""
+    """A copied recording was in the map twice, joined with itself, without a message."""
     search = Search(tmp_path, SlamSettings(), Described(), View())
     parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}, fresh=True) for name in "abc"}
     one, other = noise.normal(size=(2, 50, WIDTH)).astype(np.float32)
@@ -308,7 +309,7 @@ def test_a_drive_under_two_names_is_joined_once(tmp_path: Path, noise: np.random
 
 
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
-    """Also after one that was cut short, which counts as none."""
+    """This includes an index that was truncated, which is ignored."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     drives = [noise.normal(size=(50, WIDTH)).astype(np.float32) for _ in range(2)]
     drives[1][7] = 0  # a keyframe without descriptors
@@ -328,7 +329,7 @@ def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise:
 
 
 def test_candidates_that_are_gone_are_looked_for_anew(tmp_path: Path, noise: np.random.Generator) -> None:
-    """Damaged ones are an error that names what to remove."""
+    """Damaged ones are an error that names the file to remove."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     search = Search(tmp_path, SlamSettings(), Cluster(), View())
     parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}) for name in "ab"}
@@ -352,7 +353,7 @@ def test_candidates_that_are_gone_are_looked_for_anew(tmp_path: Path, noise: np.
 def test_late_places_and_those_in_the_graph_are_found_alike(
     tmp_path: Path, noise: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever came when, was kept, or was damaged; one that was cut short while it was saved goes on."""
+    """This holds for any order, and for a kept or damaged index; an index whose saving was interrupted continues."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
     monkeypatch.setattr("dpm2_core.fleet.places._LATE", 120)
     drives = [noise.normal(size=(50, WIDTH)).astype(np.float32) for _ in range(5)]
@@ -370,7 +371,7 @@ def test_late_places_and_those_in_the_graph_are_found_alike(
         index.save()
         if number == 2:
             whole = file.read_bytes()
-            file.write_bytes(listed)  # as by one that was killed when the graph was written, and not the list
+            file.write_bytes(listed)  # as after a kill when the graph was written, but not the list
             index = FleetIndex(tmp_path)
             assert len(index.drives) == 2
             check(index, 2)

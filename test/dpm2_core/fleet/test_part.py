@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts are done once, again when what they read has changed, and one that failed is named."""
+"""Parts run once, and again if their input has changed; a failed part is named."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def count(folder, advance, start):
         raise UsageError("below zero")
     return {"value": start + 1, "times": len(log.read_text()), "process": os.getpid()}
 """
-"""A part that leaves how often it was done."""
+"""A part that counts how often it ran."""
 
 
 @pytest.fixture(autouse=True)
 def _importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`part_work`, also in other processes."""
+    """Make `part_work` importable, also in other processes."""
     (tmp_path / "part_work.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "part_work", raising=False)
@@ -60,7 +60,7 @@ def test_what_is_done_is_not_done_again_unless_its_input_changed(tmp_path: Path)
 
 
 def test_what_read_something_else_is_done_again(tmp_path: Path) -> None:
-    """Such as a drive of which there are more frames now; a record of before, which does not say, stays."""
+    """An example is a drive that now has more frames; an older record without this information is kept."""
     assert run_parts([Part("a", WORK, {"start": 1}, content="half a drive")], tmp_path)["a"]["times"] == 1
     whole = Part("a", WORK, {"start": 1}, content="the drive")
     assert run_parts([whole], tmp_path)["a"]["times"] == 2
@@ -73,7 +73,7 @@ def test_what_read_something_else_is_done_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_parts_in_processes_of_their_own_give_the_same(tmp_path: Path) -> None:
-    """In the order that was asked for; one that fails is named all the same."""
+    """Results are in the requested order; a part that fails is named nevertheless."""
     parts = [Part(str(i), WORK, {"start": i}) for i in range(3)]
     found = run_parts(parts, tmp_path, workers=2)
     assert [figures["value"] for figures in found.values()] == [1, 2, 3]
@@ -97,7 +97,8 @@ def test_a_damaged_record_is_made_anew(tmp_path: Path) -> None:
 
 
 def test_a_fresh_part_is_whole_or_not_there(tmp_path: Path) -> None:
-    """Its folder appears when all is in it; what is cut short later, or left by a kill, is not taken for whole."""
+    """Its folder appears only when complete; one that was truncated later, or left by a kill, does not count as
+    complete."""
     part, out = Part("a", WORK, {"start": 1}, fresh=True), tmp_path / "out"
     with pytest.raises(UsageError, match="below zero"):
         do_part(Part("a", WORK, {"start": -1}, fresh=True), out)

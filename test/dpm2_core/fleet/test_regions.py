@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a fleet in stages is the graph of the whole."""
+"""Solving a fleet's graph in stages gives the graph of the whole."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from test.helpers.fleets import fleet_maps
 
 
 def test_stages_give_the_poses_of_the_whole_and_refuse_what_cannot_be() -> None:
-    """Regions of two drives, then their borders, as all at once: the wrong loops are told, the right ones kept."""
+    """Regions of two drives, then their borders, equal a full solution: wrong loops are rejected, right ones kept."""
     truth, maps, joins = fleet_maps(5)
     sizes = {name: len(data) for name, data in maps.items()}
     assert [len(regions_of(sizes, joins, largest)) for largest in (1000, 130)] == [1, 3]
@@ -26,4 +26,4 @@ def test_stages_give_the_poses_of_the_whole_and_refuse_what_cannot_be() -> None:
     for name in maps:
         np.testing.assert_allclose(staged.poses[name], whole.poses[name], atol=0.02)
     true = np.concatenate(list(truth.values()))
-    assert ape_rmse(true, np.concatenate(list(whole.poses.values()))) < 2.0  # 600 m, by 1 mrad a keyframe
+    assert ape_rmse(true, np.concatenate(list(whole.poses.values()))) < 2.0  # 600 m, by 1 mrad per keyframe

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the terminal says of a fleet."""
+"""What the terminal shows of a fleet."""
 
 from __future__ import annotations
 
