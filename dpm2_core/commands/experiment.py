@@ -49,7 +49,7 @@ def experiment(
 
     A stopped experiment continues where it was: every part (a method on a sequence, a training) is done only once.
     """
-    from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what the lists need, not torch
+    from dpm2_core.experiments.registry import EXPERIMENTS, carry_out  # imports what --list needs, not torch
     from dpm2_core.experiments.request import Request
     from dpm2_core.experiments.table import shown
     from dpm2_core.fleet.part import Progress

@@ -61,7 +61,7 @@ class AblationSettings(Settings):
 
 
 COMPARED = ("near_m", "near_success", "far_success", "turned_success")
-"""Figures of which the gain is stated."""
+"""Figures for which the gain is reported."""
 Table = dict[str, dict[str, dict[str, list[float]]]]
 """Figures of `PairSet.measure` by variant and drives: one value per seed."""
 

@@ -144,7 +144,7 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
         UsageError: no such file, or it is of other frames.
     """
     found = read_trajectory(file)
-    if found.kind == "kitti" and len(found) != len(truth):  # of the whole recording, or of one that it is a part of
+    if found.kind == "kitti" and len(found) != len(truth):  # of the whole recording, or of a longer one
         whole = read_ground_truth(source, file, *span)
         assert isinstance(whole, np.ndarray)
         return whole

@@ -154,7 +154,7 @@ def _judged(
 
 
 def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
-    """The same, but replaced where few pairs fit, as on both sides of a corner, and another pose is clearly more
+    """The solution, replaced where few pairs fit, as on both sides of a corner, and another pose is clearly more
     probable."""
     rows = (solved.share < FEW).nonzero()[:, 0]
     if len(rows) == 0:

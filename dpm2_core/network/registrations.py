@@ -72,7 +72,7 @@ def _registration(
 ) -> Registration:
     if not bool(T.isfinite().all() and covariance.isfinite().all()):
         return Registration.failed("neural", "no finite pose")
-    # Rigid to float64: the solver composes many steps, and an exponential of a large one leaves 1 + 2e-15 behind.
+    # Rigid to float64: the solver composes many steps, and the exponential of a large one is rigid only to 2e-15.
     rigid = se3.orthonormalized(T.double().numpy())
     result = Registration(rigid, covariance.numpy(), confidence, rmse, "neural", not objection, objection, overlap)
     return with_calibration(result, rigid)

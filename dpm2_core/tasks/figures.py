@@ -20,7 +20,7 @@ _FAR = 40.0  # m, the last color of a range image, and the edge of the view from
 def dynamic_objects_png(
     path: Path, points: NDArray[np.float32], found: NDArray[np.bool_], truth: NDArray[np.bool_]
 ) -> None:
-    """Points (N, 3+) from above, x upwards, with what was found to be a dynamic object (N,) and what is one (N,).
+    """Draw points (N, 3+) from above, x upwards: dynamic objects as found (N,) and as true (N,).
 
     Raises:
         Dpm2Error: the file could not be written.
@@ -41,9 +41,9 @@ def dynamic_objects_png(
 
 
 def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, settings: GroundSettings) -> None:
-    """Elevation (cells, cells) found, that of the labels (NaN where unknown) and their difference, x upwards.
+    """Draw the elevation (cells, cells) found, that of the labels (NaN where unknown) and their difference, x upwards.
 
-    On the first, the points (N, 4) that stand above it.
+    The first one shows the points (N, 4) above it.
 
     Raises:
         Dpm2Error: the file could not be written.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DSLR (Kumar et al., AAAI 2021): a scan without what moves, from one with it, by an adversarially trained autoencoder.
+"""DSLR (Kumar et al., AAAI 2021): removes moving objects from a scan, by an adversarially trained autoencoder.
 
-An autoencoder learns static scans; a discriminator learns to distinguish a pair of static codes from a static and a
-dynamic one; then a copy of the encoder learns to give dynamic scans codes that pass for static and decode to the
-static twin.
+An autoencoder learns static scans. A discriminator learns to distinguish a pair of static codes from a static and a
+dynamic one. Then a copy of the encoder learns to map dynamic scans to codes that the discriminator takes for static and
+that decode to the static twin.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dpm2_core.network.perception.range_image import (
 )
 from dpm2_core.network.perception.task_weights import load_network
 
-_TALLEST = 42  # rows that the decoder makes; the image is cut from them
+_TALLEST = 42  # rows that the decoder makes; the image is cropped from them
 
 
 class DslrSettings(Settings):
@@ -37,13 +37,13 @@ class DslrSettings(Settings):
     image: RangeImageSettings = RangeImageSettings()
     """Geometry of the scans, at most 42 rows."""
     channels: int = Field(default=64, ge=4)
-    """Of the first layer; the innermost has eight times as many."""
+    """Channels of the first layer; the innermost has eight times as many."""
     latent: int = Field(default=160, ge=8, multiple_of=8)
     """Length of the code of a scan."""
 
 
 class RangeEncoder(nn.Module):
-    """Images (B, 2, rows, columns) to codes (B, latent). The layers see the points that the slots stand for."""
+    """Images (B, 2, rows, columns) to codes (B, latent). The layers read the points of the slots."""
 
     def __init__(self, settings: DslrSettings) -> None:
         """Default settings: 2.544 million parameters."""
@@ -92,9 +92,9 @@ class RangeDecoder(nn.Module):
 
 
 class PairDiscriminator(nn.Module):
-    """Two codes (B, latent) each to a logit (B,): positive where both are taken for static scans.
+    """Two codes (B, latent) each to a logit (B,): positive if both are taken for static scans.
 
-    With leaky units within; sigmoids, as in the original, barely pass a gradient through five layers.
+    It has leaky units; sigmoids, as in the original, hardly pass a gradient through five layers.
     """
 
     def __init__(self, settings: DslrSettings) -> None:
@@ -134,7 +134,7 @@ class Dslr(nn.Module):
 
     @torch.no_grad()
     def translate(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Image (2, rows, columns) of the static scan, and (rows, columns) bool which slots the scan has a point in.
+        """Image (2, rows, columns) of the static scan, and (rows, columns) bool, the slots with a point of the scan.
 
         Args:
             points: (N, 3+) m; those outside the image are not used.
@@ -150,12 +150,12 @@ class Dslr(nn.Module):
         return ~(self.in_front(d, image[0].flatten()[slot]) & inside)
 
     def in_front(self, d: Tensor, static: Tensor) -> Tensor:
-        """Where distances (...), in units of the scale, are so much less than those of the static scan that something
-        which will not stay stands in between: by a fifth and a meter, which is more than the translation errs."""
+        """Where distances (...), in units of the scale, are so much less than those of the static scan that a temporary
+        object must be in between: by a fifth and a meter, which is more than the error of the translation."""
         return d < 0.8 * static - 1.0 / self.settings.image.scale
 
     def static_points(self, points: Tensor) -> Tensor:
-        """The translated scan (M, 3), m: one point for each slot that the scan (N, 3+) has a point in."""
+        """The translated scan (M, 3), m: one point for each slot in which the scan (N, 3+) has a point."""
         image, mask = self.translate(points)
         return to_points(image, self.settings.image.scale)[mask.flatten()]
 
@@ -166,7 +166,7 @@ def load(path: Path) -> Dslr:
 
 
 def initialize(module: nn.Module) -> None:
-    """Weights of the original: normal, 0.02 wide."""
+    """Set the initial weights of the original: normal, with a standard deviation of 0.02."""
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
         nn.init.normal_(module.weight, 0.0, 0.02)
     elif isinstance(module, nn.BatchNorm2d):
@@ -189,7 +189,7 @@ def down(
 def up(
     inputs: int, outputs: int, kernel: int | tuple[int, int], stride: int, padding: int | tuple[int, int]
 ) -> list[nn.Module]:
-    """Layers of a decoder: twice the size, or what the kernel makes of it."""
+    """Layers of a decoder: twice the size, or as the kernel determines."""
     return [
         nn.ConvTranspose2d(inputs, outputs, kernel, stride, padding, bias=False),
         nn.BatchNorm2d(outputs),

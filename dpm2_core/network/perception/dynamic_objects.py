@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which points of one scan are of things that move, or could: a small encoder-decoder over a grid seen from above.
+"""Detects points of one scan on objects that move or could move: a small encoder-decoder over a grid seen from above.
 
-A column of the grid says in which layers of height above the ground it has points; the output has the same shape. Only
-occupancy goes in, no counts, no intensity and no height of the sensor: so that another LiDAR looks much the same.
+A column of the grid has a value for each layer of height above the ground: whether it has points there. The output has
+the same shape. Only occupancy is used, no counts, intensity or sensor height, so that other LiDARs look much the same.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class DynamicObjectNetSettings(Settings):
     """Grid and network of the dynamic objects."""
 
     cells: int = Field(default=200, ge=16, multiple_of=8)
-    """Of the grid along x and along y; the sensor is in its middle. What lies off it counts as standing."""
+    """Cells of the grid along x and along y; the sensor is at its center. Points off the grid count as static."""
     cell: float = Field(default=0.4, gt=0)
     """Edge of a cell, m."""
     channels: int = Field(default=24, ge=4)
-    """Of the finest layers; the coarser ones have two and three times as many."""
+    """Channels of the finest layers; the coarser ones have two and three times as many."""
 
 
 class DynamicObjectNet(nn.Module):
-    """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of being a dynamic object in each of its voxels, the same
+    """Occupancy (B, 7, cells, cells), 0 or 1, to the logit of a dynamic object in each of its voxels, in the same
     shape."""
 
     range: Tensor
@@ -57,7 +57,7 @@ class DynamicObjectNet(nn.Module):
         self.head = nn.Conv2d(c, planes, 1)
         half = settings.cells // 2
         axis = (torch.arange(half) + 0.5) / half * 2 - 1
-        away = torch.hypot(axis[:, None], axis[None])  # points are the fewer the farther away
+        away = torch.hypot(axis[:, None], axis[None])  # points are fewer at larger distances
         self.register_buffer("range", away[None, None], persistent=False)
 
     def forward(self, occupied: Tensor) -> Tensor:
@@ -73,7 +73,7 @@ class DynamicObjectNet(nn.Module):
 
     @torch.inference_mode()
     def probability(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N,) 0..1 of (N, 3+) points of one scan, m, in a frame whose z is about up; 0 off the grid."""
+        """Probability (N,) 0..1 of (N, 3+) points of one scan, m, in a frame with z about up; 0 off the grid."""
         voxel, inside = voxels(points, self.settings)
         occupied = occupancy([voxel[inside]], self.settings).to(self.range.device)
         with mixed_precision(occupied.device):

@@ -2,7 +2,7 @@
 """GndNet (Paigwar et al., IROS 2020): the height of the ground in a grid around the sensor, from one scan.
 
 Pillars of points, a feature of each by a small network and a maximum, and an encoder-decoder over the grid. Points are
-scattered into the grid by themselves, so that a pillar may have any number of them; the original takes at most 100.
+scattered into the grid one by one, so that a pillar may have any number of them; the original takes at most 100.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class GroundSettings(Settings):
     """Grid, network and loss of the ground."""
 
     cells: int = Field(default=100, ge=8, multiple_of=4)
-    """Of the grid along x and along y; the sensor is in its middle."""
+    """Cells of the grid along x and along y; the sensor is at its center."""
     cell: float = Field(default=1.0, gt=0)
     """Edge of a cell, m."""
     sensor_height: float = 1.733
-    """Of the LiDAR above the ground that it stands on, m."""
+    """Height of the LiDAR above the ground below it, m."""
     height_range: float = Field(default=4.0, gt=0)
     """Points farther than this above or below that ground are not used, m."""
     channels: int = Field(default=64, ge=4)
-    """Of a pillar's feature; the inner layers have two and four times as many."""
+    """Channels of a pillar's feature; the inner layers have two and four times as many."""
     threshold: float = 0.2
     """A point higher above the ground is an obstacle, m."""
     softness: float = Field(default=0.05, gt=0)
@@ -42,8 +42,8 @@ class GroundSettings(Settings):
     smoothness: float = Field(default=0.1, ge=0, le=1)
     """Fraction of the loss that is the curvature of the ground."""
     curvature: Literal["squared", "absolute"] = "squared"
-    """Second differences along x and y, squared; or, as the authors have them, absolute and the mixed ones twice, which
-    weighs a bend of 0.1 m ten times as much."""
+    """Second differences along x and y, squared. Or, as in the authors' code, absolute and the mixed ones twice, which
+    weights a bend of 0.1 m ten times as much."""
 
 
 class GroundNet(nn.Module):
@@ -60,7 +60,7 @@ class GroundNet(nn.Module):
         self.head = nn.Conv2d(c, 1, 3, padding=1)
 
     def forward(self, scans: Sequence[Tensor]) -> Tensor:
-        """Height in every cell, also where the scan has no point.
+        """Height in every cell, also in cells without points.
 
         Args:
             scans: B of (N_b, 4) [x, y, z m, intensity 0..1]; points outside the grid or not finite are not used.
@@ -78,7 +78,7 @@ class GroundNet(nn.Module):
         return self.head(x)[:, 0] - self.settings.sensor_height
 
     def _scattered(self, scan: Tensor) -> Tensor:
-        """(channels, cells, cells) features of the pillars of one scan, zero where there are no points."""
+        """(channels, cells, cells) features of the pillars of one scan, zero for cells without points."""
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise UsageError(f"GroundNet: a scan of shape {tuple(scan.shape)}; want (N, 4)")
         s = self.settings
@@ -95,7 +95,7 @@ class GroundNet(nn.Module):
         own = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - center], 1)
         features = functional.relu(self.pillar(own))
         out = features.new_zeros(s.cells**2, features.shape[1])
-        out = out.scatter_reduce(0, cell[:, None].expand_as(features), features, "amax")  # ReLU: zero is the least
+        out = out.scatter_reduce(0, cell[:, None].expand_as(features), features, "amax")  # ReLU: zero is the minimum
         return out.T.unflatten(1, (s.cells, s.cells))
 
 
@@ -113,13 +113,13 @@ def cell_of(points: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
 
 
 def _sums(cell: Tensor, values: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
-    """How many points are in each cell (cells^2,), and the sum (cells^2, ...) of their values (N, ...)."""
+    """Number of points in each cell (cells^2,), and the sum (cells^2, ...) of their values (N, ...)."""
     count = values.new_zeros(settings.cells**2).index_add_(0, cell, values.new_ones(len(cell)))
     return count, values.new_zeros(settings.cells**2, *values.shape[1:]).index_add_(0, cell, values)
 
 
 def elevation_labels(points: Tensor, ground: Tensor, settings: GroundSettings) -> tuple[Tensor, Tensor]:
-    """Mean height (cells, cells), m, of the ground points of a scan, and where there are any (cells, cells) bool.
+    """Mean height (cells, cells), m, of the ground points of a scan, and (cells, cells) bool, the cells with any.
 
     The original fits a surface by a conditional random field, whose code is not public.
 
@@ -142,8 +142,8 @@ def ground_loss(elevation: Tensor, labels: Tensor, known: Tensor, settings: Grou
     """Smooth L1 over the cells that are known, and the curvature of the whole map; a scalar.
 
     Args:
-        elevation, labels: (B, cells, cells) m. known: (B, cells, cells) bool, or how much a cell counts, 0..1; none
-            known gives the curvature alone.
+        elevation, labels: (B, cells, cells) m. known: (B, cells, cells) bool, or the weight of a cell, 0..1; without a
+            known cell the loss is only the curvature.
     """
     requested = torch.where(known > 0, labels, elevation.detach())
     error = functional.smooth_l1_loss(elevation, requested, reduction="none")
@@ -166,9 +166,9 @@ def height_above(points: Tensor, elevation: Tensor, settings: GroundSettings) ->
 
 
 def obstacle_weight(points: Tensor, elevation: Tensor, settings: GroundSettings) -> Tensor:
-    """(N,) 0..1: how much a point belongs to what stands on the ground; zero off the grid.
+    """(N,) 0..1: how far a point is on an object above the ground; zero off the grid.
 
-    The threshold of the evaluation made soft, so that the SLAM loss reaches the elevation: a mask has no gradient.
+    This is a soft threshold of the evaluation, so that the SLAM loss reaches the elevation: a mask has no gradient.
     """
     above = height_above(points, elevation, settings)
     return torch.sigmoid((above - settings.threshold) / settings.softness) * cell_of(points, settings)[1]
@@ -177,12 +177,12 @@ def obstacle_weight(points: Tensor, elevation: Tensor, settings: GroundSettings)
 def ground_metrics(
     points: Tensor, ground: Tensor, counted: Tensor, elevation: Tensor, settings: GroundSettings
 ) -> dict[str, float]:
-    """Of one scan: `mse` (m2) of the ground's height, and `miou`, `precision`, `recall` of the obstacles, each 0..1.
+    """Figures of a scan: `mse` (m2) of the ground's height; `miou`, `precision`, `recall` of the obstacles, each 0..1.
 
-    And what the authors' evaluation prints: `ground_iou`, `ground_precision` and `ground_recall`, which are of the
-    ground, and `mse_authors` (m2), where the points of a cell are counted from one, which draws its mean height towards
-    the level that the car stands on. A figure is NaN where the scan has nothing that it is of; `miou` is then of the
-    other class alone.
+    And those that the authors' evaluation prints: `ground_iou`, `ground_precision` and `ground_recall` of the ground,
+    and `mse_authors` (m2). There the points of a cell are counted from one, which draws its mean height towards the
+    ground level at the car. A figure is NaN if the scan has nothing to measure for it; `miou` is then of the other
+    class only.
 
     Args:
         points: (N, 3+) m. ground: (N,) bool. counted: (N,) bool, false for points without a class.
@@ -215,7 +215,7 @@ def _ratio(part: float, whole: float) -> float:
 
 
 def _mse_authors(points: Tensor, elevation: Tensor, settings: GroundSettings) -> float:
-    """The authors' mean squared error, m2, of ground points (N, 3+): heights above the level that the car stands on."""
+    """The authors' mean squared error, m2, of ground points (N, 3+): heights above the ground level at the car."""
     cell, inside = cell_of(points, settings)
     count, total = _sums(cell[inside], points[inside, 2] + settings.sensor_height, settings)
     error = (elevation.flatten() + settings.sensor_height - total / (count + 1))[count > 0]

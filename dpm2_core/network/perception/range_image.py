@@ -17,24 +17,24 @@ from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 
 CHANNELS = 2
-"""Of an image: d = sqrt(x^2 + y^2) and z, both in units of `scale`."""
-_REACH = 2  # slots that one step of filling goes on each side: a 5 x 5 pool
+"""Channels of an image: d = sqrt(x^2 + y^2) and z, both in units of `scale`."""
+_REACH = 2  # slots on each side that one step of filling covers: a 5 x 5 pool
 
 
 class RangeImageSettings(Settings):
     """Geometry of a range image; the default is the upper part of a 64-beam sensor, 40 x 256 as in the papers."""
 
     beams: tuple[tuple[float, float, int], ...] = ((2.0, -8.33, 32), (-8.83, -24.8, 32))
-    """Groups of evenly spaced beams from the top: elevation of the first and the last, deg, and how many.
+    """Groups of evenly spaced beams from the top: elevation of the first and the last, deg, and their number.
     VLP-16: ((15, -15, 16),)."""
     first: int = Field(default=5, ge=0)
     """Beam of the top row."""
     rows: int = Field(default=40, ge=4)
     """Beams of the image."""
     columns: int = Field(default=256, ge=64, multiple_of=64)
-    """Slots of a turn, from straight ahead to the left."""
+    """Slots of a revolution, from straight ahead to the left."""
     scale: float = Field(default=120.0, gt=0)
-    """Distance that counts as one, m; points farther away are not used."""
+    """Distance that is one in the image, m; points farther away are not used."""
     min_distance: float = Field(default=2.65, gt=0)
     """Points nearer than this, over ground, are not used, m."""
 
@@ -62,14 +62,14 @@ def elevations(settings: RangeImageSettings) -> Tensor:
 
 
 def azimuths(columns: int) -> Tensor:
-    """(columns,) azimuth of the middle of each column, rad."""
+    """(columns,) azimuth of the center of each column, rad."""
     return (torch.arange(columns) + 0.5) * (2 * math.pi / columns)
 
 
 def slots(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]:
     """Index (N,) of the slot of each point, row by row, and whether it is in the image at all (N,) bool.
 
-    Points that are not finite, too near, too far, or above or below the rows are not.
+    Points that are not finite, too near, too far, or above or below the rows are outside.
 
     Args:
         points: (N, 3+) m, of any dtype.
@@ -79,7 +79,7 @@ def slots(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]
     inside = points[:, :3].isfinite().all(1) & (d >= settings.min_distance) & (d < settings.scale)
     elevation = torch.atan2(points[:, 2], d)
     middle = (beams[1:] + beams[:-1]) / 2
-    above, below = beams[0] - middle[0], middle[-1] - beams[-1]  # half of the distance to a beam beyond the image
+    above, below = beams[0] - middle[0], middle[-1] - beams[-1]  # half the spacing to a beam beyond the image
     inside &= (elevation <= beams[0] + above) & (elevation > beams[-1] - below)
     row = torch.searchsorted(-middle, -elevation.nan_to_num())
     turn = torch.remainder(torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi), 1).nan_to_num()
@@ -87,9 +87,9 @@ def slots(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]
 
 
 def project(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]:
-    """Image (2, rows, columns), zero where there is no point, and where there is one (rows, columns) bool.
+    """Image (2, rows, columns), zero in slots without a point, and (rows, columns) bool, the slots with one.
 
-    Of several points in a slot the mean of d and z is taken. Points outside the image are left out, see `slots`.
+    For several points in a slot the mean of d and z is used. Points outside the image are left out, see `slots`.
 
     Args:
         points: (N, 3+) m, of any dtype.
@@ -105,9 +105,9 @@ def project(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tenso
 
 
 def fill(image: Tensor, mask: Tensor) -> Tensor:
-    """The image (..., 2, R, C) with every empty slot given the values of the farthest of the slots around it.
+    """The image (..., 2, R, C) in which every empty slot has the values of the farthest of the slots around it.
 
-    A 5 x 5 maximum over d, repeated until no slot is empty; z is of the same slot, and the columns are a circle. An
+    A 5 x 5 maximum over d is repeated until no slot is empty; z is from the same slot, and the columns are a circle. An
     image without any point stays zero.
 
     Args:
@@ -129,7 +129,7 @@ def to_points(image: Tensor, scale: float) -> Tensor:
     """Points (..., R * C, 3), m, of images (..., 2, R, C) by the fixed azimuth of their columns; differentiable.
 
     Args:
-        scale: m that one stands for.
+        scale: distance of a value of one, m.
     """
     angle = azimuths(image.shape[-1]).to(image)
     d, z = image[..., 0, :, :], image[..., 1, :, :]
@@ -137,5 +137,5 @@ def to_points(image: Tensor, scale: float) -> Tensor:
 
 
 def _around(channel: Tensor) -> Tensor:
-    """(B, 1, R, C) with the columns of the other end put at each end."""
+    """(B, 1, R, C), padded at each end with the columns of the other end."""
     return torch.cat([channel[..., -_REACH:], channel, channel[..., :_REACH]], -1)

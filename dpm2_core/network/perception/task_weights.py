@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights of a task as safetensors: they name the task and the settings of its network, and fit both or are
-rejected."""
+"""Weights of a task as safetensors: they contain the task and the settings of its network, and are rejected if they do
+not fit both."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_weights(
 
 
 def read_weights(path: Path, name: str, kind: type[T]) -> tuple[dict[str, Tensor], T]:
-    """The tensors, and the settings of the network that they are of.
+    """The tensors, and the settings of their network.
 
     Raises:
         UsageError: no such file, a pickle, weights of another task, or settings that are missing or wrong.
@@ -41,7 +41,7 @@ def load_network(path: Path, name: str, part: str, kind: type[T], make: Callable
     """The network of a trained task on the CPU, ready for inference, from what `dpm2 train NAME` wrote.
 
     Args:
-        part: what the task that was trained calls it. kind: its settings; `make` builds it from them.
+        part: name of the network in the trained task. kind: its settings; `make` builds it from them.
 
     Raises:
         UsageError: no such file, a pickle, weights of another task, other settings or shapes, values not finite.
