@@ -69,7 +69,7 @@ def merge(
 ) -> None:
     """Join the drives of a folder into one map by the places that they share. No initial poses are needed.
 
-    Drives that are new since the last call are added to the existing map. The cost depends on what they touch there.
+    Drives that are new since the last call are added to the existing map, at the cost of the part that they touch.
     """
     from dpm2_core.fleet.merge import merge as merged_map
 
