@@ -1,5 +1,5 @@
 "use strict";
-// The map in WebGL: points of which every beginning shows the whole map, so that only as many are drawn as there is time for.
+// The map in WebGL: the first n points show the whole map for every n, so that only as many are drawn as time permits.
 const data = JSON.parse(document.getElementById("data").textContent);
 const canvas = document.getElementById("view"), panel = document.getElementById("panel"), label = document.getElementById("distance");
 const gl = canvas.getContext("webgl", { antialias: false, preserveDrawingBuffer: true });
@@ -54,7 +54,7 @@ const plain = program(
 const where = { m: dots.of("m"), scale: dots.of("scale"), size: dots.of("size"), heights: dots.of("heights") };
 const line = { m: plain.of("m"), size: plain.of("size"), color: plain.of("color") };
 
-// ---- the eye: it looks at `target` from `distance` m away, turned by `turn` and tilted by `tilt` rad
+// ---- the eye (the viewpoint): it looks at `target` from a distance of `distance` m, rotated by `turn` and tilted by `tilt` rad
 
 const reach = Math.max(20, ...keyframes.map(p => Math.hypot(p[0], p[1])));
 const home = () => ({ target: [0, 0, 0], distance: 2.4 * reach, turn: -Math.PI / 2, tilt: 1.0 });
@@ -72,7 +72,7 @@ function matrix() {
     x * right[2], f * up[2], a * back[2], -back[2], x * dot(right), f * dot(up), a * dot(back) + b, -dot(back)]) };
 }
 
-/** Where a place of the map is on the screen, CSS pixels from the upper left; null behind the eye. */
+/** Screen position of a map position, CSS pixels from the upper left; null behind the eye. */
 function project(p, m = matrix().m) {
   const w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
   if (w <= 0) return null;
@@ -80,7 +80,7 @@ function project(p, m = matrix().m) {
   return [(x + 1) / 2 * canvas.clientWidth, (1 - y) / 2 * canvas.clientHeight, w];
 }
 
-// ---- drawing: while the view moves as many points as a thirtieth of a second has room for, then the others on top
+// ---- drawing: while the view moves, as many points as fit into a thirtieth of a second; then the others on top
 
 const on = id => document.getElementById(id).checked;
 let budget = 40000, drawn = 0, moved = true, last = 0, frames = 0, rate = 0, since = performance.now();
@@ -145,7 +145,7 @@ function nearest(x, y, within) {
   return best;
 }
 
-/** The point of the cloud that is seen at a place of the screen: of those near by the one that is nearest to the eye. */
+/** The cloud point that is seen at a screen position: of the points near it, the one nearest to the eye. */
 function surface(x, y) {
   const { m } = matrix(), s = data.scale;
   let best = null, score = Infinity;
@@ -255,5 +255,5 @@ document.getElementById("status").textContent =
 new ResizeObserver(resize).observe(canvas);
 resize();
 requestAnimationFrame(frame);
-// For scripts that look at the page: where a keyframe or a place of the map is on the screen, points drawn so far, frames a second while it moves.
+// For scripts that check the page: screen position of a keyframe or a map position, points drawn so far, frames per second while it moves.
 window.dpm2 = { project: i => project(keyframes[i]), at: p => project(p.map((v, i) => v - data.middle[i])), points: COUNT, get drawn() { return drawn; }, get rate() { return rate; } };

@@ -1,5 +1,5 @@
 "use strict";
-// Draws what run_page.py put into the page: a map, charts and states for each group of runs of one drive.
+// Draws the data that run_page.py put into the page: a map, charts and states for each group of runs of one drive.
 const COLORS = ["#d9480f", "#1971c2", "#2f9e44", "#9c36b5", "#e8590c", "#0c8599", "#c2255c", "#5c940d", "#6741d9", "#846358"];
 const STATES = { tracking: "#2f9e44", degraded: "#f08c00", lost: "#e03131", initialising: "#868e96" };
 const SVG = "http://www.w3.org/2000/svg";
@@ -169,7 +169,7 @@ for (const group of JSON.parse(document.getElementById("data").textContent)) {
   const charts = html("div", "", section, "charts"), of = (pick) => group.runs.map((run, i) => [i, pick(run)]);
   chart(charts, "Translation error by length, %", "m", of((run) => run.byLength.map((row) => [row[0], row[1]])));
   chart(charts, "Rotation error by length, deg/100 m", "m", of((run) => run.byLength.map((row) => [row[0], row[2]])));
-  // Errors by speed are means over all lengths: of other lengths they are other figures.
+  // Errors by speed are means over all lengths: with other lengths they are other figures.
   for (const lengths of new Set(group.runs.map((run) => run.segments))) {
     const bySpeed = (k) => of((run) => (run.segments === lengths ? run.bySpeed : []).map((row) => [row[0], row[k]]));
     chart(charts, `Translation error by speed, %${lengths}`, "m/s", bySpeed(1));
