@@ -140,7 +140,7 @@ def make_peer(name: str, threads: int, deskew: bool) -> Peer:
     """The program of that name.
 
     Raises:
-        UsageError: there is none, or it is not installed.
+        UsageError: no such program, or it is not installed.
     """
     if name not in PEERS:
         raise UsageError(f"--peer {name}: want {', '.join(PEERS)}, or NAME=FILE with a trajectory")

@@ -71,7 +71,7 @@ def load(name: str) -> Experiment:
     """The experiment of that name; its module is imported now.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no such experiment.
     """
     if name not in EXPERIMENTS:
         raise UsageError(f"{name}: no such experiment; choose from {', '.join(EXPERIMENTS)}")

@@ -235,6 +235,6 @@ def _reason(join: Join) -> str:
 
 
 def _less(row: dict[str, Any], lost: Sequence[Join]) -> dict[str, Any]:
-    """A row after loops of its two drives turned out to be wrong."""
+    """A row, updated after loops of its two drives turned out to be wrong."""
     own = [join for join in lost if [join.one, join.other] == row["drives"]]
     return _row(row["drives"], row["accepted"] - len(own), Counter(row["reasons"]) + Counter(map(_reason, own)))

@@ -62,7 +62,7 @@ class GroupSettings(PackedSettings):
 
 
 class DataSettings(GroupSettings):
-    """What to train registration on."""
+    """The data of the registration training."""
 
     frames: int = Field(4, ge=2)
     """Frames of each place: one, and others within `radius` of it."""

@@ -149,7 +149,7 @@ class Trainer(Generic[M]):
     """A training, from its batches to the averaged weights; under torchrun in several processes.
 
     Attributes:
-        module: what is trained. Called with a batch it gives the loss, the mean over the batch, and figures for the
+        module: to be trained. Called with a batch it returns the loss, the mean over the batch, and figures for the
             log, `loss` among them.
         batches: function of (first step, rank of the process): endless arguments of the module, for each step.
         settings: optimization.

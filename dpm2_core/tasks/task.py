@@ -156,7 +156,7 @@ def task_type(name: str) -> type[Task]:
     """The task of that name.
 
     Raises:
-        UsageError: there is none.
+        UsageError: no such task.
     """
     if name not in TASKS:
         raise UsageError(f"{name}: no such task; choose from {', '.join(TASKS)}")
