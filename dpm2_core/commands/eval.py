@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
 FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
 OTHER_AXES = (
-    "the two run alike, but along other axes, as those of LiDAR and left camera do (--calib takes the estimate "
-    "from one to the other), or poses without rotations: then only APE means something"
+    "the trajectories match, but along other axes, like those of LiDAR and left camera (--calib converts the "
+    "estimate), or the poses have no rotations: then only APE is meaningful"
 )
 UNESTIMATED = "without a pose in the estimate"
 FRAME_OF_DRIVE = "{}, as in the files of this kind that dpm2 run writes"
@@ -54,7 +54,7 @@ def eval_(
     from dpm2_core.evaluation.report import metrics_table
 
     if settings and not is_drive(gt):
-        raise UsageError(f"--set {settings[0]}: says how a drive is read, and {gt} is none")
+        raise UsageError(f"--set {settings[0]}: is only for reading a drive, and {gt} is not a drive")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
     estimate, frame = read_trajectory(est), FRAME_AS_GIVEN
     if is_drive(gt):

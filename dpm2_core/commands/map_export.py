@@ -50,7 +50,7 @@ def export_map(
     spacing = {"voxel": voxel, "resolution": resolution}
     write, requested = _EXPORTS[kind]
     if ignored := [name for name, value in spacing.items() if value is not None and name != requested]:
-        raise UsageError(f"--{ignored[0]}: a map as {kind} has no use for it")
+        raise UsageError(f"--{ignored[0]}: does not apply to {kind}")
     if kind == "occupancy" and out.suffix not in (".yaml", ".pgm"):
         out = out.with_name(f"{out.name}.yaml")
     if out.exists() and out.samefile(path):
@@ -76,7 +76,7 @@ def _loaded(store: MapStore) -> MapData:
 def _tied(data: MapData, out: Path) -> MapData:
     """The part of a map that is tied to the first keyframe. Prints a note about keyframes that the file lacks."""
     tied = first_part(data)
-    _say_without(out, ways(data), ways(tied), "no loop ties them to the first keyframe")
+    _say_without(out, ways(data), ways(tied), "no loop connects them to the first keyframe")
     return tied
 
 
@@ -102,7 +102,7 @@ def _export_geojson(data: MapData, out: Path) -> None:
         raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
     drives = ways(placed)
     known = [replace(way, poses=way.poses[np.isfinite(way.poses).all(axis=(1, 2))]) for way in drives]
-    reason = "neither their own fixes nor those of what loops tie them to tell where they are"
+    reason = "neither their own fixes nor those of keyframes connected by loops give their position"
     _say_without(out, drives, known, reason)
     for way in (way for way in known if len(way.poses)):
         places = geodesy.geodetic(way.poses[:, :3, 3]).tolist()
@@ -118,8 +118,8 @@ def _export_occupancy(data: MapData, out: Path, resolution: float) -> None:
     settings = OccupancySettings(resolution=resolution)
     write_grid(out, occupancy_grid(tied.clouds, tied.poses, settings))
     if (tilt := ground_tilt(tied.clouds, tied.poses)) > _STEEP:
-        why = "as of a LiDAR mounted at an angle: an IMU, or its mounting in /tf_static, makes a level one"
-        note(f"{out}: not to be used, the ground of the map is tilted by {tilt:.0f} degrees, {why}")
+        why = "as with a LiDAR mounted at an angle: use an IMU, or publish its mounting on /tf_static"
+        note(f"{out}: do not use it: the ground of the map is tilted by {tilt:.0f} degrees, {why}")
     if why := why_of_no_use(tied.poses):
         note(f"{out}: {why}")
 

@@ -42,7 +42,7 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
         ("pruned", str(f["pruned"])),
         ("robots", ", ".join(robot or "(one)" for robot in f["robots"]) or "-"),
         ("length", f"{f['length_m']:.1f} m"),
-        ("extent", f"{extent} m, of the keyframes that are tied to the first" if extent else "-"),
+        ("extent", f"{extent} m, of the keyframes that are connected to the first" if extent else "-"),
         ("loops", f"{f['loops_accepted']} accepted of {f['loops_tried']} tried"),
         ("georeference", georeference_text(f["georeference"], unplaced(data))),
         ("size", f"{f['bytes'] / 1e6:.2f} MB, {f['bytes'] / max(f['keyframes'], 1) / 1e3:.1f} kB per keyframe"),
@@ -50,7 +50,11 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
     for row in rows:
         table.add_row(*row)
     for s in figures["sessions"]:
-        tied = f", {s['untied']} of them not tied to the first keyframe: elsewhere" if s["untied"] else ""
+        tied = (
+            f", {s['untied']} of them not connected to the first keyframe: their poses are not known"
+            if s["untied"]
+            else ""
+        )
         info = (
             f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
         )
@@ -116,10 +120,10 @@ def unplaced(data: MapData) -> str:
     fixes = np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
     tied = int(fixes[placed(data)].sum())
     elsewhere = int(fixes.sum()) - tied
-    why = "the way is too short or too straight, or half of them or more are off it, as by another clock"
-    reasons = [f"{tied} fixes do not tell it: {why}"] if tied else []
+    why = "the trajectory is too short or too straight, or at least half of them are off it, as with another clock"
+    reasons = [f"{tied} fixes do not determine it: {why}"] if tied else []
     if elsewhere:
-        reasons.append(f"{elsewhere} fixes are of keyframes that no loop ties to the first")
+        reasons.append(f"{elsewhere} fixes are of keyframes that no loop connects to the first")
     return "; ".join(reasons)
 
 
@@ -130,7 +134,7 @@ def georeference_text(figures: dict[str, Any] | None, unplaced: str) -> str:
     heading = f"{figures['heading_deg']:.2f} deg from east to north"
     where = f"origin {latitude:.8f}, {longitude:.8f}, {altitude:.2f} m; map's x axis {heading}"
     if figures["position_sigma_m"] is None:
-        return f"{where}; how certain is not known: too few fixes are tied to the first keyframe"
+        return f"{where}; its accuracy is not known: too few fixes are connected to the first keyframe"
     east, north, up = figures["position_sigma_m"]
     return (
         f"{where} (sigma {figures['heading_sigma_deg']:.2f}); sigma {east:.2f}, {north:.2f}, {up:.2f} m; "

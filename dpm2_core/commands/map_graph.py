@@ -33,7 +33,7 @@ def optimize(
     from dpm2_core.slam.graph.robust import least_squares
 
     if out.exists() and graph.exists() and out.samefile(graph):
-        raise UsageError(f"{out}: is the graph itself; the loops that are refused would be gone")
+        raise UsageError(f"{out}: is the graph itself, whose rejected loops would be lost; choose another file")
     file = read_g2o(graph)
     require_connected(graph, file)
     data, dof = file.graph, 3 if file.planar else 6
@@ -84,24 +84,24 @@ def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[s
     """Why the result may be wrong, in sentences."""
     scale, fit, out = figures["covariance_scale"], figures["chi2_per_dof"], []
     if not settled:
-        out.append("the results had not come to rest; these are the last ones")
+        out.append("the optimization has not converged; these are its last results")
     if figures["trajectories"] > max(1, 0.1 * figures["vertices"]):
         untied = f"{figures['trajectories'] - 1} of {figures['vertices']} vertices"
-        out.append(f"{figures['trajectories']} trajectories: {untied} are not tied to the one before by an edge")
+        out.append(f"{figures['trajectories']} trajectories: {untied} have no edge to the one before")
     if figures["kept"] < 0.5 * figures["loops"]:
-        out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the rest was left out")
+        out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the others were left out")
     if undecided:
         out.append(
-            "the odometry is too loose to tell a wrong loop from a right one, and the loops do not check each other:"
+            "the odometry's covariances are too large to detect a wrong loop, and the loops do not check each other:"
             " wrong ones may have been kept"
         )
     if fit is not None and fit > 2 * scale:  # about 0.5 if the kept loops fit
         out.append(
-            f"what was kept does not fit: chi2 is {fit / scale:.3g} per degree of freedom; wrong loops among it?"
+            f"the kept edges do not fit: chi2 is {fit / scale:.3g} per degree of freedom; are there wrong loops?"
         )
     if not 0.1 < scale < 10:
         size = f"{1 / scale:.3g} times too large" if scale < 1 else f"{scale:.3g} times too small"
-        out.append(f"the covariances are {size} for what agrees; loops were judged by what fits")
+        out.append(f"the covariances are {size} for the edges that agree; loops were judged by rescaled ones")
     return out
 
 

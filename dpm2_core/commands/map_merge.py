@@ -42,9 +42,9 @@ def merge_files(
     check_new(out)
     given = [parse_transform(text) for text in transform or ()]
     if len(paths) < 2 or (given and len(given) != len(paths) - 1):
-        raise UsageError("merge: want two or more maps, and no --transform or one for each but the first")
+        raise UsageError("merge: want two or more maps, and either no --transform or one for each map but the first")
     if given and (config is not None or settings):
-        raise UsageError("merge: --config and --set say how places are found; known transforms need no settings")
+        raise UsageError("merge: --config and --set are for finding places, and do not apply with --transform")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
         maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
@@ -58,7 +58,7 @@ def merge_files(
         first = maps[0] if given else _joined_by_places(named, chosen)
         for (path, other), T in zip(named[1:], given, strict=False):
             if (off := off_by_satellites(first, other, T)) > _OFF:
-                doubt = f"{off:.0f} m from where the fixes of both maps have it: is its --transform right?"
+                doubt = f"{off:.0f} m from its pose by the fixes of both maps: is its --transform right?"
                 note(f"{path}: {doubt}")
             first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
@@ -71,7 +71,7 @@ def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
     for path, data in maps:
         own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
         if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
-            said = f"{count} of its {len(data)} keyframes are in a map before it, too: they will be there twice"
+            said = f"{count} of its {len(data)} keyframes are also in an earlier map: they will be in the new map twice"
             note(f"{path}: {said}")
         known |= own
 
@@ -90,14 +90,14 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
         number, found = next(((i, fit) for i, fit in enumerate(tried) if fit is not None), (0, None))
         if found is None:
             names = ", ".join(str(path) for path, _ in waiting)
-            raise Dpm2Error(f"{names}: nothing of the other maps was found there; --transform says where they are")
+            raise Dpm2Error(f"{names}: no place of the other maps was found there; give their poses by --transform")
         (path, other), (T, loops) = waiting.pop(number), found
         merged = merge_maps(first, other, T, loops)
         first = optimized(merged, PoseGraph(settings.pose_graph))
-        note(f"{path}: {len(loops)} loops to what came before")
+        note(f"{path}: {len(loops)} loops to the maps before")
         checked = zip(merged.edges, first.edges, strict=True)
         if rejected := [f"{now.from_node} and {now.to_node}" for was, now in checked if was.ok and not now.ok]:
-            said = "loops that contradict the rest are rejected, those of the new map's keyframes"
+            said = "loops that contradict the others are rejected, between the new map's keyframes"
             note(f"{path}: {said} {', '.join(rejected)}")
     return first
 

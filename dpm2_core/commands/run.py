@@ -74,13 +74,13 @@ def run(
     corruption = None if corrupt is None else parse_corruption(corrupt)
     span = parse_range(frames)
     if resume and extend:
-        raise UsageError("--resume goes on with the same drive, --extend adds another one: not both")
+        raise UsageError("--resume continues the same drive, --extend adds another one: they cannot be combined")
     if (resume or extend) and map_file is None:
         raise UsageError(f"--{'resume' if resume else 'extend'}: in which map? give --map FILE")
     if localise is not None and (gt is not None or map_file is not None):
-        raise UsageError("--localise: the map stays as it is, and its frame is its own: without --map and --gt")
+        raise UsageError("--localise: the map and its frame do not change: it cannot be combined with --map or --gt")
     if localise is not None and (view or record is not None):
-        raise UsageError("--view, --record: a map that grows is shown: without --localise")
+        raise UsageError("--view, --record: they show a growing map, and cannot be combined with --localise")
     if localise is None and hint is not None:
         raise UsageError("--hint: only with --localise")
     T_hint = None if hint is None else parse_hint(hint)
@@ -175,7 +175,7 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
     for problem, count in (of_imu | result.problems).items():
         note(f"{problem} ({count} of {len(result)} frames)", "yellow")
     if not result.connected:
-        note("no place of this drive was found in the map: it stands in a frame of its own", "yellow")
+        note("no place of this drive was found in the map: its poses are in a frame of their own", "yellow")
     for missing in result.save(out):
         note(missing)
     metrics, title = result.metrics, f"{source.name}, {len(result)} frames"

@@ -84,7 +84,7 @@ class Bag:
             if data:
                 yield topic, time, data
                 continue
-            what = f"{self.path}: {topic}: messages that are no {self.types[topic]} of ROS 2 Jazzy are left out"
+            what = f"{self.path}: {topic}: messages that do not match {self.types[topic]} of ROS 2 Jazzy are left out"
             note_once(self.notes, what)
 
     def decode(self, topic: str, data: bytes) -> Any:

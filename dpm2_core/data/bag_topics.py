@@ -37,7 +37,7 @@ class TopicChoice:
         if asked or not found:
             if asked in found:
                 return asked
-            hint = "" if asked else "; of a driver's packets make clouds first, by replaying them into it"
+            hint = "" if asked else "; convert a driver's packets to clouds first, by replaying them into the driver"
             raise UsageError(
                 f"{self._path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
             )

@@ -139,15 +139,15 @@ class BagSource:
             missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
             absent, useless = count - found[topic], unusable[topic]
-            details = [(absent, within), (useless, f"{useless} have one of no use")]
+            details = [(absent, within), (useless, f"{useless} have an unusable one")]
             if absent or useless:
                 text = f"{absent + useless} of {count} frames have no {what} of {topic}"
                 note_once(self.notes, text, "; ".join(detail for number, detail in details if number))
         if found[known.second_topic]:
             first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
             if abs(apart := (second - first) * 1e-9) > _CLOCKS:
-                what = f"{known.second_topic}: clouds are recorded {apart:+.2f} s later after their stamps than others"
-                note_once(self.notes, what, "a clock that is off? They join those of the same stamps")
+                what = f"{known.second_topic}: recorded {apart:+.2f} s later after its stamps than the first LiDAR"
+                note_once(self.notes, what, "is its clock off? Clouds with the same stamps are joined")
 
     @cached_property
     def stamps(self) -> Stamps:
@@ -227,12 +227,12 @@ class BagSource:
         if up[2] > _LEVEL:
             return T_base_lidar
         angle = float(np.degrees(np.arccos(max(up[2], -1.0))))
-        tilted = f"{naming.TF_STATIC} has the LiDAR tilted by {angle:.0f} degrees in {base}"
+        tilted = f"{naming.TF_STATIC} shows the LiDAR tilted by {angle:.0f} degrees in {base}"
         seen = self._ground()
         if seen is not None and seen @ up < _LIKE:
-            note_once(self.notes, tilted, "which is no base: the ground is not level in it")
+            note_once(self.notes, tilted, "which is not used as base: the ground is not level in it")
             return None
-        note_once(self.notes, tilted, "and the map is level by that")
+        note_once(self.notes, tilted, "by which the map is leveled")
         return T_base_lidar
 
     def _ground(self) -> Points | None:

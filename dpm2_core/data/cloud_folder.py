@@ -62,9 +62,9 @@ class CloudFolder(IndexedSource):
         else:
             self._files = sorted(found, key=lambda file: (not _numbers(file), _numbers(file), file.name))
             numbers = _counts(self._files)
-            self.stamps = settings.steady_stamps(numbers, f"{folder}: the names are no times", self.notes)
+            self.stamps = settings.steady_stamps(numbers, f"{folder}: the names are not times", self.notes)
             if missing := int(numbers[-1]) + 1 - len(numbers):
-                self.notes.append(f"{folder}: {missing} numbers are missing among the names: taken to be scans as well")
+                self.notes.append(f"{folder}: {missing} numbers are missing among the names: counted as missing scans")
         if any(file.suffix.lower() == ".pcd" for file in self._files):
             _pcd_types()  # report a missing package now, not at the first scan
         self._frames = FrameBuilder(settings, Calibration(self.name), self.notes.append)

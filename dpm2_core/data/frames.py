@@ -71,7 +71,7 @@ class Calibration:
         known, last = self.heard.get(topic, ("", stamp))
         frame = frame_name(frame) or known
         if known and frame != known and abs(stamp - last) < _SILENT:
-            found = f"a message in frame {frame[:80]!r}, those before are in {known!r}"
+            found = f"a message in frame {frame[:80]!r}, the previous ones are in {known!r}"
             raise MessageError(f"{found}: a topic has one sensor")
         self.heard[topic] = frame, stamp
 
@@ -231,7 +231,7 @@ class FrameBuilder:
         """The last fix before a scan, with the position of its antenna."""
         if (fix := buffer.take(stamp)) is None:
             return None
-        with self._or_else(self._calibration.gnss_topic, "the antenna is taken for the LiDAR"):
+        with self._or_else(self._calibration.gnss_topic, "the antenna is assumed to be at the LiDAR"):
             if frame_name(buffer.frame) != frame_name(lidar_frame):
                 fix = replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
         return fix

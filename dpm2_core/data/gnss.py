@@ -33,7 +33,7 @@ def decode_fix(message: Any, stamp: int) -> Fix | None:
         return None
     place = np.array([message.latitude, message.longitude, message.altitude], np.float64)
     if not place[:2].any():
-        raise MessageError("latitude and longitude 0, which receivers send before they know")
+        raise MessageError("latitude and longitude 0, which receivers send before they have a fix")
     covariance = np.array(message.position_covariance, np.float64).reshape(3, 3)
     unstated = (np.diag(covariance) == 0) | (message.position_covariance_type == 0)
     covariance[unstated], covariance[:, unstated] = 0.0, 0.0

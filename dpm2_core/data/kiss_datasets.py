@@ -95,7 +95,7 @@ class KissSource(IndexedSource):
         names = [Path(str(file)) for file in getattr(self._set, "scan_files", ())]
         if len(names) == self._count and (named := name_times(names)):
             return np.asarray(named, np.int64)
-        why = f"{self.path}: the loader knows no times"
+        why = f"{self.path}: the loader has no times"
         return np.asarray(self._settings.steady_stamps(np.arange(self._count), why, self.notes))
 
     def _offsets(self, times: Array, count: int) -> Any:

@@ -105,7 +105,7 @@ class KittiSource(VelodyneDrive):
             except ValueError as error:
                 raise UsageError(f"{path}:{line}: {error}") from None
         if rows.size and "Tr_gnss_to_velo" not in calib:
-            self.notes.append(f"{path}: the antenna is taken for the LiDAR: no Tr_gnss_to_velo in calib.txt")
+            self.notes.append(f"{path}: the antenna is assumed to be at the LiDAR: no Tr_gnss_to_velo in calib.txt")
         return sorted(found, key=lambda fix: fix.stamp)
 
     def _known_correction(self) -> float:
@@ -138,7 +138,7 @@ class KittiSource(VelodyneDrive):
         if (off := out_of_order(seconds)).any():
             first = int(np.argmax(off))
             self.notes.append(
-                f"{path}: {off.sum()} times are not between their neighbors and are taken to be, the first"
+                f"{path}: {off.sum()} times are not between their neighbors and are interpolated, the first"
                 f" {seconds[first]:g} s of scan {self.numbers[first]}"
             )
             seconds[off] = np.interp(self.numbers[off], self.numbers[~off], seconds[~off])
@@ -156,7 +156,7 @@ class KittiSource(VelodyneDrive):
                 raise UsageError(f"{requested[0]}: no such file (input.kitti_poses is {self._settings.kitti_poses})")
             return None
         if self.T_cam_lidar is None:
-            self.notes.append(f"{path} is of the camera: without Tr it is no ground truth for the LiDAR")
+            self.notes.append(f"{path} has poses of the camera: without Tr they are no ground truth for the LiDAR")
             return None
         self.truth = "/".join(path.parts[-2:])  # poses/04.txt, or SemanticKITTI's 04/poses.txt
         rows = self._of_each_scan(read_numbers(path, 12))
@@ -165,7 +165,9 @@ class KittiSource(VelodyneDrive):
         rigid = np.array([se3.is_rigid(se3.make(T[:, :3], T[:, 3]), ROUNDED) for T in rows.reshape(-1, 3, 4)], bool)
         if (wrong := np.logical_and(known, ~rigid)).any():
             first = self.numbers[int(np.argmax(wrong))]
-            self.notes.append(f"{path}: {wrong.sum()} poses are no rigid transforms and left out, that of scan {first}")
+            self.notes.append(
+                f"{path}: {wrong.sum()} poses are not rigid transforms and left out, the first that of scan {first}"
+            )
             known = np.logical_and(known, rigid)
         T_world_cam = np.full((len(self), 4, 4), np.nan)
         # Rounded to 7 digits in the files; a quaternion, as in a bag, would not keep the error of the rotation.
@@ -194,7 +196,7 @@ class KittiSource(VelodyneDrive):
         if size is None:
             return None
         if self.T_cam_lidar is None:
-            self.notes.append("images are left out: without Tr the camera's place is not known")
+            self.notes.append("images are left out: without Tr the camera's pose is not known")
             return None
         if "P2" not in calib:
             raise UsageError(f"{self.path / 'calib.txt'}: no P2, which image_2 needs; without images it is not needed")

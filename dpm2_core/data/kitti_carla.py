@@ -69,7 +69,7 @@ class KittiCarlaSource(IndexedSource):
         path, seconds = self.folder / "full_poses_lidar.txt", self.numbers * _PERIOD
         rows = read_numbers(path, 13)
         if not len(rows):
-            self.notes.append(f"{path}: missing: no ground truth, and frames are taken to be {_PERIOD} s apart")
+            self.notes.append(f"{path}: missing: no ground truth, and frames are assumed to be {_PERIOD} s apart")
             return np.round(seconds * 1e9).astype(np.int64), None
         self.truth = path.name
         times = rows[:, 12]

@@ -46,7 +46,9 @@ class KittiRawSource(VelodyneDrive):
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
         date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
         if date is None:
-            self.notes.append(f"{folders[0] / _CALIBRATION}: no such file; without calibration the points alone count")
+            self.notes.append(
+                f"{folders[0] / _CALIBRATION}: no such file; without calibration only the points are used"
+            )
             return
         cameras = date / "calib_cam_to_cam.txt"
         intrinsics = read_keyed(cameras)

@@ -19,7 +19,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import compiled
 
 REPEATED = "the same cloud as before: the LiDAR or its driver repeats itself"
-PART_PROBLEM = "a part of the cloud is that of before: of LiDARs whose clouds are made one, one repeats itself"
+PART_PROBLEM = "a part of the cloud is the same as before: one of several LiDARs in one cloud repeats itself"
 _STOPS = 1.5  # m/s: slower robots may stop at once and, in simulations without noise, measure the same cloud again
 _MOVED, _TURNS = 0.3, 3.0  # m, degrees
 _STILL, _LONG = 0.02, 30  # m, clouds: a robot within that distance is at rest; if all clouds differ, there is noise

@@ -33,10 +33,10 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
     if size % 16:
         return NO_POINTS, f"{path}: {size} bytes are no whole number of points (16 bytes each)"
     if size % 20 == 0 and _are_rings(values[4::5]) and not _are_rings(values[::5]):
-        return NO_POINTS, f"{path}: 5 numbers a point, the last a ring, as nuScenes has them; want 4"
+        return NO_POINTS, f"{path}: 5 numbers per point, the last a ring, as in nuScenes; want 4"
     points = values.reshape(-1, 4)
     if _are_none(points):
-        return NO_POINTS, f"{path}: no places that a LiDAR measures; want 4 float32 a point, x, y, z in m and intensity"
+        return NO_POINTS, f"{path}: not the points of a LiDAR; want 4 float32 per point: x, y, z in m, and intensity"
     return points, None
 
 

@@ -113,7 +113,7 @@ class InputSettings(Settings):
 
     def steady_stamps(self, numbers: NDArray[np.integer], why: str, notes: list[str]) -> NDArray[np.int64]:
         """(N,) ns of scans without time stamps, from their numbers (N,); adds a note that begins with `why`."""
-        notes.append(f"{why}: scans are taken to be {self.period:g} s apart (input.period)")
+        notes.append(f"{why}: scans are assumed to be {self.period:g} s apart (input.period)")
         return np.round(numbers * self.period * 1e9).astype(np.int64)
 
     def angle_correction(self, known: float) -> float:

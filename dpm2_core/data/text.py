@@ -82,7 +82,7 @@ def parse_row(text: str, count: int, where: str) -> Array:
     if len(row) != count or not np.isfinite(row).all():
         raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
     if np.abs(row).max(initial=0) > _LARGEST:
-        raise UsageError(f"{where}: {np.abs(row).max():g} is no time, place or calibration")
+        raise UsageError(f"{where}: {np.abs(row).max():g} is too large for a time, position or calibration")
     return row
 
 

@@ -67,7 +67,7 @@ def frames_in_order(source: Source, start: int, stop: int, corrected: Callable[[
 
 def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -> None:
     """Add a note, once, that stamps (ns) were corrected, with the first one and the number of its frame."""
-    what = f"{whose}stamps that are not between their neighbors are taken to be"
+    what = f"{whose}stamps that are not between their neighbors are interpolated"
     note_once(notes, what, f"the first at frame {number}: {stamp * 1e-9:.3f} s")
 
 

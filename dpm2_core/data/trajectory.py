@@ -153,8 +153,8 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
             return gt.poses, est.poses, (est if est.kind == "tum" or gt.kind == "kitti" else gt).keys
         raise UsageError(
             f"ground truth has {len(gt)} poses ({gt.kind}), the estimate {len(est)} ({est.kind}), and neither frame"
-            " numbers (13 KITTI columns, the number first) nor stamps (both TUM) say which belong together;"
-            " stamps do for the trajectory.tum of `dpm2 run` against a drive (`dpm2 eval --gt DRIVE`) or a TUM file"
+            " numbers (13 KITTI columns, the number first) nor stamps (both TUM) show which ones correspond;"
+            " stamps do, as for the trajectory.tum of `dpm2 run` against a drive (`dpm2 eval --gt DRIVE`) or a TUM file"
         )
     gt, est = _ordered(gt), _ordered(est)
     if stamped and not (same_stamps(gt.keys, est.keys) and gt.period >= _CLEARLY * est.period):

@@ -248,10 +248,10 @@ def _ended(ray: Any, name: str, reference: Any) -> Outcome:
     try:
         ended: Outcome = ray.get(reference)
     except ray.exceptions.OutOfMemoryError:
-        return Outcome(name, "failed", reason="its worker was ended: the machine was short of memory")
+        return Outcome(name, "failed", reason="its worker was killed: the machine ran out of memory")
     except ray.exceptions.RayTaskError as error:
         return Outcome(name, "failed", reason=f"not sent back: {error.cause}")
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        return Outcome(name, "failed", reason=f"{ATTEMPTS} workers died over it: {lines[0]}")
+        return Outcome(name, "failed", reason=f"{ATTEMPTS} workers died while processing it: {lines[0]}")
     return ended

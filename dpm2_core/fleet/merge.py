@@ -75,7 +75,7 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         search = Search(folder, settings, cluster, view or View())
         parts = search.drives(left_out)
         if not parts:
-            raise UsageError(f"{folder}: no drive that is whole; want the folder of `dpm2 fleet run`")
+            raise UsageError(f"{folder}: no complete drive in it; want the folder of `dpm2 fleet run`")
         places = search.places(parts, left_out)
         parts = {name: parts[name] for name in places}
         index = search.index(parts)
@@ -107,12 +107,12 @@ def _record(out: Path, folder: Path) -> Merged | None:
         check_new(out)  # the log of another map that was moved without it must not be removed
         return merged
     if merged is None:
-        raise UsageError(f"{out}: there is a file already, which is no merge of drives")
+        raise UsageError(f"{out}: the file exists, and is no merge of drives")
     drives = merged.drives.keys() | {path.parent.name for path in folder.glob(f"*/{MAP}")}
     with MapStore.open(out) as store:
         others = sum(str(robot).partition("/")[0] not in drives for (robot,) in store.rows("keyframes", "robot"))
     if others:  # by `dpm2 run --extend`, or another program's file next to an old record
-        raise UsageError(f"{out}: {others} of its keyframes are of no drive of {folder}; give another --out")
+        raise UsageError(f"{out}: {others} of its keyframes are of no drive in {folder}; choose another --out")
     return merged
 
 
@@ -202,7 +202,7 @@ def _untried(before: Merged, joins: Sequence[Join]) -> list[Join]:
     """The joins, rejected if the existing map has contradicted those of the two drives."""
     refused = {(row["drives"][0], row["drives"][1]) for row in before.joins if row["accepted"] < ENOUGH}
     return [
-        replace(join, loop=join.loop.rejected("the map contradicts the two drives' joins"))
+        replace(join, loop=join.loop.rejected("the map contradicts the loops between the two drives"))
         if join.loop.ok and (join.one, join.other) in refused
         else join
         for join in joins

@@ -58,11 +58,11 @@ class Search:
         for path in sorted(self.folder.glob(f"*/{MAP}")):
             name = path.parent.name
             if name in missing:
-                left_out[name] = f"not done as it was asked for last: {missing[name]}"
+                left_out[name] = f"not complete in the last run: {missing[name]}"
             elif is_whole(path.parent):
                 found[name] = places_part(name, path)
             else:
-                left_out[name] = "not whole: it is being written, or was cut short"
+                left_out[name] = "not complete: it is being written, or was interrupted"
         return found
 
     def places(self, parts: Mapping[str, Part], left_out: dict[str, str]) -> dict[str, Figures]:
@@ -81,7 +81,7 @@ class Search:
             elif outcome.figures["weights"] != [own]:
                 left_out[name] = f"made with weights {', '.join(outcome.figures['weights'])}, not with {own}"
             elif (twin := drives.setdefault(sha256(vectors_of(self.kept, name).tobytes()).digest(), name)) != name:
-                left_out[name] = f"the same drive as {twin}: all its places look exactly as there"
+                left_out[name] = f"the same drive as {twin}: all its places are the same"
             else:
                 found[name] = outcome.figures
         if not found:
@@ -149,7 +149,7 @@ class Search:
         try:
             return TypeAdapter(dict[str, list[list[int]]]).validate_json(path.read_bytes())
         except (OSError, ValueError):
-            raise Dpm2Error(f"{path}: damaged; without the folder {self.kept} it is made anew") from None
+            raise Dpm2Error(f"{path}: damaged; remove the folder {self.kept}, and it is made again") from None
 
 
 def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:

@@ -27,7 +27,7 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
     """
     keys = [_key(setting) for setting in settings]
     if twice := {key for key in keys if keys.count(key) > 1}:
-        raise UsageError(f"--set {min(twice)}: given twice; all its values belong to one, with commas")
+        raise UsageError(f"--set {min(twice)}: given twice; give all its values at once, with commas")
     out = {}
     for values in product(*(_values(setting) for setting in settings)):
         chosen = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
@@ -59,7 +59,7 @@ def sweep_parts(
     keys = {_key(setting) for overrides in settings.values() for setting in overrides}
     for drive in drives:
         if own := [setting for setting in drive.set if _key(setting) in keys]:
-            raise UsageError(f"{drive.name}: has {own[0]} of its own, which would count for more than all of --set")
+            raise UsageError(f"{drive.name}: the list has {own[0]} for it, which would override all values of --set")
     for name, overrides in settings.items():
         yield from parts_of(drives, config, overrides, f"{name}/")
 
@@ -69,7 +69,7 @@ def sweep_table(title: str, names: Sequence[str], outcomes: Sequence[Outcome]) -
     found = {outcome.name: outcome.figures for outcome in outcomes if outcome.figures is not None}
     drives = dict.fromkeys(outcome.name.partition("/")[2] for outcome in outcomes)
     whole = [drive for drive in drives if all(f"{name}/{drive}" in found for name in names)]
-    caption = f"means over {len(whole)} of {len(drives)} drives: those that are whole with all settings"
+    caption = f"means over {len(whole)} of {len(drives)} drives: those that are complete with all settings"
     table = FigureTable(title, names=["settings"], figures=["failed", *_MEANS, "breaks", "loops", "s"], caption=caption)
     for name in names:
         rows = [found[f"{name}/{drive}"] or {} for drive in whole]

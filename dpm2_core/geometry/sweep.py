@@ -22,7 +22,7 @@ _CENTERED = 0.1  # of a sweep: a stamp this close to the middle counts as the mi
 _WHOLE = 1.2  # a sweep is partial if another one is this many times as long
 _LATELY, _OFTEN = 50, 5  # times are wrong if _OFTEN of _LATELY clouds contradict them; raw ones hardly ever do
 _WRONG = (
-    "the times of the points are not used, the motion contradicts them: clouds that are de-skewed already want "
+    "the point times are not used, because the motion contradicts them; if the clouds are de-skewed already, set "
     "slam.preprocess.deskew: false"
 )
 

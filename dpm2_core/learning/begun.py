@@ -70,7 +70,7 @@ def begin_or_resume(
     _check_free(folder)
     asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
     if there and not resume:
-        raise UsageError(f"{folder}: holds a training; --resume continues it, another --out keeps it")
+        raise UsageError(f"{folder}: contains a training; continue it with --resume, or choose another --out")
     if resume and not there:
         raise UsageError(f"{folder}: no {CHECKPOINT} to resume")
     now = _asked(settings, read, data)
@@ -82,7 +82,7 @@ def begin_or_resume(
     for key in [*now, *before]:
         if key in now and before.get(key, now[key]) != now[key]:
             name, old, new = _difference(key, before[key], now[key])
-            raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume goes on with the same alone")
+            raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume needs the same settings")
         if key not in now and not key.startswith(_CONTENT):  # content of other files: the settings name these
             raise UsageError(f"{folder}: began with {key} {before[key]}, a setting of another version of dpm2")
 

@@ -39,7 +39,7 @@ def held(folder: Path, looking: bool = False) -> Iterator[None]:
         fcntl.flock(handle, (fcntl.LOCK_SH if looking else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        raise UsageError(f"{folder}: another training is writing here; another --out keeps both") from None
+        raise UsageError(f"{folder}: another training is writing here; choose another --out") from None
     except OSError:  # no locks, as on some network shares
         pass
     try:

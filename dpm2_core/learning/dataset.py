@@ -185,7 +185,9 @@ class GroupDataset(Dataset[Batch]):
             found = [fitted(drive[index], drive, self.network.points) for index in self.draw(drive, noise)]
             if min(len(sample.cloud) for sample in found) >= _LEAST:
                 return [augment(sample, self.settings.augment, noise) for sample in found]
-        raise Dpm2Error(f"of {_PLACES} places of the packed drives, each has a scan of fewer than {_LEAST} points")
+        raise Dpm2Error(
+            f"{_PLACES} places of the packed drives were tried, and each has a scan of fewer than {_LEAST} points"
+        )
 
     def batches(self, start: int, rank: int) -> Iterator[Batch]:
         """Batches from step `start` on, in order, prepared ahead by worker processes."""

@@ -71,9 +71,11 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
     poses[:, 0, 3] += _APART * part
     notes = []
     if (count := len(np.unique(part[there]))) > 1:
-        notes.append(f"where {count} parts of the drive are to each other the SLAM does not know: each is for itself")
+        notes.append(
+            f"the SLAM does not know the relative poses of {count} parts of the drive: each is used separately"
+        )
     if times:
-        notes.append("the times of the points are not used, the motion contradicts them")
+        notes.append("the point times are not used, because the motion contradicts them")
     return Referenced(source, poses, notes, timed=not times)
 
 
@@ -118,7 +120,7 @@ def prepare(
         if _is_measurable(referenced.poses[cut:]):
             pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, asked)
         elif cut < len(source):
-            lacks = f"no pairs up to {NEAR:g} m and {NEAR:g} to {FAR:g} m apart, as are measured"
+            lacks = f"no pairs up to {NEAR:g} m and {NEAR:g} to {FAR:g} m apart, which the measurement needs"
             notes.append(f"{name}: the {len(source) - cut} scans that are held out have {lacks}")
         pack(referenced, out / DRIVES / name, network, range(cut), packing, asked)
     if settings.rehearsal_share > 0 and not settings.rehearsal:

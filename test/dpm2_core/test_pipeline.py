@@ -95,7 +95,7 @@ def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
     monkeypatch.setattr(source, "frames", lambda start=0, stop=None: iter(read[start:stop]))
     result = OfflineRun(source, CONFIG, (1, None)).run()
     np.testing.assert_allclose(result.recorder.stamps, [frame.stamp for frame in scans[1:]], atol=1000)
-    what = "stamps that are not between their neighbors are taken to be"
+    what = "stamps that are not between their neighbors are interpolated"
     assert source.notes == [f"{what} (the first at frame 4: {wrong * 1e-9:.3f} s)"]
     config, path = load_settings(Config, None, [*SET, "slam.keyframes.distance=0"]), tmp_path / "drive.dpm2map"
     for span in ((0, 5), (0, 6)):  # the map ends with that frame, and goes on with it

@@ -340,5 +340,5 @@ def test_messages_of_ros1_that_ros2_defines_differently_are_left_out(
                 writer.write(connection, time_ns, noetic.serialize_ros1(message, message.__msgtype__))
     assert play_here(str(tmp_path / "b.bag"), "--wait", "0") == 0
     said = capfd.readouterr().err
-    assert said.count("/sonar: messages that are no sensor_msgs/msg/Range of ROS 2 Jazzy are left out") == 1
+    assert said.count("/sonar: messages that do not match sensor_msgs/msg/Range of ROS 2 Jazzy are left out") == 1
     assert "2 messages played" in said

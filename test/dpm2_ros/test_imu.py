@@ -129,7 +129,7 @@ def test_forces_of_the_other_sign_are_said_at_the_start(
     r = robot()
     r.gravity = -r.gravity
     r.stand(0, 1, 2)
-    assert capfd.readouterr().err.count("/imu: its forces at rest point 170 deg away from up") == 1
+    assert capfd.readouterr().err.count("/imu: its acceleration at rest is 170 deg away from up") == 1
 
 
 def test_one_that_is_named_and_never_comes_is_said(robot: Callable[..., Robot]) -> None:

@@ -123,7 +123,9 @@ def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
         assert n >= 2 or not said()
     mapper.wait(said, "the warning")
     (words,) = said()
-    assert words.startswith("dpm2/grid: not to be used, what it shows lies up to 2.8 m over each other, of storeys")
+    assert words.startswith(
+        "dpm2/grid: do not use it: parts of the map lie up to 2.8 m above each other, because of storeys"
+    )
 
 
 def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:

@@ -74,7 +74,9 @@ def read_g2o(path: Path) -> G2o:
         own = np.array(vertices.ids, np.int64)[:, 0]
         order = np.argsort(own, kind="stable")
         if len(repeated := np.flatnonzero(np.diff(own[order]) == 0)):
-            raise UsageError(f"{path}:{vertices.at[order[repeated[0] + 1]]}: vertex {own[order[repeated[0]]]} again")
+            raise UsageError(
+                f"{path}:{vertices.at[order[repeated[0] + 1]]}: vertex {own[order[repeated[0]]]} is defined again"
+            )
         if len(missing := np.setdiff1d(ids, own)):
             line = edges.at[int(np.flatnonzero((named == missing[0]).any(1))[0])]
             raise UsageError(f"{path}:{line}: edge of vertex {missing[0]}, which has no VERTEX line")

@@ -171,5 +171,5 @@ def _objection(best: Registration, others: Sequence[Registration]) -> str:
     if second is None:
         return ""
     if second == _ELSEWHERE:
-        return f"the picture correlates by {best.confidence:.2f}: no more than with a place that looks alike"
-    return f"the pictures of two places are alike: correlations of {best.confidence:.2f} and {second:.2f}"
+        return f"the image correlates by {best.confidence:.2f}: no more than with a place that looks alike"
+    return f"the images of two places are alike: correlations of {best.confidence:.2f} and {second:.2f}"

@@ -155,7 +155,7 @@ class Verifier:
         if points < s.min_points:
             return f"only {points} points above the ground"
         if structure < s.min_structure:
-            return f"only {structure:.0%} of what stands there fits"
+            return f"only {structure:.0%} of the points above the ground fit"
         if result.rmse > s.max_rmse:
             return f"residual {result.rmse:.2f} m"
         if (sigma := result.worst_sigma) > s.max_sigma:
@@ -166,5 +166,5 @@ class Verifier:
         """Why a pose is too far from the proposed one; empty if it is not."""
         meters, degrees = se3.magnitude(T_proposed_found)
         if meters > widen * self._settings.max_moved or degrees > widen * _MOST_TURNED:
-            return f"points and proposal {meters:.1f} m, {degrees:.1f} deg apart"
+            return f"the points and the proposed pose are {meters:.1f} m, {degrees:.1f} deg apart"
         return ""

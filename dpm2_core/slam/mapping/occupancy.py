@@ -64,8 +64,8 @@ def why_of_no_use(poses: Array) -> str:
     """Why a grid of keyframes at (N, 4, 4) T_map_kf is unusable, as it shows several levels; empty if it is usable."""
     if not len(poses) or (height := _height_over_each_other(poses)) <= _STOREY:
         return ""
-    why = "of storeys, which need a map each, or of drift that no loop took away"
-    return f"not to be used, what it shows lies up to {height:.1f} m over each other, {why}"
+    why = "because of storeys (make one map of each) or of drift without a loop"
+    return f"do not use it: parts of the map lie up to {height:.1f} m above each other, {why}"
 
 
 def _height_over_each_other(poses: Array) -> float:

@@ -193,7 +193,7 @@ class Bridge:
         if self._by_imu is not None:
             xi, of_way = se3.way(self._by_imu.T, T_begin)[3:], self._by_imu.covariance[3:, 3:]
             if xi @ np.linalg.solve(of_way, xi) > _EXCLUDED:
-                return f"after a pause: {np.linalg.norm(xi):.0f} m from where the IMU leads"
+                return f"after a pause: {np.linalg.norm(xi):.0f} m from the IMU's prediction"
         if self._after is None or self.twist is None:
             return ""
         # With a bounded acceleration, the distance differs from the mean of two known velocities times the time by a
@@ -206,14 +206,14 @@ class Bridge:
             seconds = float(np.clip(way @ mean / (mean @ mean + 1e-9), 0.0, seconds))
         off = float(np.linalg.norm(way - seconds * mean))
         if off > _NEAR + self._settings.steadiness * self._seconds**2 / 4:
-            return f"after a pause: {off:.0f} m from where the motion before and after leads"
+            return f"after a pause: {off:.0f} m from the prediction by the motion before and after"
         speeds, most = np.linalg.norm([before, after], axis=1), self._settings.steadiness
         if not self.held and speeds.min() > _DRIVES and before @ after > 0 and speeds.sum() < most * self._seconds:
             # It did not reverse: it has moved at least the distance to stop and to reach its speed again.
             ahead = mean / np.linalg.norm(mean)
             least, came = float(speeds @ [before @ ahead, after @ ahead]) / (2 * most), float(way @ ahead)
             if came < least - _NEAR:
-                return f"after a pause: {came:.0f} m on, but it needs {least:.0f} m to stop and start again"
+                return f"after a pause: {came:.0f} m further, but to stop and start again takes {least:.0f} m"
         return ""
 
     def _agreeing(self) -> list[float]:

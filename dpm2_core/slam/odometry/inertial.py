@@ -98,7 +98,7 @@ class InertialMotion:
             self.problem = "" if self._measured is not None else "no samples at the time of the scan"
         if not self.problem and not self._doubt.is_credible:
             self.problem = (
-                "its turns are not those of the scans, and odom may be tilted: is its orientation or unit right?"
+                "its rotations are not those of the scans, and odom may be tilted: check its orientation and unit"
             )
         if self.problem:
             return frame if frame.imu is None else replace(frame, imu=None)
@@ -183,14 +183,14 @@ class InertialMotion:
         if s.up is None:
             return
         if not self._vertical.start(T[:3, :3] @ s.forces.mean(0), T[:3, :3] @ s.up):
-            self.problem = "its forces at rest are not gravity: odom is not level"
+            self.problem = "its acceleration at rest is not gravity: odom is not level"
             return
         R = self._vertical.turn
         self.T_level_odom = se3.make(R, T[:3, 3] - R @ T[:3, 3])
         if (angle := _angle(R)) > _SLOPE:  # correct only for an upside-down LiDAR that /tf_static does not describe
             self.problem = (
-                f"its forces at rest point {np.degrees(angle):.0f} deg away from up, and odom is turned by that: "
-                f"is its orientation or sign right?"
+                f"its acceleration at rest is {np.degrees(angle):.0f} deg away from up, and odom is tilted by that: "
+                f"check its orientation and sign"
             )
 
     def _join(self, frame: Frame) -> None:

@@ -26,8 +26,8 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 
-_ENCLOSED = "all that is seen is near: what encloses the LiDAR, as a lift does, may move along"
-_CARRIED = "broken by what enclosed the LiDAR: it may have moved along, as a lift does"
+_ENCLOSED = "all points are near: the LiDAR may be in something that moves with it, such as a lift"
+_CARRIED = "broken: the LiDAR was in something that may have moved with it, such as a lift"
 _KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed; the points find the pose from within it
 _LOST = 5  # frames without a registration, after which the state is `lost`, `degraded` before
 _TRIES = 10  # frames after a pause that are registered to the map before it, before the odometry counts as broken

@@ -83,7 +83,7 @@ class FusedScanRegistration:
         """Combine with the network's registration; `points` is None if they are not registered yet (`always`)."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
-            neural = neural.rejected("found where no vehicle can have come")
+            neural = neural.rejected("found a pose that no vehicle can have reached")
         if neural is not None and neural.ok and not prediction.known:
             points, prediction = self._from_both(scan, neural, prediction, points)
         points = points or self._geometric.located(scan, prediction)
@@ -217,4 +217,4 @@ def _instead(result: Registration, other: Registration) -> Registration:
 
 def _apart(a: Registration, b: Registration) -> str:
     xi = se3.way(a.T_target_source, b.T_target_source)
-    return f"neural and points {np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg apart"
+    return f"neural and geometric {np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg apart"

@@ -258,7 +258,7 @@ class GeometricScanRegistration:
         if self._T_second is None:
             return result
         way = se3.way(T, self._T_second)
-        doubt = f"many points have moved otherwise, by {np.linalg.norm(way[3:]):.1f} m"
+        doubt = f"many points fit another motion, off by {np.linalg.norm(way[3:]):.1f} m"
         return result.doubted(way).because(doubt)
 
     def _steered(self, source: Array, T: Array, motions: Array = _HEADINGS) -> Array:

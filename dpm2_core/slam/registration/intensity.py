@@ -101,7 +101,7 @@ class IntensitySearch:
         found = _best(_correlation(before.texture(), here.texture()), reach, clear)
         way = float(axis @ (T_lidar_odom @ self._scans[-1].T_odom_lidar)[:3, 3])
         if tied == 1 and isinstance(found, Peak) and abs(found.offset - way) < _SPACING:
-            return "intensity: it stands still, or looks at what moves along"
+            return "intensity: the LiDAR stands still, or what it sees moves with it"
         return found
 
 

@@ -42,7 +42,7 @@ def missing_log(path: Path) -> str:
     wal = Path(f"{path.resolve()}-wal")
     if _write_version(path) != _LOGGED or wal.exists():
         return ""
-    return f"who wrote it was killed, and {wal.name}, where the last 4 MB or all of it may be, is not beside it"
+    return f"its writer was killed, and {wal.name}, which may contain the last 4 MB or all of it, is not next to it"
 
 
 def foreign_log(path: Path) -> str:

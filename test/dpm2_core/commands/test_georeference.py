@@ -218,7 +218,7 @@ def test_info_says_what_is_not_tied_and_measures_the_rest(tmp_path: Path) -> Non
     """The two drives are far apart, in frames of their own."""
     save_as(two_drives(), tmp_path / "map")
     done = dpm2("map", "info", tmp_path / "map", "--json", tmp_path / "info.json")
-    assert "40 of them not tied to the first keyframe" in " ".join(done.stdout.split())
+    assert "40 of them not connected to the first keyframe" in " ".join(done.stdout.split())
     figures = json.loads((tmp_path / "info.json").read_text())
     assert [session["untied"] for session in figures["sessions"]] == [0, 40]
     np.testing.assert_allclose(figures["extent_m"], np.ptp(two_drives().poses[:40, :3, 3], axis=0))
@@ -227,8 +227,8 @@ def test_info_says_what_is_not_tied_and_measures_the_rest(tmp_path: Path) -> Non
 def test_fixes_that_do_not_tell_it_are_counted(tmp_path: Path) -> None:
     data = replace(two_drives(tied=True), georeference=None)
     save_as(data, tmp_path / "map")
-    assert "(80 fixes do not tell it" in " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
-    assert "80 fixes do not tell it" in dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson").stderr
+    assert "(80 fixes do not determine it" in " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
+    assert "80 fixes do not determine it" in dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson").stderr
 
 
 def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
     first = [replace(keyframe, fix=None) for keyframe in data.keyframes[:40]]
     save_as(replace(data, keyframes=[*first, *data.keyframes[40:]], georeference=None), tmp_path / "map")
     shown = " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
-    assert "georeference - (40 fixes are of keyframes that no loop ties to the first)" in shown
+    assert "georeference - (40 fixes are of keyframes that no loop connects to the first)" in shown
     done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
     assert "without 40 of the 40 keyframes of session 1: neither their own fixes" in done.stderr
     lines = lines_of(tmp_path / "a.geojson")
@@ -247,7 +247,7 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
     few = [replace(k, fix=k.fix and replace(k.fix, covariance=np.eye(3) * 25.0)) for k in few]
     save_as(replace(data, keyframes=few, georeference=None), tmp_path / "few")
     error = refused("map", "export", tmp_path / "few", tmp_path / "few.geojson")
-    assert "2 fixes do not tell it: the way is too short or too straight, or half" in error
+    assert "2 fixes do not determine it: the trajectory is too short or too straight, or at least half" in error
     assert "; 5 fixes are of keyframes that" in error
 
 
@@ -259,7 +259,7 @@ def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
 
 
 def test_a_recovered_map_is_where_its_fixes_are(tmp_path: Path) -> None:
-    """The row that says so was damaged: the recovered map was nowhere, and "80 fixes do not tell it"."""
+    """The row that says so was damaged: the recovered map was nowhere, and "80 fixes do not determine it"."""
     data = two_drives()
     save_as(data, tmp_path / "map")
     with closing(sqlite3.connect(tmp_path / "map")) as sql, sql:

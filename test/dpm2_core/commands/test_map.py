@@ -104,13 +104,13 @@ def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Pat
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(tmp_path: Path) -> None:
     """What stands on one is free where the other one is seen through: both are one grid. A steep hill is none."""
     data = ring(40, 100)  # around 200 m
-    for name, slope, laps, words in (("hill", 0.2, 1, ""), ("house", 0.0, 2, "up to 2.8 m over each other")):
+    for name, slope, laps, words in (("hill", 0.2, 1, ""), ("house", 0.0, 2, "up to 2.8 m above each other")):
         poses = np.repeat(data.poses[None], laps, 0)
         poses[..., 2, 3] += slope * poses[..., 0, 3] + 2.8 * np.arange(laps)[:, None]
         both = data if laps == 1 else merge_maps(data, data, np.eye(4), [data.edges[0]])
         save_as(replace(both, poses=poses.reshape(-1, 4, 4)), tmp_path / f"{name}.dpm2map")
         done = succeeded("map", "export", tmp_path / f"{name}.dpm2map", tmp_path / f"{name}.yaml", "--resolution", 0.5)
-        assert ("not to be used" in done.stderr, words in done.stderr) == (bool(words), True), done.stderr
+        assert ("do not use it" in done.stderr, words in done.stderr) == (bool(words), True), done.stderr
         assert (tmp_path / f"{name}.pgm").is_file()
 
 
@@ -228,7 +228,7 @@ def test_a_drive_that_both_maps_hold_is_said_to_be_there_twice(tmp_path: Path) -
     for second, said in (("one", True), ("other", False)):
         both = tmp_path / f"with {second}"
         done = succeeded("map", "merge", tmp_path / "one", tmp_path / second, "--out", both, "--transform", "10 0 0 90")
-        assert ("12 of its 12 keyframes are in a map before it, too" in done.stderr) is said
+        assert ("12 of its 12 keyframes are also in an earlier map" in done.stderr) is said
         assert len(loaded(both)) == 24
 
 
@@ -258,7 +258,7 @@ def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Pat
         where = known.T_enu_map @ loaded(map_file).poses
         np.testing.assert_allclose(both.georeference.T_enu_map @ both.poses[place], where, atol=1e-9)
     info = dpm2("map", "info", out, "--json", tmp_path / "info.json")
-    assert "how certain is not known" in " ".join(info.stdout.split())
+    assert "its accuracy is not known" in " ".join(info.stdout.split())
     figures = json.loads((tmp_path / "info.json").read_text(), parse_constant=pytest.fail)["georeference"]
     assert (figures["heading_sigma_deg"], figures["position_sigma_m"], figures["fixes"]) == (None, None, 0)
 
@@ -267,7 +267,7 @@ def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, 
     """As of a wrong sign, or the two maps the other way round."""
     with MapStore.open(map_file, read_only=False) as store:
         store.write(Change(georeference=Georeference(np.array([49.0, 8.4, 110.0]), se3.exp([0, 0, 1.0, 2, 3, 4]))))
-    for words, said in (("500 0 0 0", "500 m from where the fixes of both maps have it"), ("1 0 0 0", "")):
+    for words, said in (("500 0 0 0", "500 m from its pose by the fixes of both maps"), ("1 0 0 0", "")):
         out = tmp_path / f"{words}.dpm2map"
         done = succeeded("map", "merge", map_file, map_file, "--out", out, "--transform", words)
         assert (said in done.stderr, "fixes" in done.stderr) == (True, bool(said))
@@ -295,7 +295,7 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
     for name in ("a.ply", "a.pcd", "a.html", "a.pgm", "a.tum"):
         for path in ("apart", "alone"):
             done = succeeded("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
-            assert (f"without 12 of the 12 keyframes of {drive}: no loop ties" in done.stderr) == (path == "apart")
+            assert (f"without 12 of the 12 keyframes of {drive}: no loop connects" in done.stderr) == (path == "apart")
         if name != "a.html":  # it has a title
             assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
     assert len(read_trajectory(tmp_path / "apart.a.tum").keys) == 12

@@ -36,10 +36,10 @@ def test_figures_on_stdout_are_json_where_one_is_not_known(capsys: pytest.Captur
     (["run", ".", "--out", "o", "--resume"], "--resume: in which map?"),
     (["run", ".", "--out", "o", "--extend"], "--extend: in which map?"),
     (["run", ".", "--out", "o", "--localise", "m", "--extend"], "--extend: in which map?"),
-    (["map", "export", "m", "a.g2o", "--voxel", "1"], "--voxel: a map as g2o has no use for it"),
-    (["map", "export", "m", "a.ply", "--resolution", "1"], "--resolution: a map as ply has no use for it"),
+    (["map", "export", "m", "a.g2o", "--voxel", "1"], "--voxel: does not apply to g2o"),
+    (["map", "export", "m", "a.ply", "--resolution", "1"], "--resolution: does not apply to ply"),
     (["map", "merge", "a", "b", "--out", "c", "--transform", "1 2 3 4", "--set", "slam.threads=1"],
-     "--config and --set say how places are found"),
+     "--config and --set are for finding places"),
 ])  # fmt: skip
 def test_an_option_without_effect_is_rejected(
     command: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -50,7 +50,7 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     assert "miou" in log[-1]
     again = train(recording, out)
     assert again.returncode == 2
-    assert "--resume continues it" in again.stderr
+    assert "continue it with --resume" in again.stderr
     assert train(recording, out, "--resume", *SLAM, *third).returncode == 0  # nothing is left to do
     other = train(recording, out, "--resume", *SLAM)
     assert (other.returncode, other.stderr.count("\n")) == (2, 1)

@@ -24,7 +24,7 @@ def test_no_point_cloud_lists_the_topics(bags: Any, tmp_path: Path) -> None:
         UsageError, match=r"no PointCloud2 messages; topics: /cam/camera_info \(.*CameraInfo, 1\), /lid"
     ):
         BagSource(bag)
-    with pytest.raises(UsageError, match="of a driver's packets make clouds first"):
+    with pytest.raises(UsageError, match="convert a driver's packets to clouds first"):
         BagSource(bag)
 
 

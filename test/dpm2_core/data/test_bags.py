@@ -106,7 +106,7 @@ def test_images_that_do_not_fit_are_not_missing(bags: Any, tmp_path: Path) -> No
     source = BagSource(bags.write(tmp_path / "b", by_time([*clouds(bags, times), *rig(bags), *images])))
     assert seen(source) == [0, 1, None, None, None, None]
     assert f"{IMAGE}: image of (3, 4, 3), calibration for (6, 8); images are left out" in source.notes
-    assert f"4 of 6 frames have no image of {IMAGE} (within 0.05 s; 3 have one of no use)" in source.notes
+    assert f"4 of 6 frames have no image of {IMAGE} (within 0.05 s; 3 have an unusable one)" in source.notes
 
 
 @pytest.mark.parametrize(

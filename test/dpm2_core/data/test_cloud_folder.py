@@ -42,7 +42,7 @@ def test_pcd_files_in_every_encoding(tmp_path: Path, encoding: str) -> None:
     assert frames[0].time_offset is not None
     np.testing.assert_allclose(frames[0].time_offset, RAMP, atol=1e-6)
     assert [note.partition(": ")[2] for note in source.notes] == [
-        "the names are no times: scans are taken to be 0.1 s apart (input.period)"
+        "the names are not times: scans are assumed to be 0.1 s apart (input.period)"
     ]
     slow = CloudFolder(tmp_path, InputSettings(period=0.5))
     assert [frame.stamp for frame in slow.frames()] == [0, 500_000_000, 1_000_000_000]

@@ -77,7 +77,7 @@ def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path
     assert not fixes[0].antenna.any()
     (note,) = source.notes
     assert note.startswith("/fix: no transform from 'gnss' to 'velo_link'")
-    assert note.endswith("; the antenna is taken for the LiDAR")
+    assert note.endswith("; the antenna is assumed to be at the LiDAR")
     own = BagSource(bags.write(tmp_path / "own", drive(bags, frame="velo_link")), InputSettings(gnss_topic="/fix"))
     assert sum(frame.fix is not None for frame in own.frames()) == 2
     assert own.notes == []
@@ -92,7 +92,7 @@ def test_the_antenna_of_a_fix_is_not_that_of_another_receiver(bags: Any, tmp_pat
     source = BagSource(bags.write(tmp_path / "b", messages), InputSettings(gnss_topic="/fix"))
     fixes = [frame.fix for frame in source.frames() if frame.fix is not None]
     assert [fix.antenna.tolist() for fix in fixes] == [[3, 0, 0]] * 2
-    problem = "a message in frame 'rear', those before are in 'gnss': a topic has one sensor"
+    problem = "a message in frame 'rear', the previous ones are in 'gnss': a topic has one sensor"
     assert source.notes == [f"/fix: 2 samples left out (the first: {problem})"]
 
 
@@ -148,7 +148,7 @@ def test_what_is_not_known(bags: Any) -> None:
         ({"place": (91.0, 8.4, 110)}, "no place on Earth"),
         ({"place": (49.0, 1e300, 110)}, "no place on Earth"),
         ({"place": (49.0, 8.4, INF)}, "no place on Earth"),
-        ({"place": (0.0, 0.0, 0.0)}, "before they know"),
+        ({"place": (0.0, 0.0, 0.0)}, "before they have a fix"),
         ({"covariance": (NAN, *COVARIANCE[1:])}, "no covariance"),
         ({"covariance": (-4.0, *COVARIANCE[1:])}, "no covariance"),
         ({"covariance": (4.0, 3, *COVARIANCE[2:])}, "no covariance"),
@@ -195,7 +195,7 @@ def test_a_folder_becomes_a_bag_with_the_same_fixes(kitti_folder: Any, tmp_path:
     folder = kitti_folder()
     rows = [(t, 49 + t, 8.4, 110.0, 1.0, 2.0, 3.0) for t in (0.05, 0.12, 0.18, 0.33)]  # two of them before one scan
     np.savetxt(folder / "gnss.txt", rows, "%.12e")
-    assert "gnss.txt: the antenna is taken for the LiDAR" in KittiSource(folder).notes[-1]
+    assert "gnss.txt: the antenna is assumed to be at the LiDAR" in KittiSource(folder).notes[-1]
     with (folder / "calib.txt").open("a") as file:
         file.write("Tr_gnss_to_velo: 1 0 0 0.3 0 1 0 0.2 0 0 1 1\n")
     source = KittiSource(folder)

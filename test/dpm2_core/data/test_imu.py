@@ -208,7 +208,7 @@ def test_two_imus_on_one_topic_are_not_taken_for_one_that_turns(bags: Any, tmp_p
         upwards = {frame.stamp: frame.imu.forces[:, 2].tolist() for frame in source.frames() if frame.imu is not None}
         assert all(up == pytest.approx(9.8) for stamp, ups in upwards.items() for up in ups if stamp < 2 * SECOND)
         assert upwards[round(3.5 * SECOND)] == pytest.approx([-9.8] * 31)
-    left_out = "/imu: 229 samples left out (the first: a message in frame 'other', those before are in 'first': a"
+    left_out = "/imu: 229 samples left out (the first: a message in frame 'other', the previous ones are in 'first': a"
     assert any(note.startswith(left_out) for note in source.notes)
 
 

@@ -287,7 +287,7 @@ def test_scans_with_a_ring_of_each_point_are_refused(kitti_folder: MakeFolder, n
     points.astype("<f4").tofile(folder / "velodyne" / "000001.bin")
     frames = [*KittiSource(folder).frames()]
     assert frames[1].problem is not None
-    assert "5 numbers a point" in frames[1].problem
+    assert "5 numbers per point" in frames[1].problem
     assert [frame.problem for frame in frames if frame.index != 1] == [None] * 4
 
 
@@ -297,7 +297,7 @@ def test_integers_are_no_floats(kitti_folder: MakeFolder, noise: np.random.Gener
     noise.integers(0, 2000, (400, 8)).astype("<u2").tofile(folder / "velodyne" / "000001.bin")
     frame = [*KittiSource(folder).frames()][1]
     assert frame.problem is not None
-    assert "no places that a LiDAR measures" in frame.problem
+    assert "not the points of a LiDAR" in frame.problem
     assert not len(frame.points)
 
 
@@ -326,7 +326,9 @@ def test_poses_that_are_no_transforms_are_none(kitti_folder: MakeFolder) -> None
     (folder / "poses.txt").write_text("".join(f"{1 + (n == 2)} 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(5)))
     source = KittiSource(folder, InputSettings(kitti_poses="semantic_kitti"))
     np.testing.assert_array_equal(np.isnan(source.poses[:, 0, 0]), np.arange(5) == 2)
-    assert any("1 poses are no rigid transforms and left out, that of scan 2" in note for note in source.notes)
+    assert any(
+        "1 poses are not rigid transforms and left out, the first that of scan 2" in note for note in source.notes
+    )
 
 
 @pytest.mark.parametrize("text", [None, ""])
@@ -345,11 +347,11 @@ def test_without_times_frames_are_a_tenth_apart(kitti_folder: MakeFolder, text: 
     [
         ("times.txt", "0\nten\n", r"times.txt:2: .*'ten'"),
         ("times.txt", "0\n\n1 2\n", r"times.txt:3: 2 numbers, want 1"),
-        ("times.txt", "0\n1e300\n", r"times.txt:2: 1e\+300 is no time"),
-        ("imu.txt", "0 0 0 0 0 0 1e300\n", r"imu.txt:1: 1e\+300 is no"),
+        ("times.txt", "0\n1e300\n", r"times.txt:2: 1e\+300 is too large for a time"),
+        ("imu.txt", "0 0 0 0 0 0 1e300\n", r"imu.txt:1: 1e\+300 is too large"),
         ("imu.txt", "0 1 2 3\n", "imu.txt:1: 4 numbers, want 7"),
         ("imu.txt", "0 0 0 0 0 0 9\n0 0 0 0 0 0 9\n", "imu.txt:2: times do not"),
-        ("gnss.txt", "1e20 49 8 100 1 1 1\n", r"gnss.txt:1: 1e\+20 is no time"),
+        ("gnss.txt", "1e20 49 8 100 1 1 1\n", r"gnss.txt:1: 1e\+20 is too large for a time"),
         ("gnss.txt", "0 49 8\n", "gnss.txt:1: 3 numbers, want 7"),
         ("gnss.txt", "0 49 8 0 1 1 1\n1 99 8 0 1 1 1\n", "gnss.txt:2: fix: .* no place on Earth"),
         ("gnss.txt", "0 49 8 0 1 1 0\n", "gnss.txt:1: fix: .* no covariance"),

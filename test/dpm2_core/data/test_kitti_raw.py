@@ -134,7 +134,7 @@ def test_a_drive_without_scans_is_said_to_be_none(date: Path) -> None:
 def test_without_calibration_the_points_count(date: Path) -> None:
     (date / "calib_velo_to_cam.txt").unlink()
     source = open_source(date / DRIVE)
-    assert "calib_velo_to_cam.txt: no such file; without calibration the points alone count" in source.notes[0]
+    assert "calib_velo_to_cam.txt: no such file; without calibration only the points are used" in source.notes[0]
     assert (source.poses, next(source.frames()).images) == (None, ())
 
 

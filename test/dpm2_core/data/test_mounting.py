@@ -56,7 +56,7 @@ def test_up_is_that_of_the_root_above_the_lidar(bags: Any, tmp_path: Path, turn:
     np.testing.assert_allclose(ups(source), [up, up], atol=1e-9)
     angle = round(np.degrees(np.arccos(up[2])))
     assert said(source) == [
-        f"/tf_static has the LiDAR tilted by {angle} degrees in base_link (and the map is level by that)"
+        f"/tf_static shows the LiDAR tilted by {angle} degrees in base_link (by which the map is leveled)"
     ]
 
 
@@ -74,14 +74,16 @@ def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path:
     source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))])
     assert ups(source).tolist() == [[0, 0, 1]] * 2
     (note,) = said(source)
-    assert note.startswith("/tf_static has the LiDAR tilted by 90 degrees in camera_optical (which is no base")
+    assert note.startswith(
+        "/tf_static shows the LiDAR tilted by 90 degrees in camera_optical (which is not used as base"
+    )
 
 
 def test_a_driver_that_begins_with_an_empty_cloud_says_nothing_of_the_ground(bags: Any, tmp_path: Path) -> None:
     """The next one does."""
     source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))], first=[bags.cloud(0.9, count=0)])
     assert ups(source).tolist() == [[0, 0, 1]] * 3
-    assert "which is no base" in said(source)[0]
+    assert "which is not used as base" in said(source)[0]
 
 
 def test_a_converted_bag_has_the_mount(bags: Any, tmp_path: Path) -> None:

@@ -184,7 +184,7 @@ def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) 
 def test_a_drive_with_its_own_value_of_what_is_swept_is_an_error_of_use(tmp_path: Path) -> None:
     """A drive's own value takes precedence, so all its rows were equal, as if the setting made no difference."""
     drives = [ManifestDrive(path="x", name="x", set=("slam.map.voxel=0.3", "slam.keyframes.distance = 5"))]
-    with pytest.raises(UsageError, match=r"^x: has slam\.keyframes\.distance = 5 of its own"):
+    with pytest.raises(UsageError, match=r"^x: the list has slam\.keyframes\.distance = 5 for it"):
         list(sweep_parts(drives, tmp_path / "base.yaml", variants(["slam.keyframes.distance=4,6"])))
 
 
@@ -232,7 +232,7 @@ def test_what_kills_every_worker_ends_with_a_reason(
     parts = [Part(str(value), "fleet_work:divide", {"value": value}) for value in (-1, 0, 2)]
     found = {ended.name: ended for ended in cluster.run(parts, tmp_path)}
     assert (found["2"].figures or {})["quotient"] == 5
-    assert found["-1"].reason.startswith("3 workers died over it")
+    assert found["-1"].reason.startswith("3 workers died while processing it")
     assert found["0"].reason.startswith("ZeroDivisionError: ")
     assert "fleet_work.py:" in found["0"].reason
 

@@ -60,7 +60,7 @@ def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: P
         assert first.drives == {"a": 7}
         assert set(first.left_out) == {"stranger", "poison", "torn"}
         assert "dpm2 map check" in first.left_out["poison"]
-        assert first.left_out["torn"].startswith("not whole")
+        assert first.left_out["torn"].startswith("not complete: it is being written")
         (known,) = (fleet / ".merge" / "joins").glob(f"a/stranger/*/{DONE}")
         before, file = known.stat().st_mtime_ns, out.stat().st_ino
         write_drive(fleet / "b", town, truth["b"], 2)
@@ -85,10 +85,10 @@ def test_drives_that_share_a_road_become_one_map_and_others_stay_out(tmp_path: P
 
 def test_a_file_that_is_no_merge_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("precious")
-    with pytest.raises(UsageError, match="which is no merge of drives"):
+    with pytest.raises(UsageError, match="and is no merge of drives"):
         merge(tmp_path, tmp_path / "mine", SlamSettings(), Cluster())
     assert (tmp_path / "mine").read_text() == "precious"
-    with pytest.raises(UsageError, match="no drive that is whole"):
+    with pytest.raises(UsageError, match="no complete drive in it"):
         merge(tmp_path, tmp_path / "out", SlamSettings(), Cluster())
 
 
@@ -192,7 +192,9 @@ def test_a_drive_that_was_added_to_a_merge_is_not_lost(
     with MapStore.create(out) if replaced else MapStore.open(out, read_only=False) as store:
         append_map(store, ring(5))
     before = out.read_bytes()
-    with pytest.raises(UsageError, match=f"town: 5 of its keyframes are of no drive of {tmp_path}; give another --out"):
+    with pytest.raises(
+        UsageError, match=f"town: 5 of its keyframes are of no drive in {tmp_path}; choose another --out"
+    ):
         merge(tmp_path, out, SlamSettings(), nullcontext())
     assert out.read_bytes() == before
 
@@ -212,7 +214,7 @@ def test_a_log_that_a_map_was_moved_without_is_not_removed(tmp_path: Path, monke
 def test_a_map_whose_record_is_damaged_is_not_replaced(tmp_path: Path, drives: str) -> None:
     save_as(ring(3), tmp_path / "town")
     (tmp_path / "town.json").write_text(f'{{"drives": {drives}, "left_out": {{}}, "joins": [], "made": {{}}}}')
-    with pytest.raises(UsageError, match="which is no merge of drives"):
+    with pytest.raises(UsageError, match="and is no merge of drives"):
         merge(tmp_path, tmp_path / "town", SlamSettings(), Cluster())
 
 
@@ -275,8 +277,8 @@ def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tm
     assert run(0.4, {"a": "", "b": "failed", "c": "stopped"}) == ["done", "failed", "stopped"]
     names, left_out = joined()
     assert names == ["a"]
-    assert left_out["b"] == "not done as it was asked for last: no such recording"
-    assert left_out["c"] == "not done as it was asked for last: stopped"
+    assert left_out["b"] == "not complete in the last run: no such recording"
+    assert left_out["c"] == "not complete in the last run: stopped"
     assert run(0.2, {"b": "", "c": ""}) == ["kept", "kept"]
     assert joined()[0] == ["a", "b", "c"]
 
@@ -305,7 +307,7 @@ def test_a_drive_under_two_names_is_joined_once(tmp_path: Path, noise: np.random
         describe_as(search.kept, name, vectors)
     left_out: dict[str, str] = {}
     assert list(search.places(parts, left_out)) == ["a", "c"]
-    assert left_out == {"b": "the same drive as a: all its places look exactly as there"}
+    assert left_out == {"b": "the same drive as a: all its places are the same"}
 
 
 def test_places_are_found_again_in_an_index_that_was_kept(tmp_path: Path, noise: np.random.Generator) -> None:
@@ -343,7 +345,7 @@ def test_candidates_that_are_gone_are_looked_for_anew(tmp_path: Path, noise: np.
     assert file.read_text() == found
     assert index.drives == [("a", [1, 2], 50), ("b", [1, 2], 50)]
     file.write_text(found[:100])
-    with pytest.raises(Dpm2Error, match=r"b.json: damaged; without the folder .*/.merge it is made anew"):
+    with pytest.raises(Dpm2Error, match=r"b.json: damaged; remove the folder .*/.merge, and it is made again"):
         search.joins(parts, index)
     listed = search.kept / "index.json"
     listed.write_text(listed.read_text().replace("50", "-50"))

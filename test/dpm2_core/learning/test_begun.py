@@ -104,7 +104,7 @@ def test_a_training_is_not_resumed_with_something_else(
     begin_or_resume(tmp_path, False, Training(), data={"SRC": "a"})
     left(tmp_path)
     begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
-    with pytest.raises(UsageError, match=f"began with {difference}; --resume goes on with the same alone"):
+    with pytest.raises(UsageError, match=f"began with {difference}; --resume needs the same settings"):
         begin_or_resume(tmp_path, True, Training.model_validate(tree), data=data)
     begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
 
@@ -179,7 +179,7 @@ def test_a_checkpoint_that_does_not_say_how_it_began_is_gone_on_with(tmp_path: P
     """An earlier version wrote it; a new training does not replace it."""
     left(tmp_path)
     begin_or_resume(tmp_path, True, Training())
-    with pytest.raises(UsageError, match="holds a training; --resume continues it"):
+    with pytest.raises(UsageError, match="contains a training; continue it with --resume"):
         begin_or_resume(tmp_path, False, Training())
     (tmp_path / CHECKPOINT).unlink()
     with pytest.raises(UsageError, match=r"no checkpoint\.pt to resume"):

@@ -172,7 +172,7 @@ def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording
     between = poses[before, None, :3, 3] - poses[after, :3, 3]
     assert np.linalg.norm(between, axis=-1).min() > 1000
     assert len(referenced.notes) == 1
-    assert "where 2 parts of the drive are to each other" in referenced.notes[0]
+    assert "the relative poses of 2 parts of the drive" in referenced.notes[0]
     for part in (before, after):
         way = [np.linalg.norm(np.diff(of[part, :3, 3], axis=0), axis=1) for of in (poses, truth)]
         assert np.abs(way[0] - way[1]).max() < 0.02
@@ -192,7 +192,7 @@ def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() ->
         frames.append(replace(frame, points=points))
     referenced = refer(InMemory(frames), GEOMETRIC)
     assert all(frame.time_offset is None for frame in referenced.frames())
-    assert referenced.notes == ["the times of the points are not used, the motion contradicts them"]
+    assert referenced.notes == ["the point times are not used, because the motion contradicts them"]
 
 
 @pytest.mark.long

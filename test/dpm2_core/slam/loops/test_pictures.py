@@ -91,7 +91,7 @@ def test_a_place_in_a_corridor_is_found_by_its_picture_alone() -> None:
     ("paint", "seen", "why"),
     [
         (PAINT, random_paint(5), "no more than with a place that looks alike"),
-        (stripes, stripes, "the pictures of two places are alike"),
+        (stripes, stripes, "the images of two places are alike"),
     ],
     ids=["elsewhere", "repetitive"],
 )

@@ -58,7 +58,7 @@ def test_a_loop_that_the_merged_map_contradicts_is_rejected_in_its_file_and_name
     done = dpm2("map", "merge", tmp_path / "two", tmp_path / "one", "--out", tmp_path / "all",
                 "--set", "slam.loops.descriptors=false")  # fmt: skip
     assert done.returncode == 0
-    assert "loops that contradict the rest are rejected, those of the new map's keyframes 0 and 12\n" in done.stderr
+    assert "loops that contradict the others are rejected, between the new map's keyframes 0 and 12\n" in done.stderr
     with MapStore.open(tmp_path / "all") as store:
         loops = {(e.from_node, e.to_node, e.registration.method): e for e in load_map(store).edges if e.kind == "loop"}
     assert len(loops) == 3 * 2 + 1 + 24

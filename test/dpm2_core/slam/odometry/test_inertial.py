@@ -69,7 +69,7 @@ def test_samples_that_two_frames_share_count_once(robot: tuple[list[Frame], Arra
     sharing = [wrong[0], *(shared(before, frame) for before, frame in pairwise(wrong))]
     plain, both = run(wrong), run(sharing)
     assert [t.T_odom_lidar.tolist() for t in both] == [t.T_odom_lidar.tolist() for t in plain]
-    assert any("its turns are not those of the scans" in (t.imu or "") for t in both)
+    assert any("its rotations are not those of the scans" in (t.imu or "") for t in both)
 
 
 def shared(before: Frame, frame: Frame) -> Frame:
@@ -90,7 +90,7 @@ def test_rates_in_degrees_do_not_bend_the_first_map(robot: tuple[list[Frame], Ar
     in_degrees = run([*with_imu(frames[:3], lambda rates, forces: (np.degrees(rates), forces)), *without(frames[3:])])
     assert all(t.registration.ok for t in in_degrees)
     assert off(in_degrees, truth).max() < 0.03
-    assert (in_degrees[2].imu or "").startswith("its turns are not those of the scans")
+    assert (in_degrees[2].imu or "").startswith("its rotations are not those of the scans")
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_a_wrong_orientation_is_noticed(robot: tuple[list[Frame], Array], plain:
     upside_down = np.diag([1.0, -1.0, -1.0])
     lies = run(with_imu(frames, lambda rates, forces: (rates @ upside_down, forces)))
     assert lies[-1].imu is not None
-    assert lies[-1].imu.startswith("its turns are not those of the scans")
+    assert lies[-1].imu.startswith("its rotations are not those of the scans")
     assert sum(t.imu == "" for t in lies) < 25  # nothing shows it at standstill
     assert error(lies, truth) < 3 * error(plain, truth)
 
@@ -191,7 +191,7 @@ def test_where_a_sudden_turn_shows_a_wrong_orientation_no_scan_is_lost() -> None
     frames, truth = list(drive.frames()), drive.poses
     lies = run(with_imu(frames, lambda rates, forces: (rates * [1, 1, -1], forces)))
     assert lies[-1].imu is not None
-    assert lies[-1].imu.startswith("its turns are not those of the scans")
+    assert lies[-1].imu.startswith("its rotations are not those of the scans")
     assert all(t.registration.ok for t in lies)
     assert error(lies, truth) < 3 * error(run(without(frames)), truth)
 
@@ -255,7 +255,7 @@ def test_a_gyroscope_that_repeats_its_last_rates_is_left_out_before_a_scan_is_lo
     repeats = run(good + bad)
     assert all(t.registration.ok for t in repeats)
     assert repeats[-1].imu is not None
-    assert repeats[-1].imu.startswith("its turns are not those of the scans")
+    assert repeats[-1].imu.startswith("its rotations are not those of the scans")
     assert error(repeats, truth) < 2 * error(plain, truth)
 
 
@@ -380,7 +380,7 @@ def test_forces_without_gravity_make_nothing_level(gravity: float) -> None:
         motion.look(replace(frame, imu=replace(frame.imu, forces=forces)))
         motion.registered(T, T, frame.stamp, twist)
         if frame is first:
-            assert motion.problem == "its forces at rest are not gravity: odom is not level"
+            assert motion.problem == "its acceleration at rest is not gravity: odom is not level"
     assert motion.problem == ""
     assert motion.turn is not None
     assert np.degrees(se3.angle(se3.make(motion.turn, np.zeros(3)))) < 0.02  # the bias would be 0.2, but it is known

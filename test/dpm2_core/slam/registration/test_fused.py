@@ -299,11 +299,11 @@ def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Dr
     assert (result.method, case.oracle.asked) == ("geometric", 0)
     assert error < 0.02
     contradicted, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.35, 0, 0])
-    assert contradicted.reason.startswith("neural and points 0.35 m")
+    assert contradicted.reason.startswith("neural and geometric 0.35 m")
     assert error < 0.02
     assert contradicted.worst_sigma > 0.3  # half of the points fit, and the network excludes them
     hardly, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.2, 0, 0])  # 3.7 standard deviations
-    assert hardly.reason.startswith("neural and points 0.20 m")
+    assert hardly.reason.startswith("neural and geometric 0.20 m")
     assert error < 0.02
     case.prediction = replace(case.prediction, starts=[case.truth @ se3.exp([0, 0, 0, 0.15, 0, 0])])  # 1.5 deviations
     case.register([0, 0, 0, 0.05, 0, 0])

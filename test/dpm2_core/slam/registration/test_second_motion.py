@@ -51,7 +51,7 @@ def test_a_crowd_that_hides_the_walls_is_followed_and_the_way_to_them_stated() -
         assert result.state is State.DEGRADED
         # within centimeters; where the walls are too far off to be found the way is extrapolated
         assert result.registration.worst_sigma == pytest.approx(error, rel=0.1)
-        assert "moved otherwise" in result.registration.reason
+        assert "fit another motion" in result.registration.reason
 
 
 @pytest.mark.parametrize(("people", "along"), [(30, True), (60, False)])

@@ -261,7 +261,9 @@ def test_the_map_of_a_killed_drive_that_was_moved_without_its_log_is_not_sound(m
         assert check_map(map_file).problems == []  # its writer lives
         shutil.copy(map_file, moved)
         store.copy_to(copy)
-    words = "who wrote it was killed, and moved.dpm2map-wal, where the last 4 MB or all of it may be, is not beside it"
+    words = (
+        "its writer was killed, and moved.dpm2map-wal, which may contain the last 4 MB or all of it, is not next to it"
+    )
     assert check_map(moved).problems == [words]
     assert check_map(copy).problems == check_map(map_file).problems == []
 
