@@ -40,8 +40,8 @@ def bench(
     unseen: Annotated[
         Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
     ] = None,
-    pairs: Annotated[int | None, typer.Option(min=1, help="Of each kind; of relocalise: visits [60].")] = None,
-    only: Annotated[str | None, typer.Option(help="This part alone, of a benchmark that has several.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=1, help="Pairs of each kind; of relocalise: visits [60].")] = None,
+    only: Annotated[str | None, typer.Option(help="Run only this part of a benchmark that has several.")] = None,
 ) -> None:
     """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.
 

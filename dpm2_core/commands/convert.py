@@ -20,7 +20,7 @@ def convert(
     config: ConfigFile = None,
     settings: InputOverrides = None,
     zstd: Annotated[bool, typer.Option("--zstd", help="Compress: about a third smaller, and slower.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a bag that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag.")] = False,
 ) -> None:
     """Convert a recording to a rosbag2 (MCAP) folder.
 

@@ -16,7 +16,7 @@ from dpm2_core.tables import FigureTable
 
 
 def doctor(
-    folder: Annotated[Path, typer.Option(help="Where results will be written: how much room there is.")] = Path(),
+    folder: Annotated[Path, typer.Option(help="Folder for results, whose free space is checked.")] = Path(),
     no_test: Annotated[bool, typer.Option("--no-test", help="Without the self-test, which takes ten seconds.")] = False,
     json_file: JsonFile = None,
 ) -> None:

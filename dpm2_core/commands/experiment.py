@@ -17,17 +17,17 @@ from dpm2_core.tables import FigureTable
 
 
 def experiment(
-    name: Annotated[str | None, typer.Argument(help="Which; --list shows them.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of the experiment; --list shows all.")] = None,
     data: Annotated[Path | None, typer.Argument(help="Root of the data set.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; what is done there stays.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; finished parts in it are kept.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the experiments.")] = False,
     sequences: Annotated[
-        str | None, typer.Option(help="To be tested on, with commas; else those of the paper that are there.")
+        str | None, typer.Option(help="Sequences to test on, with commas; else those of the paper that exist.")
     ] = None,
-    learn: Annotated[str | None, typer.Option(help="To be learned from, likewise.")] = None,
-    weights: Annotated[str | None, typer.Option(help="Of the network: a name or a .safetensors file.")] = None,
+    learn: Annotated[str | None, typer.Option(help="Sequences to train on, with commas.")] = None,
+    weights: Annotated[str | None, typer.Option(help="Weights of the network: a name or a .safetensors file.")] = None,
     registration: Annotated[
-        str | None, typer.Option(help="Of the SLAM: geometric, neural, refined, adaptive; several with commas.")
+        str | None, typer.Option(help="For the SLAM: geometric, neural, refined, adaptive; several with commas.")
     ] = None,
     peer: Annotated[
         list[str] | None,
@@ -36,13 +36,13 @@ def experiment(
     lengths: Annotated[
         str | None, typer.Option(help="Segments of the KITTI metric, m, with commas, instead of 100 to 800.")
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="Of each sequence, a:b by position from 0.")] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Trainings of each arm.")] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML of the trainings.")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames of each sequence, a:b by position from 0.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of trainings of each arm.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file with settings of the trainings.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the SLAM, or of the trainings.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Parts at a time, each in a process of its own.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Parts that run at a time, each in its own process.")] = 1,
     json_file: JsonFile = None,
 ) -> None:
     """Make a table or figure of the papers on your copy of the data, theirs beside it.

@@ -28,12 +28,13 @@ app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run
 Drives = Annotated[
     list[Path], typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a list of them as YAML.")
 ]
-Out = Annotated[Path, typer.Option(help="Folder for the results, which all workers can write; what is whole stays.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results, writable by all workers; complete ones are kept.")]
 Address = Annotated[
-    str | None, typer.Option("--ray", metavar="ADDRESS", help="Of a cluster, HOST:PORT or auto; else this machine.")
+    str | None, typer.Option("--ray", metavar="ADDRESS", help="A cluster of Ray, HOST:PORT or auto; else this machine.")
 ]
 Workers = Annotated[
-    int | None, typer.Option(min=1, show_default="as many as there are processors for", help="Tasks at a time.")
+    int | None,
+    typer.Option(min=1, show_default="as many as there are processors for", help="Tasks that run at a time."),
 ]
 
 
@@ -58,9 +59,7 @@ def run(
 @app.command()
 def merge(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results of `dpm2 fleet run`.")],
-    out: Annotated[
-        Path, typer.Option(help="Map file; one that was merged before is replaced when the new one is whole.")
-    ],
+    out: Annotated[Path, typer.Option(help="Map file; an earlier merge is replaced once the new one is complete.")],
     address: Address = None,
     workers: Workers = None,
     config: ConfigFile = None,

@@ -34,7 +34,7 @@ app.command()(optimize)
 @app.command()
 def export(
     path: MapFile,
-    out: Annotated[Path, typer.Argument(help="File to write; its ending says what, unless --format does.")],
+    out: Annotated[Path, typer.Argument(help="File to write; its suffix gives the format, unless --format does.")],
     format: Annotated[
         str,
         typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."),
@@ -64,7 +64,7 @@ def merge(
         list[str] | None,
         typer.Option(
             help='Pose of a further map in the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; one each. Else the '
-            "maps are found in each other by their descriptors."
+            "maps are aligned by their descriptors."
         ),
     ] = None,
     config: ConfigFile = None,
@@ -103,7 +103,7 @@ def prune(
 @app.command()
 def check(
     path: MapFile,
-    recover: Annotated[Path | None, typer.Option(help="Write what is good to this new map file.")] = None,
+    recover: Annotated[Path | None, typer.Option(help="Write the undamaged part to this new map file.")] = None,
 ) -> None:
     """Check a map for damage: database, checksum of every row, dangling edges, invalid poses."""
     from dpm2_core.slam.mapping.parts import georeferenced

@@ -21,11 +21,11 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, s
 InputOverrides = Annotated[
     list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as input.sequence=04.")
 ]
-Workers = Annotated[int, typer.Option(min=1, help="At a time; they do not change the result.")]
+Workers = Annotated[int, typer.Option(min=1, help="Number of processes; it does not change the result.")]
 PROCESSORS = processors()
 """Default of `Workers`."""
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: to stdout, alone.")
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: only them to stdout.")
 ]
 
 

@@ -44,22 +44,22 @@ def run(
         ),
     ] = None,
     map_file: Annotated[
-        Path | None, typer.Option("--map", help="Map file, such as drive.dpm2map, written as the drive goes on.")
+        Path | None, typer.Option("--map", help="Map file, such as drive.dpm2map, written during the drive.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on where --map ends: a run was cut off.")] = False,
-    extend: Annotated[bool, typer.Option("--extend", help="Add this drive, another one, to --map.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue where --map ends, after an interrupted run.")
+    ] = False,
+    extend: Annotated[bool, typer.Option("--extend", help="Add this drive as a new one to an existing --map.")] = False,
     localise: Annotated[
         Path | None,
-        typer.Option("--localise", help="Find the drive in this map (a file, or tiles), which stays as it is."),
+        typer.Option("--localise", help="Localize in this map (a file, or tiles), which is not changed."),
     ] = None,
-    hint: Annotated[
-        str | None, typer.Option(help="About where in --localise it begins: x,y,yaw in m and degrees.")
-    ] = None,
+    hint: Annotated[str | None, typer.Option(help="Approximate start in --localise: x,y,yaw in m and degrees.")] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
-    view: Annotated[bool, typer.Option("--view", help="Show the run as it goes on, in rerun's viewer.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show the run live in rerun's viewer.")] = False,
     record: Annotated[
-        Path | None, typer.Option(help="The same to a file, such as run.rrd: `rerun run.rrd` shows it.")
+        Path | None, typer.Option(help="Record the same in a file, such as run.rrd: `rerun run.rrd` shows it.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def show(
     src: Annotated[Path, typer.Argument(help="Any recording that `dpm2 run` reads.")],
     first: Annotated[int, typer.Argument(metavar="A", min=0, help="Position of a frame, from 0.")],
-    second: Annotated[int, typer.Argument(metavar="B", min=0, help="That of the frame that is registered to A.")],
+    second: Annotated[int, typer.Argument(metavar="B", min=0, help="Position of the frame that is registered to A.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
     weights: Annotated[
         list[str] | None,

@@ -17,31 +17,33 @@ from dpm2_core.sim.settings import DriveConfig, PresetName
 
 def sim(
     out: Annotated[Path, typer.Argument(help="Folder to make, in KITTI odometry layout; a complete one is reused.")],
-    frames: Annotated[int | None, typer.Option(help="At 10 Hz; 150, or all of a file.", show_default=False)] = None,
-    seed: Annotated[int, typer.Option(help="Of the world and the noise.")] = 0,
+    frames: Annotated[
+        int | None, typer.Option(help="Number, at 10 Hz; 150, or all of a file.", show_default=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the world and the noise.")] = 0,
     road: Annotated[
         str, typer.Option(help="straight, loop, figure8, random, or a file of KITTI poses to drive along.")
     ] = "loop",
     preset: Annotated[
         PresetName, typer.Option(help="city, suburb, rural, highway, tunnel, indoor or car_park.")
     ] = "city",
-    images: Annotated[bool, typer.Option("--images/--no-images", help="With image_2.")] = True,
+    images: Annotated[bool, typer.Option("--images/--no-images", help="Write image_2.")] = True,
     traffic: Annotated[
-        float, typer.Option(help="Times the preset's; above 1 in columns on every lane, 20 is full.")
+        float, typer.Option(help="As a factor of the preset's; above 1 in columns on every lane, 20 is full.")
     ] = 1.0,
     sensor: Annotated[
-        Literal["clean", "real"], typer.Option(help="clean: exact but for noise; real: errs as KITTI's does.")
+        Literal["clean", "real"], typer.Option(help="clean: exact except for noise; real: with errors as KITTI's.")
     ] = "clean",
     pattern: Annotated[
         Literal["spinning", "rosette"], typer.Option(help="rosette: 70 deg ahead, never the same twice (Livox).")
     ] = "spinning",
-    beams: Annotated[int, typer.Option(help="Of the LiDAR: 16, 32, 64 or 128.")] = 64,
-    height: Annotated[float, typer.Option(help="Of the LiDAR above the ground, m.")] = 1.73,
-    reach: Annotated[float, typer.Option("--range", help="Of the LiDAR, m.")] = 80.0,
+    beams: Annotated[int, typer.Option(help="Beams of the LiDAR: 16, 32, 64 or 128.")] = 64,
+    height: Annotated[float, typer.Option(help="Height of the LiDAR above the ground, m.")] = 1.73,
+    reach: Annotated[float, typer.Option("--range", help="Range of the LiDAR, m.")] = 80.0,
     imu: Annotated[
-        bool, typer.Option("--imu", help="With imu.txt, of an IMU at 100 Hz that errs as real ones.")
+        bool, typer.Option("--imu", help="Write imu.txt, of an IMU at 100 Hz with realistic errors.")
     ] = False,
-    gnss: Annotated[bool, typer.Option("--gnss", help="With gnss.txt, fixes of a plain receiver at 5 Hz.")] = False,
+    gnss: Annotated[bool, typer.Option("--gnss", help="Write gnss.txt, fixes of a plain receiver at 5 Hz.")] = False,
     workers: Workers = PROCESSORS,
 ) -> None:
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""

@@ -50,7 +50,7 @@ SequencesOption = Annotated[
         help="Sequences of SRC, or numbers of its pairs, with commas, such as 00,01; all there are otherwise."
     ),
 ]
-ValSequencesOption = Annotated[str | None, typer.Option(help="Of --val, as --sequences.")]
+ValSequencesOption = Annotated[str | None, typer.Option(help="Sequences of --val, as --sequences.")]
 ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure on during training, as SRC.")]
 
 
