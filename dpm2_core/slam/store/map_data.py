@@ -108,7 +108,7 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         raise ValueError("invalid mask of moving points")
     trail = [pruned for _, pruned in _made(store, "trail", removed_of)]
     if any(pruned.node not in nodes for pruned in trail):
-        raise ValueError("a pruned keyframe that belongs to none")
+        raise ValueError("a pruned keyframe that refers to no existing one")
     return MapData(
         keyframes,
         np.array([poses[node] for node in nodes]).reshape(-1, 4, 4),

@@ -125,7 +125,7 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     if not all(np.isfinite(part).all() for part in (xyz, step, axis, up) if part is not None):
         raise ValueError("no descriptors: values that are not finite")
     if up is not None and not abs(np.linalg.norm(up) - 1) < 1e-3:
-        raise ValueError("no descriptors: what should point up is no direction")
+        raise ValueError("no descriptors: the up direction is not a unit vector")
     return Descriptors(xyz, features, step, axis, up, scale)
 
 
@@ -191,7 +191,7 @@ def edge_of(row: tuple[Any, ...]) -> Edge:
 def check_ends(edge: Edge, nodes: Container[int]) -> None:
     """Raises ValueError unless both ends of an edge are among the nodes."""
     if edge.from_node not in nodes or edge.to_node not in nodes or edge.from_node == edge.to_node:
-        raise ValueError(f"leads from {edge.from_node} to {edge.to_node}, which are not both there")
+        raise ValueError(f"leads from {edge.from_node} to {edge.to_node}, which do not both exist")
 
 
 def removed_row(p: RemovedKeyframe) -> tuple[Any, ...]:
@@ -245,7 +245,7 @@ def georeference_of(row: tuple[Any, ...]) -> Georeference:
 def _numbers(values: list[Any]) -> Array:
     """The values as an array. Raises ValueError unless they are floating-point numbers."""
     if not all(isinstance(value, float) for value in values):
-        raise ValueError("something else where a number belongs")
+        raise ValueError("not a number where one is expected")
     return np.array(values)
 
 
@@ -265,7 +265,7 @@ def session_of(row: tuple[Any, ...]) -> Session:
 def _check_types(numbers: tuple[Any, ...], name: Any = "") -> None:
     """Raises ValueError unless they are integers and a name of limited length: SQLite columns accept any type."""
     if not all(isinstance(number, int) for number in numbers):
-        raise ValueError("something else where a whole number belongs")
+        raise ValueError("not a whole number where one is expected")
     if not isinstance(name, str) or len(name) > _LONGEST_NAME:
         raise ValueError(f"no name, or one of more than {_LONGEST_NAME} characters")
 

@@ -58,7 +58,7 @@ class Salvage:
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
         for node, mask in self._rows("moving"):
-            with self._noted(f"keyframe {node}: which points move is lost"):
+            with self._noted(f"keyframe {node}: its mask of moving points is lost"):
                 if node in keyframes and (cloud := self._payload(node)[0]) is not None:
                     unpack_mask(mask, len(unpack_cloud(cloud)))
                     moving[node] = mask
@@ -97,7 +97,7 @@ class Salvage:
                 self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
                 del loans[node]
         for node in loans:
-            with self._noted(f"keyframe {node}: how its place was last seen is lost"):
+            with self._noted(f"keyframe {node}: its own cloud is lost"):
                 if (payload := self._row("payloads", node)) is not None:
                     unpack_cloud(payload[1])
         without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
@@ -201,7 +201,7 @@ class Salvage:
                 if (pruned := rows.removed_of(row)).node in keyframes:
                     trail.append(pruned)
                     continue
-            self._problem(f"trail {row[0]}: not a pose beside a keyframe that is there")
+            self._problem(f"trail {row[0]}: not a pose relative to an existing keyframe")
         return trail
 
     def _sessions(self, keyframes: dict[int, Keyframe]) -> list[Session]:
@@ -249,7 +249,7 @@ class Salvage:
             self._problem(f"{table}: rows from {lost} on cannot be read, and how many there are is not known")
             return lost
         if last > self._most:
-            self._problem(f"{table}: a row {last} in a file of at most {self._most}")
+            self._problem(f"{table}: row number {last} in a file of at most {self._most} rows")
         return min(last, self._most)
 
     def _last_readable(self, table: str) -> int:

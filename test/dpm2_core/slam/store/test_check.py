@@ -135,7 +135,7 @@ def test_how_a_place_was_last_seen_costs_nothing_but_itself(tmp_path: Path) -> N
     execute(path, "UPDATE payloads SET cloud = x'00' WHERE node = 10")
     result = check_map(path)
     assert (result.keyframes, result.lost, result.lost_clouds) == (12, 0, 0)
-    assert result.problems == ["keyframe 10: how its place was last seen is lost: its checksum is wrong"]
+    assert result.problems == ["keyframe 10: its own cloud is lost: its checksum is wrong"]
     recovered(path)
     with MapStore.open(path.with_name("recovered.dpm2map")) as store:
         assert sorted(node for (node,) in store.rows("payloads", "node")) == [*range(10), 11]
