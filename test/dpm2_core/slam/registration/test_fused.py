@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whose result it is when network and points agree, when one is silent, and when they contradict each other.
+"""Which result is taken if network and points agree, if one of them has none, and if they contradict each other.
 
-The points are real scans of the synthetic city; what the network says is chosen, so that it can be wrong on purpose.
+The points are real scans of the synthetic city. The network's result is chosen, so that it can be deliberately wrong.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dpm2_core.slam.registration.protocol import Prediction
 from ....helpers.drives import Drive
 from ....helpers.scenes import make_image
 
-SIGMA = np.repeat([0.001, 0.04], 3)  # rad, m, that the network claims
+SIGMA = np.repeat([0.001, 0.04], 3)  # standard deviations that the network reports, rad and m
 
 
 class Oracle:
@@ -52,7 +52,7 @@ class Oracle:
 
 
 class Case:
-    """The sixth scan of a drive, to be registered to the five before."""
+    """The sixth scan of a drive, to be registered to the previous five."""
 
     def __init__(self, drive: Drive, always: bool = True, images: bool = False) -> None:
         frames, truth = drive
@@ -73,7 +73,7 @@ class Case:
         self.prediction = Prediction([self.truth @ se3.exp([0, 0, 0.005, 0.05, 0, 0])], information=100 * np.eye(6))
 
     def register(self, off: list[float], **oracle: object) -> tuple[Registration, float]:
-        """Result and its error, m, when the network is off by a tangent vector."""
+        """Result and its error, m, if the network is off by the tangent vector `off`."""
         self.oracle.T = self.truth @ se3.exp(off)
         for name, value in oracle.items():
             setattr(self.oracle, name, value)
@@ -82,7 +82,7 @@ class Case:
 
 
 def between_walls() -> Drive:
-    """Six scans, 0.2 m apart, of floor and walls that are smooth but for a niche 1 m deep and 1.5 m long."""
+    """Six scans, 0.2 m apart, of a floor and walls that are smooth except for a niche 1 m deep and 1.5 m long."""
     noise = np.random.default_rng(0)
     truth = np.tile(np.eye(4), (6, 1, 1))
     truth[:, 0, 3] = 0.2 * np.arange(6)
@@ -117,7 +117,7 @@ def test_a_network_that_knows_less_moves_nothing(case: Case) -> None:
 
 
 def test_a_network_that_claims_more_than_few_points_moves_nothing(suburb_drive: Drive) -> None:
-    """It claims 0.04 m, they 0.06: as at the walls of a building it is off by more than either."""
+    """It reports 0.04 m and the points 0.06 m. As at the walls of a building, it is off by more than either."""
     case, frame = Case(suburb_drive), suburb_drive[0][5]
     case.scan = case.registration.prepare(replace(frame, points=frame.points[::100]), np.zeros(6))
     result, _ = case.register([0, 0, 0, 0.2, 0, 0])
@@ -143,12 +143,12 @@ def test_network_alone_where_the_points_fit_nothing(case: Case) -> None:
     assert (result.ok, result.method) == (True, "neural")
     assert result.reason.startswith("not refined: ")
     assert error == pytest.approx(0.03)
-    assert result.worst_sigma > 0.2  # whatever the network claims
+    assert result.worst_sigma > 0.2  # whatever the network reports
 
 
 def test_a_network_that_no_points_confirm_is_drawn_to_where_the_motion_leads_elsewhere(case: Case) -> None:
-    """It knows its pose to 0.3 m at best, wheels or a steady motion theirs to 0.1 m. Where the motion is not known,
-    nothing speaks against it."""
+    """Its pose is accurate to 0.3 m at best, that of wheels or a steady motion to 0.1 m. If the motion is not known,
+    nothing contradicts the network."""
     elsewhere = np.random.default_rng(3).uniform(-40, 40, (8000, 4)).astype(np.float32)
     case.scan = case.registration.prepare(Frame(0, elsewhere), np.zeros(6))
     result, error = case.register([0, 0, 0, 0.5, 0, 0])
@@ -184,7 +184,8 @@ def test_a_contradiction_that_nothing_settles_is_answered_with_uncertainty(case:
 
 
 def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -> None:
-    """Points that start 12 m off settle elsewhere; from a network that is 0.6 m off, and sure of it, they do not."""
+    """From a start 12 m off, the points converge elsewhere; from a network 0.6 m off with a small covariance, they do
+    not."""
     case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, 12, 0, 0])], widen=2.0)
     _, lost = case.register([0, 0, 0, 0, 0, 0], size=0)
     assert lost > 5
@@ -196,8 +197,9 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
 @pytest.mark.parametrize(("off", "method"), [([0.05, 0.02], "refined"), ([0.6, 0.2], "geometric")])
 @pytest.mark.parametrize("known", [0.01, 4.0])
 def test_where_two_disagree_the_likelier_is_taken(case: Case, off: list[float], method: str, known: float) -> None:
-    """Points that start 9 m off fit somewhere, but not as well as from the network's pose; also where it is 0.6 m off
-    and sure of it, and whether the motion so far is thought to be known to 10 m or to 0.5 m."""
+    """From a start 9 m off, the points fit somewhere, but not as well as from the network's pose. This is so even if
+    the network is 0.6 m off with a small covariance, and whether the motion is assumed to be known to 10 m or to 0.5
+    m."""
     start = case.truth @ se3.exp([0, 0, 0, 9, 0, 0])
     case.prediction = Prediction([start], widen=2.0, information=known * np.eye(6))
     somewhere, error = case.register([0, 0, 0, 0, 0, 0], size=0)
@@ -209,7 +211,8 @@ def test_where_two_disagree_the_likelier_is_taken(case: Case, off: list[float], 
 
 
 def test_what_few_points_show_is_found_from_the_network() -> None:
-    """Two walls with a niche: points that start 4 m off leave the way along open, and do not contradict the network."""
+    """Two walls with a niche. From a start 4 m off, points leave one translation open, and do not contradict the
+    network."""
     case = Case(between_walls())
     information = np.diag(np.repeat([1.0, 2.0], 3) ** -2.0)
     case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, -4, 0, 0])], information=information)
@@ -222,7 +225,7 @@ def test_what_few_points_show_is_found_from_the_network() -> None:
 
 
 def beside_a_wall() -> Drive:
-    """Six scans of level ground in rings, as 24 beams see it, and of a smooth wall: five 0.05 m apart, one 2 m on."""
+    """Six scans of level ground in rings (24 beams) and of a smooth wall: five 0.05 m apart, one 2 m further on."""
     noise, truth = np.random.default_rng(0), np.tile(np.eye(4), (6, 1, 1))
     truth[:, 0, 3] = [0, 0.05, 0.1, 0.15, 0.2, 2.2]
     frames = []
@@ -238,8 +241,8 @@ def beside_a_wall() -> Drive:
 
 
 def test_along_what_stays_open_the_network_lures_nobody_away() -> None:
-    """That is sure of standing still, where the map has the rings that a scan shows; it fits nearly as well where the
-    motion leads, though that is known to 5 m only."""
+    """The network reports a standstill with a small covariance, where the map has the rings that a scan shows. The scan
+    fits nearly as well where the motion leads, although the motion is known only to 5 m."""
     case = Case(beside_a_wall())
     case.prediction = Prediction([case.truth], information=np.diag(np.repeat([0.1, 5.0], 3) ** -2.0))
     result, error = case.register([0, 0, 0, -2, 0, 0], size=5)
@@ -249,8 +252,8 @@ def test_along_what_stays_open_the_network_lures_nobody_away() -> None:
 
 
 def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Drive, tunnel_drive: Drive) -> None:
-    """Sure points are the result to the bit, however little is known of the motion; points that fit only from the
-    network's pose are the result alone. A tunnel is a reason to ask."""
+    """Points with a small covariance are the result to the bit, however little is known of the motion. Points that fit
+    only from the network's pose are the result alone. In a tunnel the network is used."""
     case, always = Case(suburb_drive, always=False), Case(suburb_drive)
     result, error = case.register([0, 0, 0, 5, 0, 0])
     assert (result.ok, result.method, result.reason, case.oracle.asked) == (True, "geometric", "", 0)
@@ -272,7 +275,7 @@ def test_the_network_is_asked_only_where_the_points_do_not_know(suburb_drive: Dr
 
 
 def test_more_of_the_points_must_fit_where_the_motion_is_not_known(suburb_drive: Drive) -> None:
-    """Of a scan with 400 points of noise in the air 0.72 fit: enough to be believed only where the motion is known."""
+    """In a scan with 400 noise points in the air, 0.72 of all fit. This is accepted only if the motion is known."""
     frames, truth = suburb_drive
     elsewhere = np.random.default_rng(3).uniform([-40, -40, 3, 0], [40, 40, 12, 1], (400, 4)).astype(np.float32)
     noisy = replace(frames[5], points=np.concatenate([frames[5].points, elsewhere]))
@@ -288,8 +291,9 @@ def test_more_of_the_points_must_fit_where_the_motion_is_not_known(suburb_drive:
 
 
 def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Drive) -> None:
-    """Half of them, as of few beams in a young map. Along a corridor of equal doors the network, asked, was 0.35 m off
-    at a stated 5 mm, the points fitted better there, and the drive was 5.2 m off as `tracking`; not asked, 0.002 m."""
+    """Half of them fit, as with few beams in a young map. Along a corridor of equal doors, the network was 0.35 m off
+    at a stated 5 mm, and the points fitted better there: the drive was 5.2 m off as `tracking`. Without the network it
+    was 0.002 m."""
     frames, truth = suburb_drive
     elsewhere = np.random.default_rng(3).uniform([-40, -40, 3, 0], [40, 40, 12, 1], (900, 4)).astype(np.float32)
     noisy = replace(frames[5], points=np.concatenate([frames[5].points, elsewhere]))
@@ -311,8 +315,9 @@ def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Dr
 
 
 def test_along_a_tunnel_the_network_by_its_images_counts_little_where_the_motion_is_known(tunnel_drive: Drive) -> None:
-    """It is a metre off along: its matches err together. The result stays with the motion, and the image is asked, as
-    it is where a deviation is above 0.08 m; across, where the points know, nothing moves."""
+    """The network is a meter off along the tunnel: its matches have a common error. The result stays with the motion.
+    The image is used, as always if a standard deviation is above 0.08 m. Across the tunnel, where the points are
+    certain, nothing moves."""
     case = Case(tunnel_drive, images=True)
     result, _ = case.register([0, 0, 0, 1.0, 0.03, 0])
     assert (result.ok, result.method) == (True, "refined")
@@ -323,7 +328,7 @@ def test_along_a_tunnel_the_network_by_its_images_counts_little_where_the_motion
 
 
 def test_along_a_tunnel_the_network_by_its_images_leads_where_the_motion_is_not_known(tunnel_drive: Drive) -> None:
-    """The points fit everywhere, best where nothing has moved: 8 m behind."""
+    """The points fit everywhere, and best without any motion: 8 m behind."""
     case = Case(tunnel_drive, images=True)
     case.prediction = Prediction([case.truth @ se3.exp([0, 0, 0, -8, 0, 0])], widen=2.0)
     result, error = case.register([0, 0, 0, 0.2, 0.03, 0])
@@ -334,12 +339,12 @@ def test_along_a_tunnel_the_network_by_its_images_leads_where_the_motion_is_not_
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_along_a_tunnel_a_network_without_images_is_not_believed(tunnel_drive: Drive, camera: bool) -> None:
-    """It claims to know what the points leave open, and is a meter off: the uncertainty stays that of the points; also
-    of a network that has a camera, where a scan comes without its image."""
+    """The network reports a small covariance where the points leave a direction open, and is a meter off. The
+    uncertainty stays that of the points, also for a network with a camera if a scan has no image."""
     case = Case(tunnel_drive)
     case.registration.uses_images = camera
     result, _ = case.register([0, 0, 0, 1.0, 0, 0])
     assert result.ok
     assert result.worst_sigma > 0.5
     off = se3.way(case.truth, result.T_target_source)
-    assert abs(off[3]) < 0.3  # that of the prediction and of the points
+    assert abs(off[3]) < 0.3  # the error of the prediction and of the points

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points to a map: what is accepted when only part of a scan has a counterpart, and which of several starts wins."""
+"""Registration of points to a map: what is accepted if only part of a scan has correspondences, and which of several
+starts is chosen."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ Case = tuple[GeometricScanRegistration, Scan, Array]
 
 
 def make_registration() -> GeometricScanRegistration:
-    """With the default settings, and an empty map."""
+    """Registration with the default settings and an empty map."""
     return GeometricScanRegistration(
         Preprocessor(PreprocessSettings()),
         GeometricRegistration(GeometricSettings()),
@@ -32,7 +33,7 @@ def make_registration() -> GeometricScanRegistration:
 
 
 def make_case(drive: Drive, seen: float) -> Case:
-    """A map of one scan, of which something hides all but a fraction of the azimuth; the fourth scan after, its
+    """A map of one scan, of which only the fraction `seen` of the azimuth is visible; the fourth scan after it, and its
     pose."""
     (frames, truth), registration = drive, make_registration()
     first, later = (registration.prepare(frames[i], np.zeros(6)) for i in (0, 4))
@@ -67,7 +68,7 @@ def test_what_the_motion_led_to_expect_needs_fewer_counterparts(occluded: Case) 
 def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_uncertainty(
     occluded: Case, off: list[float]
 ) -> None:
-    """Along the road ground alone may fit anywhere: the covariance then says so, and the state is `degraded`."""
+    """Along the road, ground alone may fit anywhere. Then the covariance shows it, and the state is `degraded`."""
     registration, scan, truth = occluded
     result = registration.register(scan, Prediction([truth @ se3.exp(off)], information=PRIOR))
     wrong = error(result.T_target_source, truth)
@@ -75,7 +76,7 @@ def test_a_wrong_prediction_in_a_map_of_one_scan_is_never_confirmed_without_unce
 
 
 def test_a_scan_of_elsewhere_is_rejected_where_it_was_expected(occluded: Case) -> None:
-    """18 % of a highway's points fit, 30 % are wanted."""
+    """18 % of the points of a highway fit; 30 % are required."""
     registration, _, truth = occluded
     elsewhere = Preprocessor(PreprocessSettings()).prepare(make_drive("highway", 1)[0][0], np.zeros(6))
     assert not registration.register(elsewhere, Prediction([truth], information=PRIOR)).ok
@@ -83,7 +84,7 @@ def test_a_scan_of_elsewhere_is_rejected_where_it_was_expected(occluded: Case) -
 
 def test_the_most_likely_start_wins_whatever_its_place(suburb_drive: Drive) -> None:
     registration, scan, truth = make_case(suburb_drive, 1.0)
-    off = truth @ se3.exp([0, 0, 0, 6, 1, 0])  # too far to come back from
+    off = truth @ se3.exp([0, 0, 0, 6, 1, 0])  # too far away to converge
     for starts in ([off, truth], [truth, off]):
         result = registration.register(scan, Prediction(starts))
         assert result.ok
@@ -92,7 +93,8 @@ def test_the_most_likely_start_wins_whatever_its_place(suburb_drive: Drive) -> N
 
 @pytest.mark.parametrize("off", [[0, 0, 0.14, 1, 0.5, 0], [0, 0, -0.14, 1, 0, 0], [0, 0, 0.16, 2, 1, 0]])
 def test_the_heading_is_looked_for_where_a_curve_may_have_ended(suburb_drive: Drive, off: list[float]) -> None:
-    """8 or 9 degrees off: always, where the motion is not known, and where few points fit if it is."""
+    """8 or 9 degrees off. The search always runs if the motion is not known; if it is known, it runs where few points
+    fit."""
     registration, scan, truth = make_case(suburb_drive, 1.0)
     start = truth @ se3.exp(off)
     for information in (np.eye(6), np.eye(6) / 2**2, None):
@@ -102,7 +104,7 @@ def test_the_heading_is_looked_for_where_a_curve_may_have_ended(suburb_drive: Dr
 
 
 def test_on_a_plain_the_heading_stays_that_of_the_motion() -> None:
-    """Rings on the ground fit at any heading: by chance another one seems to fit a little better."""
+    """Rings on the ground fit at any heading. By chance, another heading may seem to fit a little better."""
     registration, rng = make_registration(), np.random.default_rng(0)
     height, azimuth = 1.7, np.linspace(-np.pi, np.pi, 1024, endpoint=False)
     radius = np.repeat(height / np.tan(np.radians(np.linspace(1.5, 25, 40))), len(azimuth))
@@ -116,7 +118,7 @@ def test_on_a_plain_the_heading_stays_that_of_the_motion() -> None:
 
     for x in (0.0, 1.0, 2.0):
         registration.update(scan(), se3.make(np.eye(3), [x, 0, 0]))
-    turns_little = np.diag(np.repeat([0.01, 2.0], 3) ** -2.0)  # so that the scan stays at the heading it starts from
+    turns_little = np.diag(np.repeat([0.01, 2.0], 3) ** -2.0)  # so that the scan keeps its initial heading
     for x in (6.0, 7.1, 8.3, 9.2, 10.4):
         start = se3.make(np.eye(3), [x, 0, 0])
         result = registration.register(scan(), Prediction([start], information=turns_little))
@@ -124,7 +126,8 @@ def test_on_a_plain_the_heading_stays_that_of_the_motion() -> None:
 
 
 def test_where_sight_returns_what_was_too_far_to_be_seen_does_not_count(suburb_drive: Drive) -> None:
-    """Out of fog in which one saw 10 m, 10 to 15 % of the points fitted: lost, and broken after ten frames."""
+    """After fog with a visibility of 10 m, 10 to 15 % of the points fitted. Previously, the state was lost, with a
+    break after ten frames."""
     frames, truth = suburb_drive
     registration = make_registration()
     for frame, T in zip(frames[:8], truth[:8], strict=True):
@@ -136,7 +139,7 @@ def test_where_sight_returns_what_was_too_far_to_be_seen_does_not_count(suburb_d
     result = registration.register(scan, Prediction([truth[8]], information=PRIOR))
     assert result.ok
     assert result.confidence > 0.7
-    assert error(result.T_target_source, truth[8]) < 0.1  # along the street its motion leads
+    assert error(result.T_target_source, truth[8]) < 0.1  # along the street, the motion determines it
 
 
 @pytest.mark.parametrize("information", [np.eye(6), None])
@@ -155,11 +158,11 @@ def test_likelihood_is_greatest_at_the_truth(suburb_drive: Drive) -> None:
     method = GeometricRegistration(GeometricSettings())
     fit = [method.likelihood(scan.source, local_map, truth[4] @ se3.exp([0, 0, 0, x, 0, 0])) for x in (0, 0.3, 1, 3)]
     assert fit == sorted(fit, reverse=True)
-    assert method.likelihood(scan.source + 1e3, local_map, truth[4]) == 0  # no counterpart at all
+    assert method.likelihood(scan.source + 1e3, local_map, truth[4]) == 0  # no correspondence at all
 
 
 def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel_drive: Drive) -> None:
-    """How far the car went cannot be seen there: starts that end meters apart do not contradict each other."""
+    """The distance traveled is not observable there: starts that end meters apart do not contradict each other."""
     registration, scan, _ = make_case(tunnel_drive, 1.0)
     starts = [se3.exp([0, 0, 0, x, 0, 0]) for x in (1.0, 2.0)]
     alone = [registration.register(scan, Prediction([T])) for T in starts]
@@ -170,7 +173,7 @@ def test_along_a_tunnel_answers_agree_and_the_least_motion_is_kept(tunnel_drive:
 
 
 def mapped(drive: Drive) -> GeometricScanRegistration:
-    """Five scans of a drive as a map."""
+    """Registration with a map of five scans of a drive."""
     made = make_registration()
     for frame, T in zip(*(part[:5] for part in drive), strict=True):
         made.update(made.prepare(frame, np.zeros(6)), T)
@@ -178,7 +181,7 @@ def mapped(drive: Drive) -> GeometricScanRegistration:
 
 
 def searched(drive: Drive, starts: list[Array]) -> tuple[bool, str, float]:
-    """Of the sixth scan: whether it is found, why not, and how far from where it was taken, m."""
+    """Search for the pose of the sixth scan: whether it succeeds, why not, and the error, m."""
     registration = mapped(drive)
     scan: Scan = registration.prepare(drive[0][5], np.zeros(6))
     result = registration.register(scan, Prediction(starts, unique=True))
@@ -187,7 +190,7 @@ def searched(drive: Drive, starts: list[Array]) -> tuple[bool, str, float]:
 
 @pytest.mark.parametrize("turn", [0.0, 0.3])
 def test_the_place_is_found_among_many(suburb_drive: Drive, turn: float) -> None:
-    """Half a meter and four degrees are near enough for a start."""
+    """A start that is off by half a meter and four degrees is near enough."""
     grid = [[0, 0, turn + yaw, x, y, 0] for yaw in (-0.3, -0.15, 0, 0.15) for x in range(-8, 9) for y in (-1, 0, 1)]
     off = np.array([0, 0, 0.07, 0.25, 0.25, 0])
     ok, reason, error = searched(suburb_drive, [suburb_drive[1][5] @ se3.exp(xi) for xi in np.array(grid) + off])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way along a smooth tunnel by the intensities of the LiDAR, and that nothing else in them is taken for it."""
+"""Translation along a smooth tunnel from LiDAR intensities, and that nothing else in them is taken for it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ _WIDTH, _FLOOR, _CEILING = 4.0, -1.7, 3.0  # m
 
 
 class Tunnel:
-    """Smooth walls, with patches as bright as chance has it, an end behind its beginning, and a LiDAR with 32 beams.
+    """Smooth walls with patches of random brightness, an end wall behind the start, and a LiDAR with 32 beams.
 
-    Each beam has a gain of its own, and a bright line runs along either side of the floor: both stay with the sensor.
+    Each beam has its own gain, and a bright line runs along either side of the floor: both move with the sensor.
     """
 
     def __init__(self, seed: int, spread: float, period: float = 1e3) -> None:
-        """`spread`: standard deviation of the intensity from patch to patch. `period`: way after which they repeat."""
+        """`spread`: standard deviation of the intensity from patch to patch. `period`: distance after which the patches
+        repeat."""
         self._rng = np.random.default_rng(seed)
         self._patches = spread * self._rng.standard_normal((1 << 12, 64))
         self._period = period
@@ -60,7 +61,7 @@ def _at(x: float) -> Array:
 
 
 def _searched(tunnel: Tunnel, offset: float, reach: float, scans: int = 5) -> Peak | str:
-    """What is found for a scan that is `offset` m farther along than it is believed to be."""
+    """Search result for a scan that is `offset` m farther along than assumed."""
     search = IntensitySearch()
     for i in range(scans):
         search.update(tunnel.scan(100 + 1.3 * i), _at(1.3 * i))
@@ -71,19 +72,19 @@ def _searched(tunnel: Tunnel, offset: float, reach: float, scans: int = 5) -> Pe
 def test_the_way_along_a_smooth_tunnel_is_found(offset: float) -> None:
     found = _searched(Tunnel(0, 0.06), offset, 6.0)
     assert isinstance(found, Peak), found
-    # Patches of 0.4 m in cells of 0.1 m: 0.02 m in 40 of these cases, and twice that for chance.
+    # Patches of 0.4 m in cells of 0.1 m: 0.02 m of error in 40 of these cases, and twice that to allow for chance.
     assert abs(found.offset - offset) < min(0.05, 4 * found.sigma)
 
 
 def test_beams_and_lines_that_stay_with_the_sensor_are_not_taken_for_a_halt() -> None:
-    """Without patches nothing is left of a scan but what moves with the sensor."""
+    """Without patches, a scan contains only what moves with the sensor."""
     for seed in range(10):
         assert _searched(Tunnel(seed, 0.0), 1.3, 6.0) == "intensity: no place stands out"
 
 
 def test_what_repeats_is_not_decided_by_chance() -> None:
     assert _searched(Tunnel(1, 0.06, period=4.0), 1.0, 6.0) == "intensity: several places are alike"
-    found = _searched(Tunnel(1, 0.06, period=4.0), 1.0, 1.5)  # the motion so far decides
+    found = _searched(Tunnel(1, 0.06, period=4.0), 1.0, 1.5)  # the prior motion decides
     assert isinstance(found, Peak)
     assert abs(found.offset - 1.0) < 0.05
 
@@ -108,7 +109,7 @@ def test_where_intensities_or_points_are_missing_nothing_is_told(intensity: floa
 
 @pytest.mark.parametrize("half", [0.0, 0.5, 1.5])
 def test_a_scan_that_shows_a_short_stretch_tells_nothing(half: float) -> None:
-    """What correlates at random is not known then."""
+    """Then the random correlation is not known."""
     search, tunnel = IntensitySearch(), Tunnel(0, 0.06)
 
     def stretch(at: float) -> Points:
@@ -121,7 +122,8 @@ def test_a_scan_that_shows_a_short_stretch_tells_nothing(half: float) -> None:
 
 
 def _driven(tunnel: Tunnel, **settings: Any) -> tuple[list[State], Array]:
-    """States (80,) and how far along (80,) an odometry is too far, m: 1 m from scan to scan, with a halt in between."""
+    """States (80,), and how far the odometry is ahead (80,), m. It moves 1 m from scan to scan, with a halt in
+    between."""
     way = np.concatenate([[0.0], np.cumsum(np.interp(np.arange(79), [20, 40, 50, 70], [1.0, 0, 0, 1.0]))])
     odometry = make_odometry(SlamSettings.model_validate({"registration": "geometric", **settings}))
     tracks = [odometry.process(Frame(i * 10**8, tunnel.scan(60 + x), index=i)) for i, x in enumerate(way)]
@@ -129,10 +131,10 @@ def _driven(tunnel: Tunnel, **settings: Any) -> tuple[list[State], Array]:
 
 
 def test_an_odometry_starts_in_a_tunnel_without_a_camera_and_stops_there_and_goes() -> None:
-    """The first scans teach what moves with the sensor; from then on the way is known, whatever the speed."""
+    """The first scans show what moves with the sensor. After that the translation is known at any speed."""
     states, ahead = _driven(Tunnel(2, 0.06))
     assert states[8:].count(State.TRACKING) >= 70  # of 72
-    assert np.ptp(ahead[8:]) < 0.3  # of 40 m
+    assert np.ptp(ahead[8:]) < 0.3  # over 40 m
     without, wrong = _driven(Tunnel(2, 0.06), visual={"enabled": False})
     assert np.ptp(wrong[8:]) > 3
     assert State.TRACKING not in without
@@ -144,7 +146,7 @@ def test_without_texture_it_says_so() -> None:
 
 
 def test_the_surface_of_a_real_road_tells_the_way(kitti_root: Path) -> None:
-    """KITTI 04, by what lies within 0.25 m of the road, searched for 6 m from 1.4 m to 1.4 m."""
+    """KITTI 04, with points within 0.25 m of the road. The search covers 6 m, every 1.4 m."""
     source, search, rng, errors = (
         open_source(kitti_root / "sequences" / "04"),
         IntensitySearch(),
@@ -161,4 +163,4 @@ def test_the_surface_of_a_real_road_tells_the_way(kitti_root: Path) -> None:
             errors.append(abs(found.offset - offset))
         search.update(road, T)
     assert len(errors) >= 30  # 39 of 46
-    assert max(errors) < 0.1  # 0.077 m; the poses err by a centimeter or two from scan to scan
+    assert max(errors) < 0.1  # 0.077 m; the poses have an error of a centimeter or two from scan to scan

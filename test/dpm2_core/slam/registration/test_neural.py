@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Neural registration in the SLAM: which descriptors are registered to, what is rejected, and what is loaded when."""
+"""Neural registration in the SLAM: which descriptors are used, what is rejected, and what is loaded when."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ from ....helpers.scenes import boxes, make_image
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """The tiny network as a file: random weights, but similarities centered, so that equal descriptors match best."""
+    """The tiny network as a file. Its weights are random, but its similarities are centered, so that equal descriptors
+    match best."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny(decoder={"temperature": 0.01})).eval().requires_grad_(False)
     some = model.describe(Frame(0, cloud(boxes(np.random.default_rng(1)))))
@@ -106,7 +107,8 @@ def test_a_frame_enters_after_motion_or_a_turn(noise: np.random.Generator) -> No
 
 
 def test_frames_are_described_when_they_are_registered_to(noise: np.random.Generator) -> None:
-    """One that has too few points for descriptors is passed over; without any there is nothing to register to."""
+    """A frame with too few points for descriptors is skipped. Without any descriptors there is nothing to register
+    to."""
     places = DescriptorMap(Spacing(3, 0), radius=20)
     described = [lazy(None), lazy(descriptors(noise)), lazy(descriptors(noise))]
     for i, one in enumerate(described):
@@ -138,7 +140,7 @@ def test_memory_is_bounded(noise: np.random.Generator) -> None:
 
 
 def test_a_frame_seen_again_is_found_without_any_prior(weights: Path, noise: np.random.Generator) -> None:
-    """True of any weights: equal descriptors match, and untrained offsets are zero."""
+    """This holds for any weights: equal descriptors match, and untrained offsets are zero."""
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights), min_confidence=0))
     registration = make_registration(s)
     frame = Frame(0, cloud(boxes(noise)))
@@ -150,7 +152,7 @@ def test_a_frame_seen_again_is_found_without_any_prior(weights: Path, noise: np.
     assert (result.ok, result.method) == (True, "neural")
     np.testing.assert_allclose(result.T_target_source, place, atol=1e-3)  # fp16 features, bf16 arithmetic
     assert np.linalg.eigvalsh(result.covariance)[0] > 0
-    # but where the velocity is known, to 1 m/s, what contradicts it is rejected
+    # But if the velocity is known to 1 m/s, a result that contradicts it is rejected.
     known = registration.register(scan, Prediction([wrong], information=np.eye(6) / 0.1**2))
     assert (known.ok, known.reason) == (False, "contradicts the motion so far")
     assert registration.register(scan, Prediction([place], information=np.eye(6) / 0.1**2)).ok
@@ -189,7 +191,7 @@ def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.
 
 
 def test_another_place_is_no_answer(weights: Path, noise: np.random.Generator) -> None:
-    """The same one is, by another scan."""
+    """Another scan of the same place is registered."""
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights)))
     registration = make_registration(s)
     here, elsewhere = (cloud(boxes(noise)) for _ in range(2))
@@ -203,7 +205,7 @@ def test_another_place_is_no_answer(weights: Path, noise: np.random.Generator) -
 
 
 def test_in_a_search_for_a_place_a_pose_must_be_probable(noise: np.random.Generator) -> None:
-    """Nothing else would contradict a place that looks alike; where the motion is known it can."""
+    """Nothing else would contradict a place that looks alike; a known motion can."""
     torch.manual_seed(0)
     network, here = DeepPointMap2(tiny()).eval(), cloud(boxes(noise))
 
@@ -255,7 +257,7 @@ def test_a_keyframe_of_a_lidar_that_hangs_is_described_as_one_that_stands(
 
 
 def test_what_is_remembered_of_a_scan_gives_its_descriptors(noise: np.random.Generator) -> None:
-    """A kept scan, thinned out and with a small image, is described as the whole one would have been."""
+    """A kept scan, reduced and with a small image, has the descriptors that the whole scan would have had."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval().requires_grad_(False)
     registration = NeuralScanRegistration(NeuralSettings(), Preprocessor(PreprocessSettings()), model)
@@ -302,7 +304,7 @@ def test_threads_are_those_of_the_settings(weights: Path) -> None:
 
 @pytest.mark.slow
 def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
-    """torch takes seconds and 200 MB, for nothing where no loop asks for descriptors."""
+    """torch takes seconds and 200 MB, which is useless if no loop uses descriptors."""
     program = (
         "import sys, numpy as np; from dpm2_core.slam.build import SlamSettings, make_slam; "
         "from dpm2_core.frame import Frame; import dpm2_core.commands.run; "
@@ -317,7 +319,7 @@ def test_the_geometric_slam_imports_neither_torch_nor_matplotlib() -> None:
 @pytest.mark.weights
 @pytest.mark.slow
 def test_the_papers_slam_follows_a_street(suburb_drive: Drive) -> None:
-    """All of its ways at once. Its odometry meets keyframes 10 m apart, and is coarser than ours."""
+    """All of its methods at once. Its odometry registers to keyframes 10 m apart, and is less accurate than ours."""
     frames, truth = suburb_drive
     slam = make_slam(SlamSettings(preset="paper"))
     tracked = [slam.process(frame).odometry for frame in frames[:10]]
@@ -337,9 +339,9 @@ def test_a_scan_that_enters_the_map_is_registered_once_more(suburb_drive: Drive)
         registration = make_registration(SlamSettings(registration="neural", neural=neural))
         for i in (0, 4, 12, 8):
             registration.update(registration.prepare(frames[i], np.zeros(6)), truth[i])
-        for i in (6, 9):  # between two of the map, which both together make surer than the nearest alone
+        for i in (6, 9):  # between two frames of the map, which together are more accurate than the nearest alone
             scan = registration.prepare(frames[i], np.zeros(6))
             ends.append(registration.register(scan, Prediction([truth[i]])).T_target_source)
-    assert not np.array_equal(ends[0], ends[2])  # farther than `spacing` from the last one
+    assert not np.array_equal(ends[0], ends[2])  # farther than `spacing` from the last frame
     assert np.array_equal(ends[1], ends[3])
     assert np.linalg.norm((ends[2] - truth[6])[:3, 3]) < 0.2

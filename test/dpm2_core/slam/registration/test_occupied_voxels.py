@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rough fit of a scan: best where it was taken, whatever the order and the number of the poses."""
+"""The coarse fit of a scan is best where it was taken, whatever the order and the number of the poses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_the_pose_where_the_scan_was_taken_fits_best() -> None:
 
 
 def test_what_lies_outside_counts_nothing() -> None:
-    for meters in (500.0, 1e12):  # what no integer can count
+    for meters in (500.0, 1e12):  # the last one is too large for an integer
         far = se3.exp([0, 0, 0, meters, meters, meters])
         assert OccupiedVoxels(WORLD, np.zeros(3)).fit(SCAN, np.array([far, se3.inverse(far)])).tolist() == [0, 0]
     assert OccupiedVoxels(WORLD + 1000, np.zeros(3)).fit(SCAN, T[None]).tolist() == [0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled loops compute what the formulas in matrix form say."""
+"""The compiled loops compute the same as the formulas in matrix form."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_normal_equations_are_those_of_the_jacobian() -> None:
     s, n, r, v = source[used], normals[used] @ T[:3, :3], residual[used], variances[used]
     J = np.concatenate([np.cross(s, n), n], 1)
     weight = 1 / (v + r * r)
-    # Sums of a few hundred terms in another order: rounding alone.
+    # Sums of a few hundred terms in another order: only rounding differs.
     np.testing.assert_allclose(H, J.T @ (J * weight[:, None]), rtol=1e-11, atol=1e-9)
     np.testing.assert_allclose(gradient, J.T @ (weight * r), rtol=1e-11, atol=1e-9)
     assert fits == (r * r < 9 * v).sum()
@@ -67,7 +67,7 @@ def test_moments_are_normal_equations_weighed_by_powers_of_the_times() -> None:
     J = np.concatenate([np.cross(source[used], n), n], 1)
     weight = 1 / (variances[used] + r * r)
     assert (len(H), len(gradient)) == (2 * ORDER + 1, ORDER + 1)
-    for k in range(2 * ORDER + 1):  # sums in another order: rounding alone, of what shrinks by 0.05 with each power
+    for k in range(2 * ORDER + 1):  # sums in another order: rounding, of terms that shrink by 0.05 with each power
         np.testing.assert_allclose(H[k], J.T @ (J * (weight * t**k)[:, None]), rtol=1e-9, atol=1e-9 * 0.05**k)
     for k in range(ORDER + 1):
         np.testing.assert_allclose(gradient[k], J.T @ (weight * t**k * r), rtol=1e-9, atol=1e-9 * 0.05**k)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where many points move along with the robot two motions may be its own: the odometry says so, and how far apart."""
+"""If many points move with the robot, two motions may be its own. The odometry reports this, and how far apart they
+are."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ COUNT = 15
 
 
 def crowd(count: int) -> Array:
-    """(count, 2, 3) boxes as large as people, 0.9 to 5 m around the origin."""
+    """Boxes (count, 2, 3) as large as people, 0.9 to 5 m around the origin."""
     rng = np.random.default_rng(count)
     radius, angle = np.sqrt(rng.uniform(0.9**2, 5.0**2, count)), rng.uniform(-np.pi, np.pi, count)
     low = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)]) - [0.2, 0.2, 0]
@@ -29,7 +30,7 @@ def crowd(count: int) -> Array:
 
 
 def driven(people: int, along: bool = True) -> tuple[list[OdometryResult], Array]:
-    """A robot that drives through a hall among people who walk along with it, or stand: its odometry, and the position
+    """A robot drives through a hall among people who walk with it, or stand. Returns its odometry and the position
     errors, m."""
     way = STEP * np.arange(COUNT)[:, None] * [1.0, 0, 0]
     truth = se3.make(np.eye(3), way + np.array([0, 0, 0.6]))
@@ -44,19 +45,19 @@ def driven(people: int, along: bool = True) -> tuple[list[OdometryResult], Array
 
 
 def test_a_crowd_that_hides_the_walls_is_followed_and_the_way_to_them_stated() -> None:
-    """Most of what it sees stands still around it. Nothing but the stated uncertainty tells that the robot drives."""
+    """Most of what it sees stands still relative to it. Only the reported uncertainty shows that the robot drives."""
     results, errors = driven(60)
     assert errors[-1] > 0.9 * STEP * (COUNT - 1), "else it is not the crowd that is followed"
     for result, error in zip(results[4:], errors[4:], strict=True):
         assert result.state is State.DEGRADED
-        # within centimeters; where the walls are too far off to be found the way is extrapolated
+        # to centimeters; if the walls are too far off to be matched, the motion is extrapolated
         assert result.registration.worst_sigma == pytest.approx(error, rel=0.1)
         assert "fit another motion" in result.registration.reason
 
 
 @pytest.mark.parametrize(("people", "along"), [(30, True), (60, False)])
 def test_where_the_walls_are_followed_there_is_no_doubt(people: int, along: bool) -> None:
-    """Though with 16 beams much is met at the same distance wherever the robot is."""
+    """This is so although with 16 beams many points have the same distance wherever the robot is."""
     results, errors = driven(people, along)
     assert errors.max() < 0.05
     assert {r.state for r in results[2:]} == {State.TRACKING}

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of a sweep in motion the pose and the motion are found, from a rigid guess; what contradicts its beginning is not."""
+"""Pose and motion during a sweep are estimated from a rigid guess, unless they contradict the beginning of the
+sweep."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ MOTION = st.lists(st.floats(-1, 1), min_size=18, max_size=18).map(lambda v: np.r
 
 
 def sweep(T: Array, motion: Array, seed: int = 0) -> tuple[Scan, Array]:
-    """2,000 points of the walls, seen during a sweep around T (4, 4), and the wall of each."""
+    """2,000 points of the walls, seen during a sweep around T (4, 4), and the wall of each point."""
     rng = np.random.default_rng(seed)
     wall, times = rng.integers(0, 6, 2000), rng.uniform(-HALF, HALF, 2000)
     at = rng.uniform(-3, 3, (2000, 3))
@@ -41,7 +42,7 @@ def matched(wall: Array, points: Array, T: Array) -> tuple[Array, Array, Array]:
 
 
 def found(T: Array, motion: Array, seed: int = 0, guess: Array | None = None) -> Swept | None:
-    """From how it began, if it moved as at its beginning before, and a guess of its pose."""
+    """Result from a guess of the pose, with the beginning that a steady motion before the sweep gives."""
     scan, wall = sweep(T, motion, seed)
     T_start = T @ curve.poses(-HALF, motion)
     twist = motion[0] - HALF * motion[1] + HALF**2 / 2 * motion[2]
@@ -56,7 +57,7 @@ def test_the_pose_and_the_motion_are_found_from_a_wrong_guess(motion: Array, off
     result = found(T, motion, guess=T @ se3.exp(off))
     assert result is not None
     error = se3.way(T, result.T)
-    # 2 cm of noise, and 10 points that count as one against how it began: 2 mm; the ends are known less well.
+    # 2 cm of noise, and 10 points count as one against the beginning: 2 mm; the ends are less certain.
     assert np.abs(error[:3]).max() < 0.004
     assert np.abs(error[3:]).max() < 0.01
     ends = np.array([-HALF, HALF])
@@ -66,7 +67,7 @@ def test_the_pose_and_the_motion_are_found_from_a_wrong_guess(motion: Array, off
 
 
 def test_its_covariance_covers_its_errors() -> None:
-    """As the points are as independent as they are here, at a tenth of the information: not too narrow."""
+    """The points are independent here, but count with a tenth of their information: the covariance is not too small."""
     rng, T, chi2 = np.random.default_rng(1), np.eye(4), []
     for seed in range(20):
         motion = rng.normal(size=(3, 6)) * [[0.5], [5], [50]]
@@ -97,7 +98,7 @@ def test_the_next_sweep_begins_where_one_ended_and_after_a_pause_less_is_known()
     way = se3.log(se3.inverse(end) @ one.T @ curve.poses(HALF + 1e-5, one.motion)) / 1e-5
     np.testing.assert_allclose(
         beginning.twist, way, atol=0.06
-    )  # the curve turns: to first order the twist is its slope
+    )  # the curve rotates: the twist is its slope only to first order
     later = one.next(0.5, HALF, 10.0)
     np.testing.assert_allclose(later.T, end @ se3.exp(0.4 * beginning.twist), atol=1e-12)
     assert (np.diag(later.covariance) > np.diag(beginning.covariance)).all()
@@ -105,10 +106,10 @@ def test_the_next_sweep_begins_where_one_ended_and_after_a_pause_less_is_known()
 
 
 def test_what_a_camera_adds_to_the_pose_was_motion_too() -> None:
-    """Along a tunnel the points say nothing, so that a pose farther ahead means a faster sweep."""
+    """Along a tunnel the points show no motion, so a pose farther ahead means a faster sweep."""
     sigma = np.repeat([0.001, 1e-3, 0.1, 1.0, 10.0, 10.0, 100.0, 100.0], 3)
     covariance = np.diag(sigma**2)
-    start_sigma, h = 0.01, HALF  # the sweep began at a known place: pose = start + h * twist
+    start_sigma, h = 0.01, HALF  # the sweep began at a known position: pose = start + h * twist
     covariance[3, 3] = start_sigma**2 + h**2 * covariance[9, 9]
     covariance[3, 9] = covariance[9, 3] = h * covariance[9, 9]
     one = Swept(np.eye(4), np.zeros((3, 6)), covariance, h)

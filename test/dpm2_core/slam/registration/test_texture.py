@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is the same all along a road does not say how far along it one is."""
+"""Texture that is constant along a road does not determine the position along it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETTINGS = VisualSettings()
 
 
 def railed(contrast: float) -> Paint:
-    """Walls whose paint is faint beside two black rails along them."""
+    """Walls with faint paint next to two black rails."""
     walls = random_paint(4)
 
     def paint(points: Array) -> Array:
@@ -29,7 +29,7 @@ def railed(contrast: float) -> Paint:
 
 @pytest.mark.parametrize(("contrast", "truck"), [(1.0, False), (0.4, False), (1.0, True)])
 def test_neither_rails_nor_a_truck_ahead_hide_the_way(contrast: float, truck: bool) -> None:
-    """1.7 m, to 5 cm, and nothing else correlates half as well; the truck drives as fast."""
+    """1.7 m, to 5 cm, and nothing else correlates half as well. The truck drives at the same speed."""
     paint = railed(contrast)
     first, second = frame(0.0, paint, truck=truck), frame(1.7, paint, 1, gain=0.8, truck=truck)
     known = reference(first.points, textured(first.images[0]), AXIS)

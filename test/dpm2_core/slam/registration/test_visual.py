@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image along the direction that scans leave open: a corridor of constant section with painted walls."""
+"""Images constrain the direction that scans leave open: a corridor of constant cross section with painted walls."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from ....helpers.corridor import CAMERA, T_LIDAR_CAM, Paint, frame, random_paint
 from ....helpers.drives import track
 
 GEOMETRIC = SlamSettings(registration="geometric")
-"""What is done with images is the same with the network, which takes most of the time."""
+"""Images are processed in the same way with the network, which takes most of the time."""
 
 
 def registered(first: Frame, second: Frame, **visual: object) -> Registration:
-    """Of the second in the frame of the first."""
+    """Registration of the second frame in the frame of the first."""
     settings = VisualSettings.model_validate(visual)
     registration = make_registration(SlamSettings(registration="geometric", visual=settings))
     registration.update(registration.prepare(first, np.zeros(6)), np.eye(4))
@@ -46,7 +46,8 @@ def assert_same(one: Registration, other: Registration) -> None:
 
 @pytest.mark.slow
 def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
-    """1.7 m that no point constrains, to 3 cm, a step of the fine search, at any exposure; its covariance shows it."""
+    """1.7 m that no point constrains are found to 3 cm, one step of the fine search, at any exposure. The covariance
+    shows it."""
     paint = random_paint()
     first, second = frame(0.0, paint), frame(1.7, paint, 1, gain=0.6)
     blind = registered(first, second, enabled=False)
@@ -58,7 +59,7 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     assert found.T_target_source[0, 3] == pytest.approx(1.7, abs=0.03)
     np.testing.assert_allclose(found.T_target_source[1:3, 3], 0, atol=0.03)
     assert np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]) < 0.1
-    # An image shows the scene, and nothing of the errors of calibration, which grow with the way that it has found.
+    # An image shows the scene, but not the calibration errors, which grow with the distance that it determines.
     assert found.floor[1] == pytest.approx(0.006 * 1.7, rel=0.05)
     assert np.linalg.eigvalsh(found.of_scene)[0] > 0
     assert found.of_scene[3, 3] < blind.of_scene[3, 3] / 9
@@ -70,7 +71,8 @@ def test_the_way_along_a_corridor_is_read_from_its_walls() -> None:
     [(stripes, "several places are alike"), (lambda p: np.full(len(p), 99.0), "no place correlates by 0.30")],
 )
 def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) -> None:
-    """Paint that repeats, or none: the result stays that of the points, with their uncertainty, and says why."""
+    """Paint that repeats, or none: the result stays that of the points, with their uncertainty, and reports the
+    reason."""
     result = registered(frame(0.0, paint), frame(0.7, paint, 1))
     assert result.method == "geometric"
     assert why in result.reason
@@ -80,7 +82,8 @@ def test_an_image_that_does_not_constrain_is_not_used(paint: Paint, why: str) ->
 
 @pytest.mark.slow
 def test_a_camera_that_shows_no_point_is_said_and_not_used() -> None:
-    """One that looks back from a LiDAR that sees ahead alone, or not in its optical frame: it ended the run."""
+    """The camera looks backwards while the LiDAR only sees ahead, or its pose is not that of the optical frame.
+    Previously, it ended the run."""
     paint = random_paint()
     back = replace(CAMERA, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ T_LIDAR_CAM)
     first, second = (
@@ -93,7 +96,7 @@ def test_a_camera_that_shows_no_point_is_said_and_not_used() -> None:
 
 @pytest.mark.slow
 def test_without_images_nothing_changes() -> None:
-    """Frames whose camera fails go the way they always went."""
+    """Frames whose camera fails are processed as before."""
     paint = random_paint()
     first, second = (Frame(f.stamp, f.points, index=f.index) for f in (frame(0.0, paint), frame(0.2, paint, 1)))
     assert_same(registered(first, second), registered(first, second, enabled=False))
@@ -101,7 +104,7 @@ def test_without_images_nothing_changes() -> None:
 
 @pytest.mark.slow
 def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image() -> None:
-    """Never one camera's image with the other's: they show different walls, or none in common."""
+    """An image is never compared with one of the other camera: they show different walls, or none in common."""
     paint, back = random_paint(), np.diag([-1.0, -1, 1, 1])
     rear = replace(CAMERA, T_lidar_cam=back @ T_LIDAR_CAM, name="rear")
     two = [replace(f, images=(*f.images, seen(x, paint, rear))) for x, f in
@@ -119,7 +122,8 @@ def test_of_two_cameras_the_first_is_asked_and_the_second_where_it_has_no_image(
 @pytest.mark.slow
 @pytest.mark.parametrize(("focal", "apart"), [(1.0, False), (1.1, True)])
 def test_a_camera_whose_calibration_is_wrong_leads_nowhere_where_intensities_tell(focal: float, apart: bool) -> None:
-    """By the image alone 10 % of the focal length are 4 m of 39, `tracking`; intensities have no calibration."""
+    """By the image alone, 10 % of the focal length are an error of 4 m in 39 m, as `tracking`. Intensities have no
+    calibration."""
     paint, states, reasons, ahead = random_paint(), [], [], []
     camera = replace(CAMERA, K=CAMERA.K @ np.diag([focal, focal, 1.0]))
     odometry = make_odometry(GEOMETRIC)
@@ -136,7 +140,7 @@ def test_a_camera_whose_calibration_is_wrong_leads_nowhere_where_intensities_tel
 
 
 def noisy(one: Frame) -> Frame:
-    """With the noise of a camera, by which no two images are the same."""
+    """The frame with camera noise, so that no two images are the same."""
     noise = np.random.default_rng(one.index).integers(0, 3, one.images[0].pixels.shape, np.uint8)
     return replace(one, images=tuple(replace(i, pixels=np.minimum(i.pixels, 253) + noise) for i in one.images))
 
@@ -150,12 +154,13 @@ def noisy(one: Frame) -> Frame:
     ],
 )
 def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -> None:
-    """By a camera that hangs: it showed a halt, and the error was the way of the vehicle meanwhile, in `tracking`."""
+    """A camera that hangs sends it. Previously, it showed a halt, and the error was the distance traveled meanwhile, as
+    `tracking`."""
     paint = random_paint(3)
     good = [noisy(frame(0.5 * i, paint, i)) for i in range(10)]
     hung = [replace(f, images=good[5 if hangs(7) else i - 1].images) if hangs(i) else f for i, f in enumerate(good)]
     without = [replace(f, images=()) if hangs(i) else f for i, f in enumerate(good)]
-    odometry = [make_odometry(SlamSettings()) for _ in range(2)]  # the network does not see it either
+    odometry = [make_odometry(SlamSettings()) for _ in range(2)]  # the network does not receive it either
     for i, (one, other) in enumerate(zip(hung, without, strict=True)):
         result, expected = odometry[0].process(one), odometry[1].process(other)
         assert_same(result.registration, expected.registration)
@@ -166,7 +171,8 @@ def test_an_image_that_is_sent_again_is_left_out(hangs: Callable[[int], bool]) -
 
 @pytest.mark.slow
 def test_a_camera_of_another_rate_than_the_scans() -> None:
-    """At 15 Hz beside 10 Hz and 10 m/s, each second image is 0.33 m from its scan: that was the error of each step."""
+    """With 15 Hz next to 10 Hz at 10 m/s, every second image is 0.33 m from its scan. Previously, that was the error of
+    each step."""
     paint, late = random_paint(3), np.arange(10) % 2 / 30
     frames = [frame(1.0 * i, paint, i) for i in range(10)]
     odometry, tracked = make_odometry(GEOMETRIC), []
@@ -177,14 +183,15 @@ def test_a_camera_of_another_rate_than_the_scans() -> None:
     sigma = np.array([t.registration.worst_sigma for t in tracked])
     off = np.abs(np.diff(x) - 1.0)
     assert (off < 3 * np.hypot(sigma[:-1], sigma[1:])).all()
-    assert off[2:].max() < 0.1  # when the motion is known
+    assert off[2:].max() < 0.1  # once the motion is known
     assert [t.state for t in tracked[4:]] == [State.TRACKING] * 6
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [0.1, -0.1])
 def test_a_picture_of_another_time_than_its_keyframe(late: float) -> None:
-    """Its camera is placed where that was then: places were found by it that were off by the speed times that time."""
+    """Its camera is placed where it was at the time of the image. Previously, places found with the image were off by
+    the speed times the time difference."""
     paint, slam = random_paint(3), make_slam(GEOMETRIC)
 
     def place(i: float) -> float:
@@ -198,15 +205,16 @@ def test_a_picture_of_another_time_than_its_keyframe(late: float) -> None:
     picture = usable_image(result.keyframe.thumbnail)
     assert picture is not None
     ahead = place(13 + 10 * late) - place(13)
-    # The speed is that of the way of this image from the one before, 0.9 m/s off at most.
+    # The speed is the average between this image and the previous one, 0.9 m/s off at most.
     np.testing.assert_allclose(picture.camera.T_lidar_cam[:3, 3], [ahead, 0, 0], atol=0.1)
-    # The odometry is that of the camera, off by as much: a correction by a speed that its images give would diverge.
+    # The odometry follows the camera and is off by the same distance: correcting it with a speed from its images would
+    # diverge.
     assert result.T_odom_lidar[0, 3] == pytest.approx(place(13) + ahead, abs=0.1)
 
 
 @pytest.mark.slow
 def test_an_image_that_is_sent_again_is_no_picture_of_a_keyframe() -> None:
-    """It shows another place."""
+    """Such an image shows another place."""
     frames = [noisy(frame(0.5 * i, random_paint(3), i)) for i in range(3)]
     for images, shown in ((frames[2].images, True), (frames[1].images, False)):
         slam = make_slam(GEOMETRIC)
@@ -220,7 +228,7 @@ def test_an_image_that_is_sent_again_is_no_picture_of_a_keyframe() -> None:
 
 @pytest.mark.slow
 def test_the_same_image_is_good_for_two_clouds_and_at_rest_without_noise() -> None:
-    """Where it is the nearest of both, or where the cloud is the same too."""
+    """The image is the nearest to both clouds, or the cloud is the same, too."""
     first, second = (frame(0.5 * i, random_paint(3), i) for i in range(2))
     late = replace(second, images=(replace(first.images[0], time_offset=-0.1),))
     for again in (late, replace(first, stamp=second.stamp)):
@@ -231,7 +239,8 @@ def test_the_same_image_is_good_for_two_clouds_and_at_rest_without_noise() -> No
 
 @pytest.mark.slow
 def test_an_odometry_that_brakes_in_a_tunnel() -> None:
-    """Six scans at 1 m, then ever shorter: by its velocity alone it would overshoot, and it would say `degraded`."""
+    """Six scans 1 m apart, then shorter and shorter steps. By its velocity alone it would overshoot, and be
+    `degraded`."""
     paint = random_paint(3)
     steps = [1.0] * 5 + [0.7, 0.4, 0.1, 0.0]
     at = np.concatenate([[0.0], np.cumsum(steps)])
@@ -252,11 +261,12 @@ def test_an_odometry_that_brakes_in_a_tunnel() -> None:
 
 
 def test_points_images_and_intensities_of_a_real_drive_agree(kitti_root: Path) -> None:
-    """Asked where nothing is open, the others move the result by centimeters: three measurements of one motion."""
+    """Used where nothing is open, images and intensities move the result by centimeters: three measurements of one
+    motion."""
     frames = list(open_source(kitti_root / "sequences" / "04").frames(0, 12))
     tracks = [track(frames, odometry={"degraded_sigma": sigma}) for sigma in (0.08, 1e-4)]
     methods = [tracked.registration.method for tracked in tracks[1][1:]]
-    assert methods.count("visual") >= 4  # of 11: until there are scans enough to ask the intensities
+    assert methods.count("visual") >= 4  # of 11: until there are enough scans to use the intensities
     assert methods.count("visual") + methods.count("intensity") >= 9
     assert "intensity" in methods
     assert {"visual", "intensity"}.isdisjoint(tracked.registration.method for tracked in tracks[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A damaged map is diagnosed without being touched, and what is good of it becomes a new, sound map."""
+"""A damaged map is diagnosed without being changed, and its good part becomes a new, valid map."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from test.helpers.scenes import make_image
 
 
 def recovered(path: Path) -> MapData:
-    """The good part, which must be sound; the damaged file is not touched."""
+    """The good part, which must be valid; the damaged file is not changed."""
     before, out = path.read_bytes(), path.with_name("recovered.dpm2map")
     out.unlink(missing_ok=True)
     check_map(path, out)
@@ -55,7 +55,7 @@ def test_a_sound_map_has_no_problems(map_file: Path, keyframes: list[Keyframe]) 
 
 
 def test_rounding_is_no_damage(map_file: Path) -> None:
-    """A loop that was rejected, as dpm2 0.1 wrote it: 1 + 2e-15 in its last corner."""
+    """A rejected loop as dpm2 0.1 wrote it: 1 + 2e-15 in its last corner."""
     T = np.eye(4)
     T[3, 3] = 1.0000000000000016
     row = (90, "loop", 1, 5, T.tobytes(), np.eye(6).tobytes(), 0, 0.0, 1.9, "neural", "too unlike")
@@ -86,7 +86,7 @@ def test_each_kind_of_damage_is_named(map_file: Path, keyframes: list[Keyframe])
         load_map(store)
     data = recovered(map_file)
     assert [k.id for k in data.keyframes] == [0, 1, 2, 3, 4, 5, 6, 7, 9, 10, 11]
-    # The lost pose follows from the odometry, and the holes in the chain are bridged by it.
+    # The lost pose follows from the odometry, which also bridges the gaps in the chain.
     np.testing.assert_allclose(data.poses[4], keyframes[4].T_odom_kf, atol=1e-9)
     chain = {(e.from_node, e.to_node) for e in data.edges if e.kind == "odometry"}
     assert chain == {(i, i + 1) for i in range(10)}
@@ -98,21 +98,21 @@ def test_each_kind_of_damage_is_named(map_file: Path, keyframes: list[Keyframe])
 def test_damaged_pages_cost_only_what_is_on_them(map_file: Path, seed: int) -> None:
     content = bytearray(map_file.read_bytes())
     rng, pages = np.random.default_rng(seed), len(content) // 4096
-    for page in rng.choice(np.arange(10, pages), 2, replace=False):  # the roots of the tables come before
+    for page in rng.choice(np.arange(10, pages), 2, replace=False):  # the root pages of the tables come before
         content[page * 4096 + 200 : (page + 1) * 4096] = rng.bytes(3896)
     map_file.write_bytes(content)
     assert check_map(map_file).problems
     data = recovered(map_file)
-    assert len(data) >= 8  # each page holds a few keyframes or less
+    assert len(data) >= 8  # each page contains a few keyframes or less
 
 
 def test_an_invalid_picture_costs_nothing_but_itself(map_file: Path, noise: np.random.Generator) -> None:
-    """Its checksum is right: who wrote it did not know better, or wishes harm."""
+    """Its checksum is right: the writer is faulty or malicious."""
     jpeg = thumbnail(make_image(noise), 32).replace(b'"K": [[', b'"K": [["')
     with closing(sqlite3.connect(map_file)) as sql:
         row = sql.execute("SELECT node, cloud, descriptors, ? FROM payloads WHERE node = 3", (jpeg,)).fetchone()
     execute(map_file, ("UPDATE payloads SET thumbnail = ?, crc = ? WHERE node = 3", with_crc(*row)[3:]))
-    assert check_map(map_file).problems == []  # that is no camera at all: a foreign JPEG
+    assert check_map(map_file).problems == []  # it has no camera at all: a foreign JPEG
     jpeg = thumbnail(make_image(noise), 32).replace(b'"size": [32,', b'"size": [-2,')
     row = (*row[:3], jpeg)
     execute(map_file, ("UPDATE payloads SET thumbnail = ?, crc = ? WHERE node = 3", with_crc(*row)[3:]))
@@ -127,7 +127,8 @@ def test_an_invalid_picture_costs_nothing_but_itself(map_file: Path, noise: np.r
 
 
 def test_how_a_place_was_last_seen_costs_nothing_but_itself(tmp_path: Path) -> None:
-    """A keyframe that borrows has its own cloud in the file, too: damaged, it is said, and left out."""
+    """A keyframe that borrows has its own cloud in the file, too. If this cloud is damaged, it is reported and left
+    out."""
     data, path = ring(12), tmp_path / "a.dpm2map"
     for node in (10, 11):
         data.clouds.borrow(node, Loan(node - 10, np.eye(4)))
@@ -160,7 +161,8 @@ def test_a_map_that_was_cut_off(map_file: Path) -> None:
 
 
 def test_joined_maps_that_were_cut_off_hang_together(tmp_path: Path) -> None:
-    """All edges lay behind the last keyframe: one percent less, and no loop tied the second map to the first."""
+    """Previously, all edges were behind the last keyframe: with one percent less, no loop connected the second map to
+    the first."""
     path, data = tmp_path / "map", ring(40, 300)
     tie = Edge("loop", 0, 1, Registration(data.poses[1], np.eye(6) * 1e-4))
     save_as(merge_maps(data, data, np.eye(4), [tie]), path)
@@ -170,11 +172,12 @@ def test_joined_maps_that_were_cut_off_hang_together(tmp_path: Path) -> None:
     assert len(left) > 70
     assert set(parts_of(left)) == {0}
     bridges = [edge.to_node for edge in left.edges if edge.registration.method == "bridge"]
-    assert all(node > 60 for node in bridges)  # where the cut is; all other odometry is as it was measured
+    assert all(node > 60 for node in bridges)  # where the cut is; all other odometry is as measured
 
 
 def test_a_map_without_its_last_pages_keeps_all_before_them(tmp_path: Path) -> None:
-    """Where a map ends is read from the last page of a table; without it a single keyframe was recovered, 0 lost."""
+    """The end of a map is read from the last page of a table. Previously, without this page a single keyframe was
+    recovered, and 0 were reported lost."""
     path = tmp_path / "map"
     save_as(ring(60, 30), path)
     content, cut = bytearray(path.read_bytes()), {}
@@ -194,7 +197,8 @@ def test_a_map_without_its_last_pages_keeps_all_before_them(tmp_path: Path) -> N
 
 
 def save_drives(path: Path, robots: Sequence[str], begins: int = 0) -> None:
-    """A map of one session, with the robot of each keyframe; at the node `begins` one begins another drive."""
+    """Save a map of one session, with the robot of each keyframe. At the node `begins`, a robot begins another
+    drive."""
     data, newest, edges = ring(len(robots), 30), dict[str, int](), []
     keyframes = [replace(k, robot=robot) for k, robot in zip(data.keyframes, robots, strict=True)]
     for node, robot in enumerate(robots):
@@ -209,7 +213,7 @@ def save_drives(path: Path, robots: Sequence[str], begins: int = 0) -> None:
     "damage", ["", "UPDATE edges SET rmse = 9 WHERE id = 2", "DELETE FROM keyframes WHERE node IN (3, 6)"]
 )
 def test_two_drives_of_a_robot_in_one_session_stay_apart(tmp_path: Path, damage: str) -> None:
-    """Where the second is relative to the first is not known; holes within the two are bridged."""
+    """The pose of the second drive relative to the first is not known. Gaps within each drive are bridged."""
     save_drives(tmp_path / "map", ["red"] * 12, begins=6)
     execute(tmp_path / "map", damage)
     data = recovered(tmp_path / "map")
@@ -234,12 +238,12 @@ def test_nothing_left_to_recover(tmp_path: Path) -> None:
         check_map(tmp_path / "none")
     assert not (tmp_path / "out").exists()
     (tmp_path / "there").touch()
-    with pytest.raises(UsageError, match="there is a file already"):  # before the work, of minutes
+    with pytest.raises(UsageError, match="there is a file already"):  # before the work, which takes minutes
         check_map(path, tmp_path / "there")
 
 
 def test_the_tail_of_a_killed_drive_is_recovered_too(map_file: Path) -> None:
-    """It lies in FILE-wal."""
+    """It is in FILE-wal."""
     program = f"""
 import os
 from pathlib import Path
@@ -254,11 +258,12 @@ os._exit(0)
 
 
 def test_the_map_of_a_killed_drive_that_was_moved_without_its_log_is_not_sound(map_file: Path, tmp_path: Path) -> None:
-    """All of a short drive is in FILE-wal: "0 keyframes, sound". Copies that `~/save_map` makes have none."""
+    """All of a short drive is in FILE-wal. Previously, the check returned "0 keyframes, sound". Copies made by
+    `~/save_map` have no log."""
     moved, copy = tmp_path / "moved.dpm2map", tmp_path / "copy.dpm2map"
     with MapStore.open(map_file, read_only=False) as store:
         store.begin_session()
-        assert check_map(map_file).problems == []  # its writer lives
+        assert check_map(map_file).problems == []  # its writer is alive
         shutil.copy(map_file, moved)
         store.copy_to(copy)
     words = (
@@ -271,7 +276,7 @@ def test_the_map_of_a_killed_drive_that_was_moved_without_its_log_is_not_sound(m
 def test_a_map_that_is_written_meanwhile_is_of_one_instant(
     tmp_path: Path, keyframes: list[Keyframe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A slow copy of FILE was of another instant than that of FILE-wal, which the writer had begun anew."""
+    """Previously, a slow copy of FILE was of another instant than that of FILE-wal, which the writer had restarted."""
     copyfile = shutil.copyfile
     with MapStore.create(tmp_path / "map") as store:
         store.begin_session()
@@ -304,7 +309,7 @@ def test_a_map_without_room_for_its_copy_is_not_said_to_be_damaged(map_file: Pat
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_check_that_is_stopped_leaves_no_copy(tmp_path: Path, number: signal.Signals) -> None:
-    save_as(ring(300, 3000), tmp_path / "map")  # a second and more
+    save_as(ring(300, 3000), tmp_path / "map")  # takes a second or more
     (tmp_path / "temporary").mkdir()
     program = (
         "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds come back as they were to half a centimeter, from disk or, without one, from memory."""
+"""Clouds are restored to half a centimeter, from disk or, if there is none, from memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def clouds() -> list[np.ndarray]:
 
 @given(st.integers(0, 300), st.sampled_from([0.0, 1.0, 60.0, 327.0, 2000.0]), st.integers(0, 2**32 - 1))
 def test_rounding_is_half_a_step(count: int, reach: float, seed: int) -> None:
-    """Half a centimeter up to 327 m, in proportion beyond; order, number and dtype stay."""
+    """Half a centimeter up to 327 m, proportional beyond. Order, number and dtype stay."""
     rng = np.random.default_rng(seed)
     cloud = rng.uniform(-1, 1, (count, 4)).astype(np.float32) * np.float32([reach, reach, reach, 1])
     cloud[:, 3] = np.abs(cloud[:, 3])
@@ -51,7 +51,7 @@ def test_what_is_no_cloud_is_rejected() -> None:
 
 
 def test_where_the_lidar_was_goes_with_its_cloud() -> None:
-    """Behind the header; a LiDAR at the origin takes no byte, as in maps of before."""
+    """It is behind the header. A LiDAR at the origin takes no byte, as in earlier maps."""
     cloud, there = clouds()[0], np.array([5.0, -0.25, 2.5])
     here, moved = pack_cloud(cloud), pack_cloud(cloud, there)
     assert pack_cloud(cloud, np.zeros(3)) == here
@@ -80,7 +80,8 @@ def test_a_step_that_no_cloud_has_is_rejected(quantum: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [10, 1_000_000, 0xFFFFFFFF])
 def test_a_bomb_is_not_inflated(count: int) -> None:
-    """200 kB that would become 200 MB: no more memory is taken than so many points need, whatever is claimed."""
+    """200 kB that would become 200 MB. At most as much memory is used as the claimed points need, whatever is
+    claimed."""
     bomb = zlib.compress(bytes(200_000_000), 9)
     tracemalloc.start()
     try:
@@ -107,7 +108,7 @@ def check(store: CloudStore) -> None:
         np.testing.assert_allclose(cloud, stored, atol=0.0051)
     assert len(store[-1]) == 7
     assert len(store[:2]) == 2
-    store[0][:] = 0  # a copy: what is stored stays
+    store[0][:] = 0  # a copy: the stored cloud stays
     assert store[0].any()
     with pytest.raises(IndexError):
         store[3]
@@ -137,14 +138,15 @@ def test_moving_points_are_left_out_and_a_borrowed_cloud_is_moved() -> None:
     assert [store.origin(n).tolist() for n in range(3)] == [[0, 0, 0], [1, 0, 2], [2, 0, 4]]
     store.borrow(2, Loan(0, T))
     np.testing.assert_allclose(store[2], se3.transform(T, store[0]), atol=1e-5)
-    np.testing.assert_allclose(store.origin(2), T[:3, 3])  # where the lender's LiDAR was
+    np.testing.assert_allclose(store.origin(2), T[:3, 3])  # the position of the lender's LiDAR
 
 
 AHEAD = np.array([1, 0, 0, 0], np.float32)
 
 
 def test_how_a_place_was_last_seen_is_kept() -> None:
-    """Of those that borrow in a place the newest has its own cloud, without what moves; the one before gives it up."""
+    """In each place, the newest keyframe that borrows keeps its own cloud, without moving points. The one before gives
+    its cloud up."""
     store, (cloud, *_) = CloudStore(), clouds()
     for number in range(4):
         store.append(pack_cloud(cloud + number * AHEAD, np.array([1.0, 0, 2]) * number))
@@ -161,7 +163,7 @@ def test_how_a_place_was_last_seen_is_kept() -> None:
 
 
 def test_disk_that_fills_up() -> None:
-    """In a process that may write 4 kB: the first clouds are on disk, the rest stay in memory, none is lost."""
+    """In a process that may write only 4 kB: the first clouds are on disk, the rest stay in memory, none is lost."""
     program = """
 import resource, signal
 import numpy as np

@@ -13,7 +13,7 @@ from dpm2_core.slam.store.map_cloud import map_cloud, map_cloud_in_steps
 
 
 def test_it_is_the_first_point_in_each_voxel_made_in_steps() -> None:
-    """However many clouds are thinned at once; and what is not asked for is not in it."""
+    """The number of clouds that are thinned at once does not matter. Nodes that are not requested are not in it."""
     noise, clouds = np.random.default_rng(0), CloudStore()
     poses = se3.exp(np.arange(230)[:, None] * np.array([0, 0, 0.01, 0.5, 0, 0]))
     for _ in poses:

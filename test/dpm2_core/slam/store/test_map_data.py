@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of maps, and maps behind one another: whole, or not there."""
+"""Copies of maps, and maps appended to one another: complete, or not there."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from test.helpers.maps import change, ring
 
 
 def test_a_copy_that_does_not_fit_on_the_disk_is_an_error(tmp_path: Path, noise: np.random.Generator) -> None:
-    """Also where only the last step fails: all of it is in FILE-wal then, but not in the file."""
+    """Also if only the last step fails: then all of it is in FILE-wal, but not in the file."""
     data = replace(ring(13), thumbnail=lambda node: noise.bytes(500_000))
     save_as(data, tmp_path / "map")
     size = (tmp_path / "map").stat().st_size
     with largest_file(size - 300_000), pytest.raises(Dpm2Error, match=r"copy: not written: .*is the disk full"):
         save_as(data, tmp_path / "copy")
-    assert size > CHECKPOINT + 600_000  # else FILE-wal would have been too large first, which is another error
+    assert size > CHECKPOINT + 600_000  # else FILE-wal would become too large first, which is another error
     assert os.listdir(tmp_path) == ["map"]
 
 
@@ -69,7 +69,8 @@ with MapStore.open(Path(sys.argv[1])) as store:
 
 
 def test_a_copy_that_is_killed_leaves_no_map_and_the_next_one_cleans_up(tmp_path: Path, map_file: Path) -> None:
-    """It left an empty map, which the check called sound, and for which the same call was refused."""
+    """Previously, it left an empty map, which the check reported as sound, and because of which the same call was
+    rejected."""
     out = tmp_path / "copy"
     killed = subprocess.run([sys.executable, "-c", COPY, str(map_file), str(out), "killed"], timeout=60, check=False)
     assert killed.returncode == -signal.SIGKILL
@@ -82,7 +83,7 @@ def test_a_copy_that_is_killed_leaves_no_map_and_the_next_one_cleans_up(tmp_path
 
 
 def test_of_two_copies_of_one_name_the_first_that_is_whole_gets_it(tmp_path: Path, map_file: Path) -> None:
-    """The second took away what the first had written, and neither was left."""
+    """Previously, the second one deleted what the first had written, and neither was left."""
     out = tmp_path / "copy"
 
     def meanwhile(node: int) -> None:
@@ -96,7 +97,8 @@ def test_of_two_copies_of_one_name_the_first_that_is_whole_gets_it(tmp_path: Pat
 
 
 def test_a_map_behind_another_one_is_the_map_of_both(tmp_path: Path, map_file: Path) -> None:
-    """Nodes, sessions, lenders, edges and what was pruned count on, as where two maps are joined in memory."""
+    """The numbers of nodes, sessions, lenders, edges and pruned keyframes continue, as if two maps were joined in
+    memory."""
     with MapStore.open(map_file) as first, MapStore.create(tmp_path / "both") as both:
         save_as(ring(30), tmp_path / "ring")
         with MapStore.open(tmp_path / "ring") as second:
@@ -113,7 +115,7 @@ def test_a_map_behind_another_one_is_the_map_of_both(tmp_path: Path, map_file: P
 
 
 def test_a_copy_replaces_a_map_whose_writer_was_killed(tmp_path: Path, keyframes: list[Keyframe]) -> None:
-    """Its log stayed beside the new map, which was then read with the old one's pages."""
+    """Previously, its log stayed next to the new map, which was then read with pages of the old map."""
     path, target = tmp_path / "a.dpm2map", tmp_path / "b.dpm2map"
     with MapStore.create(tmp_path / "killed") as store:
         store.begin_session()
@@ -133,7 +135,8 @@ def test_a_copy_replaces_a_map_whose_writer_was_killed(tmp_path: Path, keyframes
 
 
 def test_a_way_goes_as_it_was_driven_where_its_stamps_come_again() -> None:
-    """As of a clock that was set back, or a bag that is played twice: the two halves were taken alternately."""
+    """For example after a clock was set back, or if a bag is played twice. Previously, the two halves were
+    interleaved."""
     data = ring(12, points=10)
     keyframes = [replace(k, stamp=k.stamp - 6 * 10**9 * (k.id >= 6)) for k in data.keyframes]
     data = replace(data, keyframes=keyframes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map file and its log belong together: neither is taken for that of another map."""
+"""A map file and its log belong together: neither is used with that of another map."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from test.helpers.maps import change
 
 
 def begun(source: Path, path: Path) -> None:
-    """As a drive or a robot makes one."""
+    """Create a map like a drive or a robot."""
     open_session(path, SlamSettings(registration="geometric", loops={"descriptors": False}), "", resume=False).close()
 
 
 def saved(source: Path, path: Path) -> None:
-    """As prune, merge and check --recover make one."""
+    """Create a map like prune, merge and check --recover."""
     with MapStore.open(source) as store:
         save_as(load_map(store), path)
 
 
 def copied(source: Path, path: Path) -> None:
-    """As the node saves one."""
+    """Create a map like the node when it saves one."""
     with MapStore.open(source) as store:
         store.copy_to(path)
 
@@ -45,7 +45,7 @@ def copied(source: Path, path: Path) -> None:
 def test_a_map_under_a_link_is_made_where_the_link_leads(
     tmp_path: Path, map_file: Path, make: Callable[[Path, Path], None], there: bool
 ) -> None:
-    """As on a larger disk. It was refused after all the work, or took the place of the link."""
+    """For example on a larger disk. Previously, the map was rejected after all the work, or it replaced the link."""
     link, disk = tmp_path / "link.dpm2map", tmp_path / "disk"
     disk.mkdir()
     link.symlink_to(disk / "new.dpm2map")
@@ -65,19 +65,19 @@ def test_a_map_under_a_link_is_made_where_the_link_leads(
 def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], make: Callable[[Path, Path], None]
 ) -> None:
-    """Of a killed one that was removed or moved: SQLite took it for the new map's, which then held the keyframes of the
-    old one, or was malformed."""
+    """The log of a killed map that was removed or moved. Previously, SQLite used it for the new map, which then
+    contained the keyframes of the old one, or was malformed."""
     path = tmp_path / "new.dpm2map"
     log = path.with_name("new.dpm2map-wal")
     with MapStore.create(tmp_path / "killed") as store:
         store.begin_session()
         store.write(change(0, keyframes[0]))
-        shutil.copyfile(tmp_path / "killed-wal", log)  # as `kill -9`, and then `rm` or `mv` of the map, leave it
+        shutil.copyfile(tmp_path / "killed-wal", log)  # left by `kill -9` and then `rm` or `mv` of the map
     before = log.read_bytes()
     with pytest.raises(UsageError, match=r"new\.dpm2map-wal: the last keyframes of a map .* or remove it"):
         make(map_file, path)
     assert not path.exists()
-    assert log.read_bytes() == before  # the map that was moved needs it
+    assert log.read_bytes() == before  # the moved map needs it
     log.unlink()
     make(map_file, path)
     assert check_map(path).problems == []
@@ -88,7 +88,8 @@ def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
 def test_a_map_that_was_copied_over_a_killed_one_is_not_read_with_its_log(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], more: int
 ) -> None:
-    """As a backup that is put back: it had the drive that it is without, or was malformed, as with 4 MB of a log."""
+    """For example a restored backup. Previously, it contained the drive that it must not have, or was malformed, as
+    with 4 MB of log."""
     path = tmp_path / "town.dpm2map"
     shutil.copyfile(map_file, path)
     with MapStore.open(path, read_only=False) as store:
@@ -116,7 +117,8 @@ def test_a_map_that_was_copied_over_a_killed_one_is_not_read_with_its_log(
 def test_where_nothing_can_be_written_that_is_said(
     tmp_path: Path, map_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There removing what was not made is an error, too, and was the one that came out, as a traceback."""
+    """There, removing a file that was not created is an error, too. Previously, this error was raised, as a
+    traceback."""
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -128,7 +130,7 @@ def test_where_nothing_can_be_written_that_is_said(
 
 
 def test_prune_says_so_before_it_has_worked(tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the exit code of a mistake, as where there is a file."""
+    """The exit code is that of a usage error, as if the file existed."""
     (tmp_path / "less.dpm2map-wal").write_bytes(b"log")
     with pytest.raises(SystemExit, match="2"):
         main(["map", "prune", str(map_file), "--out", str(tmp_path / "less.dpm2map")])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map file survives: kills, cut-off files, full disks, readers and writers meanwhile."""
+"""A map file survives kills, truncated files, full disks, and readers and writers at the same time."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ for node in range(int(sys.argv[2])):
 
 
 def whole_prefix(path: Path) -> int:
-    """How many keyframes the map has; they must be the first ones, each with all that belongs to it."""
+    """Number of keyframes of the map. They must be the first ones, each complete."""
     with MapStore.open(path) as store:
         data = load_map(store)
         assert [k.id for k in data.keyframes] == list(range(len(data)))
@@ -65,7 +65,7 @@ def whole_prefix(path: Path) -> int:
 
 
 def test_everything_comes_back(tmp_path: Path, map_file: Path, keyframes: list[Keyframe]) -> None:
-    """Poses and covariances to the last bit, clouds to half a centimeter, descriptors as the bytes they are."""
+    """Poses and covariances to the last bit, clouds to half a centimeter, descriptors byte for byte."""
     for path in (map_file, tmp_path / "again.dpm2map", tmp_path / "without.dpm2map"):
         if path != map_file:
             with MapStore.open(map_file) as store:
@@ -106,7 +106,7 @@ def test_a_loan_and_a_thumbnail_come_back(map_file: Path, keyframes: list[Keyfra
         borrowed, lent = data.keyframes[12].descriptors, data.keyframes[3].descriptors
         assert borrowed is not None
         assert lent is not None
-        assert borrowed.features is lent.features  # no memory
+        assert borrowed.features is lent.features  # no additional memory
         assert data.thumbnail(13) == b"jpeg"
         assert data.thumbnail(0) is None
 
@@ -125,12 +125,12 @@ def test_kill_at_any_instant_loses_no_keyframe_that_was_taken_in(tmp_path: Path,
     child.stdout.close()
     assert acknowledged - 1 <= whole_prefix(path) <= acknowledged + 1  # the last line itself may be cut off
     assert check_map(path).problems == []
-    with MapStore.open(path, read_only=False) as store:  # and it can be written to again
+    with MapStore.open(path, read_only=False) as store:  # and the file can be written to again
         store.begin_session()
 
 
 def test_a_file_cut_off_at_any_place_holds_the_first_keyframes(tmp_path: Path) -> None:
-    """What a machine that dies leaves of FILE-wal: any prefix, and garbage after it."""
+    """A machine that dies leaves any prefix of FILE-wal, and possibly garbage after it."""
     path = tmp_path / "a.dpm2map"
     program = WRITER + "\nimport os; os._exit(0)"  # without closing: FILE-wal stays
     subprocess.run([sys.executable, "-c", program, str(path), "12"], check=True, capture_output=True, timeout=60)
@@ -143,7 +143,7 @@ def test_a_file_cut_off_at_any_place_holds_the_first_keyframes(tmp_path: Path) -
         Path(f"{cut}-wal").write_bytes(wal[:size] + (rng.bytes(5000) if trial % 2 else b""))
         try:
             counts.add(whole_prefix(cut))
-        except UsageError:  # the very beginning: not even the schema had been written
+        except UsageError:  # the very beginning: not even the schema was written
             assert size < 100_000
     assert 12 in counts or max(counts) >= 10
     assert len(counts) > 4
@@ -159,7 +159,7 @@ def test_a_reader_sees_whole_keyframes_while_they_are_written(tmp_path: Path) ->
     counts = []
     while child.poll() is None:
         counts.append(whole_prefix(path))
-        if counts[-1] == 20 * told < 60:  # it goes on when it has been seen so far: else a slow reader might miss all
+        if counts[-1] == 20 * told < 60:  # the writer waits until this was seen: else a slow reader might miss all
             child.stdin.write(b"\n")
             child.stdin.flush()
             told += 1
@@ -187,7 +187,7 @@ def test_reading_leaves_no_trace(map_file: Path) -> None:
 
 @pytest.mark.slow
 def test_a_folder_that_cannot_be_written(map_file: Path) -> None:
-    """Reading works, also of a map whose writer was killed; writing is an error that says so."""
+    """Reading works, also for a map whose writer was killed. Writing is an error that reports the reason."""
     program = f"""
 import os, sys
 from pathlib import Path
@@ -258,7 +258,7 @@ MapStore.create(Path(sys.argv[1]))
 
 
 def test_a_kill_while_a_map_is_made_leaves_no_file_of_its_name(tmp_path: Path) -> None:
-    """A robot that is switched off then would find "not a dpm2 map" there for ever."""
+    """Otherwise, a robot that is switched off then would find "not a dpm2 map" there forever."""
     path = tmp_path / "map"
     done = subprocess.run([sys.executable, "-c", _KILLED_AT_THE_START, str(path)], check=False)
     assert done.returncode == -signal.SIGKILL
@@ -272,7 +272,7 @@ def test_a_kill_while_a_map_is_made_leaves_no_file_of_its_name(tmp_path: Path) -
 def test_of_two_programs_that_make_a_map_of_one_name_one_gets_it(
     tmp_path: Path, error: OSError | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other program comes between; also on a file system without hard links."""
+    """The other program creates its file in between; also on a file system without hard links."""
     path, link = tmp_path / "map", os.link
 
     def late(source: Path, target: Path) -> None:
@@ -304,7 +304,7 @@ def test_two_writers(map_file: Path, keyframes: list[Keyframe], monkeypatch: pyt
 def test_of_two_programs_that_go_on_with_a_map_only_the_later_one_writes(
     map_file: Path, keyframes: list[Keyframe]
 ) -> None:
-    """Both count on from its 12 keyframes: the one would replace what the other has written."""
+    """Both continue after its 12 keyframes: one would overwrite what the other has written."""
     mine, others = (replace(keyframes[0], robot=robot) for robot in ("one", "two"))
     with MapStore.open(map_file, read_only=False) as one, MapStore.open(map_file, read_only=False) as two:
         one.begin_session()
@@ -334,7 +334,7 @@ def test_a_program_that_takes_over_other_maps_goes_on_with_its_own_session(
 
 @pytest.mark.parametrize("size", [20_000, 60_000])
 def test_a_map_that_cannot_be_begun_is_not_in_the_way_of_the_next(tmp_path: Path, size: int) -> None:
-    """Neither where its tables do not fit on the disk, 41 kB, nor where the settings of its first session do not."""
+    """Neither if its tables do not fit on the disk, 41 kB, nor if the settings of its first session do not."""
     settings = SlamSettings(registration="geometric", loops={"descriptors": False})
     path = tmp_path / "map"
     with largest_file(size), pytest.raises(Dpm2Error, match=r"map: (disk I/O error|database or disk is full)"):
@@ -345,7 +345,8 @@ def test_a_map_that_cannot_be_begun_is_not_in_the_way_of_the_next(tmp_path: Path
 
 
 def test_a_new_map_is_whole_without_its_log(tmp_path: Path) -> None:
-    """A power cut in the first seconds may take all of FILE-wal; what it left was no map, and in the way of one."""
+    """A power cut in the first seconds may delete all of FILE-wal. Previously, the rest was no map, and prevented a new
+    one."""
     with MapStore.create(tmp_path / "map") as store:
         store.begin_session()
         shutil.copyfile(tmp_path / "map", tmp_path / "copy")
@@ -357,7 +358,7 @@ def test_a_new_map_is_whole_without_its_log(tmp_path: Path) -> None:
 def test_a_link_to_a_map_that_is_being_written_shows_all_of_it(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], read_only: bool
 ) -> None:
-    """FILE-wal lies beside the file, and not beside the link."""
+    """FILE-wal is next to the file, not next to the link."""
     link = tmp_path / "elsewhere" / "latest"
     link.parent.mkdir()
     link.symlink_to(map_file)
@@ -372,7 +373,7 @@ def test_a_link_to_a_map_that_is_being_written_shows_all_of_it(
 
 
 def test_what_is_written_together_is_there_together_or_not_at_all(tmp_path: Path, keyframes: list[Keyframe]) -> None:
-    """An error within takes back what was written before it, and what comes after the block stands by itself."""
+    """An error within the block reverts what was written before it. What follows the block is independent of it."""
     with MapStore.create(tmp_path / "map") as store:
         store.begin_session()
         for node, keyframe in enumerate(keyframes[:3]):

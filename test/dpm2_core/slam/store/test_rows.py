@@ -24,7 +24,7 @@ from test.helpers.maps import FIX, GEOREFERENCE, change, execute
 
 def test_descriptors_of_a_tilted_lidar_come_back_with_where_up_is(noise: np.random.Generator) -> None:
     made = Descriptors.of(noise.normal(size=(9, 3)).astype("f4"), noise.normal(size=(9, 8)))
-    up = np.array([0.6, 0, -0.8], "f4")  # of one that hangs
+    up = np.array([0.6, 0, -0.8], "f4")  # of a LiDAR that hangs upside down
     for axis in (None, noise.normal(size=(9, 2)).astype("f4")):
         packed = pack_descriptors(replace(made, axis=axis, up=up))
         back = unpack_descriptors(packed)
@@ -116,7 +116,7 @@ def test_hostile_fixes_are_found_and_left_out(map_file: Path, tmp_path: Path, ta
 @pytest.mark.parametrize("column", ["id", "session", "lender"])
 @pytest.mark.parametrize("number", [2**63 - 1, 2**31, -1])
 def test_numbers_after_which_none_comes_are_found_and_left_out(map_file: Path, column: str, number: int) -> None:
-    """The next drive would count on from there."""
+    """The next drive would continue the numbers from there."""
     names = schema.CONTENT["keyframes"]
     with closing(sqlite3.connect(map_file)) as db, db:
         row = dict(
@@ -140,7 +140,8 @@ def test_rows_before_the_first_are_found(map_file: Path) -> None:
 
 
 def test_damage_within_descriptors_is_found_when_they_are_read(map_file: Path) -> None:
-    """One bit, of which SQLite knows nothing: they were others then, and copies of the map were sound with them."""
+    """One bit, which SQLite does not notice. Previously, the descriptors were different then, and copies of the map
+    with them were valid."""
     with closing(sqlite3.connect(map_file)) as db, db:
         node, packed = db.execute("SELECT node, descriptors FROM payloads WHERE descriptors NOT NULL").fetchone()
         wrong = packed[:-40] + bytes([packed[-40] ^ 1]) + packed[-39:]

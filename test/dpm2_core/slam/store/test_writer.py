@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map file that catches up is sound after each of its transactions: the disk may be full again before the next."""
+"""A map file that catches up is valid after each of its transactions: the disk may be full again before the next
+one."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ WRITTEN, WAITING = 4, 25
 def test_a_cloud_stays_in_the_file_until_that_is_there_for_which_it_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """1 borrows from 0. Of the keyframes that wait the last one borrows there, too, by which 1 goes, and 2, whose loop
-    waited for that one's."""
+    """1 borrows from 0. The last of the waiting keyframes borrows there, too, so that the cloud of 1 is given up. So is
+    that of 2, which borrows there later, because its loop waited for that of the last one."""
     path, room = tmp_path / "a.dpm2map", [100]
     write = MapStore.write
 
@@ -62,7 +63,7 @@ def test_a_cloud_stays_in_the_file_until_that_is_there_for_which_it_is_given_up(
             add(node)
             sync()
         add(len(keyframes) - 1, 0)  # the place of 1 as it was last seen
-        add(2, 0)  # whose loop waited
+        add(2, 0)  # its loop waited
         sync()
         assert "in memory only" in writer.problem
         room[0] = 1
