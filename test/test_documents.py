@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What documents say was measured is what the records in benchmarks/ say; the modules that they name exist."""
+"""Measured figures in the documents are those of the records in benchmarks/, and the modules that they name exist."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_the_figures_of_loops_and_of_the_solver_are_those_of_the_records() -> No
 
 
 def test_bold_is_what_is_best() -> None:
-    """Of each drive and figure, and nothing else: the reader looks at what is bold."""
+    """The best value of each drive and figure is bold, and nothing else, because readers look at bold figures."""
     heading = "| drive | method | RPE m | RPE deg | ATE m | t_err % | drift % | frames/s | CPU ms per frame |"
     drives: dict[str, list[list[str]]] = {}
     for cells in rows(MEASURED, heading):
@@ -205,7 +205,8 @@ def test_what_the_camera_adds_to_the_descriptors_is_said() -> None:
 
 @pytest.mark.parametrize("path", ["README.md", "CONTRIBUTING.md", "Makefile", *sorted(p.name for p in DOCS)])
 def test_modules_that_are_named_exist(path: str) -> None:
-    """With a folder: there, from the root, the core or the nodes; without: somewhere. NAME stands for any."""
+    """A name with a folder must exist there, relative to the root, the core or the nodes; one without, anywhere. NAME
+    stands for any name."""
     file = next(f for f in (ROOT / path, ROOT / "docs" / path) if f.is_file())
     names = re.findall(r"(?<![\w/.])((?:\w+/)*\w+\.py)\b", file.read_text(encoding="utf-8"))
     folders = (ROOT, ROOT / "dpm2_core", ROOT / "dpm2_ros")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The direction of imports, lazy ones included, as pyproject.toml gives it to import-linter."""
+"""Direction of imports, including lazy ones, as pyproject.toml defines it for import-linter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_imports_run_one_way_and_in_no_circle() -> None:
-    """Every arrow against the layers, and every circle between siblings, is named in the output."""
+    """Every import against the layers, and every cycle between siblings, is named in the output."""
     program = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(

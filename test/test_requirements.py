@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the code imports is what setup.py declares, and what belongs to an extra is imported only where it is needed."""
+"""setup.py declares exactly what the code imports, and packages of an extra are imported only where they are needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-WITH_ANOTHER_WAY = {"kiss_icp", "pypose", "small_gicp"}  # a benchmark says that there is nothing to compare with
+WITH_ANOTHER_WAY = {"kiss_icp", "pypose", "small_gicp"}  # optional: a benchmark reports that they are missing
 WITHOUT_DEPENDENCIES = {"ouster"}  # pip install --no-deps: its dependencies contradict the base install's
 FILES = sorted(
     path
@@ -56,12 +56,12 @@ def _distributions() -> dict[str, list[str]]:
 
 
 def _distribution(module: str) -> set[str]:
-    """The distributions that an import may come from; those that are not installed have its name."""
+    """Distributions that an import may come from; if not installed, the module's name."""
     return {_normal(name) for name in [*_distributions().get(module, []), module]}
 
 
 def _imports(tree: ast.AST, extra: str | None = None, inside: bool = False) -> Iterator[tuple[str, str | None, bool]]:
-    """Third-party top-level modules, the extra of the `with needs(...)` around, and whether in a function."""
+    """Third-party top-level modules, the extra of the surrounding `with needs(...)`, and whether within a function."""
     for node in ast.iter_child_nodes(tree):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -84,7 +84,8 @@ def _imports(tree: ast.AST, extra: str | None = None, inside: bool = False) -> I
 
 
 def _of_ros(module: str) -> bool:
-    """Comes with ROS 2: as a wheel, or as a package that package.xml declares or its generators bring."""
+    """Whether a module comes with ROS 2: as a wheel, or as a package that package.xml declares or its generators
+    provide."""
     depends = {element.text for element in ET.parse(ROOT / "package.xml").getroot().findall("exec_depend")}
     return module in depends or any(name.startswith("ros-") for name in _distributions().get(module, []))
 
@@ -110,7 +111,7 @@ def test_every_import_is_declared_where_it_is_needed(declared: dict[str, list[Re
             elif extra != owner and module not in WITH_ANOTHER_WAY:
                 wrong.append(f"{where} of the extra {owner} is imported as of {extra}")
     assert not wrong, "\n".join(wrong)
-    assert {"numpy", "annotated_types", "contourpy", "matplotlib", "laspy", "rclpy"} <= seen  # the scan sees them
+    assert {"numpy", "annotated_types", "contourpy", "matplotlib", "laspy", "rclpy"} <= seen  # the scan finds them
 
 
 @pytest.mark.slow
@@ -124,7 +125,7 @@ def test_what_is_declared_for_the_base_install_is_imported(declared: dict[str, l
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 def test_a_machine_is_asked_only_for_what_exists_for_it(declared: dict[str, list[Requirement]], machine: str) -> None:
-    """Looked up in the package index: embreex and ros-rclpy have no wheels for aarch64."""
+    """Checked in the package index: embreex and ros-rclpy have no wheels for aarch64."""
     environment = {"platform_machine": machine, "python_version": "3.12", "sys_platform": "linux"}
     requested = {
         _normal(r.name): str(r.specifier)
@@ -141,7 +142,8 @@ def test_what_make_demo_and_make_test_install_has_their_extras() -> None:
 
 
 def test_make_dist_check_installs_every_extra_of_a_user(declared: dict[str, list[Requirement]]) -> None:
-    """What it leaves out its help says: a program to compare with, what makes a release, and a sum of the others."""
+    """Its help names what it leaves out: programs to compare with, release tools, and the extra that combines
+    others."""
     extras = r"^dist-check:.* every extra but (.*)\n\t.*tools\.check_dist dist (.*)$"
     ((left_out, installed),) = re.findall(extras, (ROOT / "Makefile").read_text(), re.M)
     assert set(re.findall(r"\w+", left_out.replace(" and ", " "))) == {"peers", "release", "dev"}

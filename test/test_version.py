@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One version: that of dpm2_core/_version.py is what everybody who asks is given."""
+"""One version: every source reports that of dpm2_core/_version.py."""
 
 from __future__ import annotations
 

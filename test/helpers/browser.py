@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real browser for the pages that are written."""
+"""A real browser for the pages that dpm2 writes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tools.browser import SOFTWARE, chromium
 
 @contextmanager
 def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[Any, list[str]]]:
-    """A page in headless Chromium without a network, and what its console says; skips where there is no browser."""
+    """A page in headless Chromium without a network, and its console output. Skips the test if there is no browser."""
     api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install '.[test]'")
     program = chromium()
     if program is None:
@@ -27,7 +27,7 @@ def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[An
         try:
             context = browser.new_context(viewport={"width": width, "height": height}, offline=True)
             page = context.new_page()
-            page.set_default_timeout(120_000)  # software rendering beside other work
+            page.set_default_timeout(120_000)  # software rendering, next to other work
             page.on("console", lambda message: said.append(f"{message.type}: {message.text}"))
             page.on("pageerror", lambda error: said.append(f"error: {error}"))
             page.goto(path.as_uri())
@@ -37,7 +37,7 @@ def opened(path: Path, width: int = 800, height: int = 600) -> Iterator[tuple[An
 
 
 def wait(page: Any, expression: str, seconds: float = 120.0) -> None:
-    """Until an expression of JavaScript holds; `wait_for_function` evaluates a string, which our pages forbid."""
+    """Wait until a JavaScript expression is true. `wait_for_function` evaluates a string, which our pages forbid."""
     end = time.monotonic() + seconds
     while not page.evaluate(expression):
         assert time.monotonic() < end, f"waited {seconds} s for {expression}"

@@ -19,7 +19,7 @@ from dpm2_core.cli import main
 
 
 class Done(NamedTuple):
-    """Exit code and what was printed."""
+    """Exit code and output."""
 
     returncode: int
     stdout: str
@@ -35,14 +35,14 @@ def dpm2(*arguments: object) -> Done:
 
 
 def succeeded(*arguments: object) -> Done:
-    """The same, which must end well."""
+    """Run the command, which must succeed."""
     done = dpm2(*arguments)
     assert done.returncode == 0, done.stderr
     return done
 
 
 def refused(*arguments: object) -> str:
-    """What `dpm2` says of a request that cannot be: one line, and exit code 2."""
+    """Error message of `dpm2` for an invalid request: one line, with exit code 2."""
     done = dpm2(*arguments)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done
     assert done.stderr.startswith("dpm2: ")
@@ -56,8 +56,9 @@ def dpm2_process(*arguments: object, **options: object) -> subprocess.CompletedP
 
 @contextmanager
 def started(*arguments: object, until: Callable[[], object] = lambda: True) -> Iterator[subprocess.Popen[str]]:
-    """The same, when it has come so far, to be interrupted; it ends with this."""
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may have it ignored
+    """Start the command in its own process and wait for `until`, for example to interrupt it. It is killed at the end
+    of the block."""
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may ignore it
     with subprocess.Popen(_command(arguments), stderr=subprocess.PIPE, text=True, preexec_fn=listen) as process:
         try:
             while not until():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A corridor without end: the points say nothing of the way along it, the paint on its walls does."""
+"""An endless corridor: the points do not constrain the position along it, but the paint on its walls does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dpm2_core.frame import R_AHEAD, Array, Camera, Frame, Image
 from dpm2_core.geometry import se3
 
 HALF, HEIGHT = 4.0, 1.8  # m: from the sensor to the walls, and to floor and ceiling
-AHEAD = 14.0  # m, the truck
+AHEAD = 14.0  # m, to the truck
 T_LIDAR_CAM = se3.make(R_AHEAD, np.zeros(3))
 CAMERA = Camera(np.array([[300, 0, 319.5], [0, 300, 119.5], [0, 0, 1.0]]), T_LIDAR_CAM, (640, 240))
 Paint = Callable[[Array], Array]
@@ -34,7 +34,7 @@ def random_paint(seed: int = 0) -> Paint:
 
 
 def stripes(points: Array) -> Array:
-    """The same every 2 m."""
+    """Paint that repeats every 2 m."""
     return 128 + 100 * np.sign(np.sin(np.pi * points[:, 0]))
 
 
@@ -44,7 +44,8 @@ def with_truck(paint: Paint, x: float) -> Paint:
 
 
 def hits(rays: Array, x: float, truck: bool) -> Array:
-    """Where rays (N, 3) from (x, 0, 0) meet walls, floor or ceiling, or the truck, (N, 3) in the corridor."""
+    """Intersections (N, 3) of rays (N, 3) from (x, 0, 0) with walls, floor or ceiling, or the truck, in the
+    corridor."""
     with np.errstate(divide="ignore"):
         way = np.minimum(HALF / np.abs(rays[:, 1]), HEIGHT / np.abs(rays[:, 2]))
         back = AHEAD / rays[:, 0]
@@ -62,16 +63,17 @@ def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0, truck: bool 
 
 
 def with_intensities(one: Frame, x: float, paint: Paint) -> Frame:
-    """The same scan from `x` m, whose points are as bright as the paint."""
+    """The same scan from `x` m, with the brightness of the paint as intensities."""
     there = one.points[:, :3].astype(np.float64)
-    there[:, 1:] = np.clip(there[:, 1:], [-HALF, -HEIGHT], [HALF, HEIGHT])  # the noise of the ranges
+    there[:, 1:] = np.clip(there[:, 1:], [-HALF, -HEIGHT], [HALF, HEIGHT])  # removes the range noise
     there[:, 0] += x
     brightness = paint(there) / 255
     return replace(one, points=np.c_[one.points[:, :3], brightness].astype(np.float32))
 
 
 def frame(x: float, paint: Paint, index: int = 0, gain: float = 1.0, truck: bool = False) -> Frame:
-    """Scan and image from `x` m along the corridor; `gain` is the exposure; with a truck that drives ahead, or not."""
+    """Scan and image from `x` m along the corridor, optionally with a truck that drives ahead; `gain` is the
+    exposure."""
     noise = np.random.default_rng(index)
     azimuth, elevation = noise.uniform(-np.pi, np.pi, 20_000), noise.uniform(-0.4, 0.4, 20_000)
     rays = np.c_[np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]

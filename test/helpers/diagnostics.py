@@ -9,16 +9,16 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 
 def figures(status: DiagnosticStatus) -> dict[str, str]:
-    """Its values by their keys."""
+    """Values of a status by their keys."""
     return {value.key: value.value for value in status.values}
 
 
 def having(**expected: object) -> Callable[[DiagnosticStatus], bool]:
-    """Whether a status has these figures."""
+    """Condition: the status has these values."""
     wanted = {key: str(value) for key, value in expected.items()}
     return lambda status: wanted.items() <= figures(status).items()
 
 
 def saying(text: str) -> Callable[[DiagnosticStatus], bool]:
-    """Whether a status has that in its message."""
+    """Condition: the message of the status contains `text`."""
     return lambda status: text in status.message

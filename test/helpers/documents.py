@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What documents say, and the records in benchmarks/ that it is compared with."""
+"""Text of the documents, and the records in benchmarks/ that it is compared with."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def record(name: str) -> Any:
-    """What a file in benchmarks/ holds."""
+    """Contents of a JSON file in benchmarks/."""
     return json.loads((ROOT / "benchmarks" / name).read_text(encoding="utf-8"))
 
 
 def text(path: str) -> str:
-    """A document in one line."""
+    """Text of a document in one line."""
     return " ".join((ROOT / path).read_text(encoding="utf-8").split())
 
 
@@ -34,6 +34,6 @@ def rows(path: str, heading: str) -> Iterator[list[str]]:
 
 
 def equals(written: str, true: float) -> bool:
-    """Whether a figure in a text is the true one, rounded to as many digits."""
+    """Whether a figure in a text is the true one, rounded to the same number of digits."""
     digits = -int(Decimal(written).as_tuple().exponent)
     return abs(float(written) - true) <= 0.5001 * 10.0**-digits

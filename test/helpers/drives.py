@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives through the synthetic city, in memory and as the start of a recording; and what the odometry makes of one."""
+"""Drives through the synthetic city, in memory and as the start of a recording, and their odometry."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Drive = tuple[list[Frame], Array]
 
 
 class InMemory(IndexedSource):
-    """A drive of these frames."""
+    """A source of these frames."""
 
     def __init__(self, frames: list[Frame]) -> None:
         super().__init__("memory", len(frames))
@@ -36,7 +36,7 @@ class InMemory(IndexedSource):
 
 @cache
 def street(preset: PresetName, seed: int, length: float = 160.0) -> World:
-    """A straight road of so many meters; building one takes seconds."""
+    """A straight road of `length` m. Building one takes seconds."""
     return build_world("straight", preset, seed=seed, length=length)
 
 
@@ -46,7 +46,7 @@ def straight(preset: PresetName) -> World:
 
 
 def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start: float = 2.0) -> Drive:
-    """A drive at 10 Hz, from `start` s of the way on."""
+    """A drive at 10 Hz that starts `start` s after the beginning of the world's drive."""
     world = straight(preset)
     lidar = Lidar(LidarConfig(columns=1024))
     rng = np.random.default_rng(0)
@@ -63,20 +63,20 @@ def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start:
 
 
 def track(frames: Iterable[Frame], **settings: object) -> list[OdometryResult]:
-    """The odometry of each; `settings`: those of the SLAM that are not as by default."""
+    """Odometry results of the frames; `settings` of the SLAM that differ from the default."""
     odometry = make_odometry(SlamSettings.model_validate(settings))
     return [odometry.process(frame) for frame in frames]
 
 
 def off(tracked: Sequence[OdometryResult], poses: Array) -> Array:
-    """(N,) m from the true position relative to the first."""
+    """Errors (N,) of the positions relative to the first, m."""
     T_odom_lidar = np.array([t.T_odom_lidar for t in tracked])
     T = se3.inverse(se3.inverse(poses[0]) @ poses) @ se3.inverse(T_odom_lidar[0]) @ T_odom_lidar
     return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
 
 
 def first_scans(recording: Path, count: int, out: Path) -> Path:
-    """The first scans of a simulated recording without images as one of its own, in `out`; scans are links."""
+    """The first scans of a simulated recording without images, as a recording of its own in `out`. Scans are links."""
     for file in sorted(path for path in recording.rglob("*") if path.is_file()):
         to = out / file.relative_to(recording)
         to.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment has written."""
+"""Output of an experiment."""
 
 from __future__ import annotations
 

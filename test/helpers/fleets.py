@@ -17,7 +17,7 @@ from .maps import FIRM, SESSION, stored
 
 
 def drive_map(poses: Array, seed: int) -> MapData:
-    """The map of a drive whose odometry has drifted; it stands in a frame of its own."""
+    """Map of a drive whose odometry has drifted, in a frame of its own."""
     rng = np.random.default_rng(seed)
     keyframes = [Keyframe(i, i, i, np.eye(4), NO_POINTS, session=1) for i in range(len(poses))]
     edges, own = [], [se3.exp(rng.normal(size=6) * [0, 0, 1, 50, 50, 0])]
@@ -30,10 +30,11 @@ def drive_map(poses: Array, seed: int) -> MapData:
 
 
 def fleet_maps(count: int, turn: float = 0.01) -> tuple[dict[str, Array], dict[str, MapData], list[Join]]:
-    """Drives along one way, each sharing its last 20 keyframes with the next; 10 true joins each, and a false one.
+    """Drives along one trajectory, each sharing its last 20 keyframes with the next. There are 10 true joins for each
+    pair, and a false one.
 
     Args:
-        turn: rad a keyframe.
+        turn: rad per keyframe.
     """
     way = se3.exp(np.arange(40 * count + 40)[:, None] * np.array([0, 0, turn, 2.0, 0, 0]))
     names = [f"d{number}" for number in range(count)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in this process, beside a node of the test, over real DDS."""
+"""Nodes in this process, next to a node of the test, over real DDS."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tools.replay import ros_environment, start
 
 
 class Harness:
-    """Nodes under test and a tester's node, spun by one thread."""
+    """Nodes under test and a tester node, spun by one thread."""
 
     def __init__(self, parameters: Sequence[str], domain: int, namespace: str) -> None:
-        # Without the network, which takes most of the time, unless a test says otherwise: how a node handles scans and
-        # keyframes is the same. Drives through nodes as they are by default: test_replay.py and test_lockstep.py.
+        # By default without the network, which takes most of the time: how a node handles scans and keyframes is the
+        # same. Drives through nodes with their default settings: test_replay.py and test_lockstep.py.
         quick = ("ros.map_directory:=''", "slam.registration:=geometric", "slam.loops.descriptors:=false")
         pairs = [part for pair in (*quick, *parameters) for part in ("-p", pair)]
         remap = ["-r", f"__ns:={namespace}"] if namespace else []
@@ -46,10 +46,10 @@ class Harness:
 
     def _spin(self) -> None:
         while not self._ended.is_set():
-            self._executor.spin_once(timeout_sec=1.0)  # what is added and the end wake it
+            self._executor.spin_once(timeout_sec=1.0)  # added nodes and the end wake it up
 
     def add(self, node: Node) -> Any:
-        """Spin and in the end close a node."""
+        """Spin a node, and close it at the end."""
         self._executor.add_node(node)
         self._executor.wake()
         self._closing.append(node)
@@ -67,20 +67,20 @@ class Harness:
         self._between_waits(end, f"the end of {node.get_name()}")
 
     def start(self, name: str, arguments: Sequence[str], log: Path, **variables: str) -> subprocess.Popen[bytes]:
-        """One of the executables as a process that sees these nodes, and in the end is killed."""
+        """Start an executable as a process that communicates with these nodes. It is killed at the end."""
         environment = ros_environment(self.node.context.get_domain_id()) | variables
         self._processes.append(start(name, arguments, environment, log))
         return self._processes[-1]
 
     def hear(self, kind: type, topic: str, qos: Any = 100) -> list[Any]:
-        """The messages of a topic, as they come."""
+        """Subscribe to a topic; the list receives the messages as they arrive."""
         messages = self.received.setdefault(topic, [])
         self.node.create_subscription(kind, topic, messages.append, qos)
         self._executor.wake()
         return messages
 
     def found_by(self, node: Node, topic: str) -> bool:
-        """Whether a node has found the tester's subscription; it may have one of its own."""
+        """Whether a node has discovered the tester's subscription; it may have its own subscription."""
         return any(one.node_name == self.node.get_name() for one in node.get_subscriptions_info_by_topic(topic))
 
     def publisher(self, kind: type, topic: str, reliable: bool = True, latched: bool = False) -> Any:
@@ -92,11 +92,11 @@ class Harness:
         )
 
     def call(self, kind: type, name: str, **fields: Any) -> Any:
-        """The reply of a node's service, of which the request goes out once: it need not be one that may come twice.
+        """Call a node's service and return the reply. The request is sent once: it need not be idempotent.
 
-        Fast DDS drops a reply where the server has not found the client's reader within 0.1 s, as may be on a busy
-        machine, and does not tell the client. Readers are announced in the order in which they were made: once the node
-        has replied to one that was made later, it knows the first.
+        Fast DDS drops a reply if the server has not discovered the client's reader within 0.1 s, which may happen on a
+        busy machine. The client is not informed. Readers are announced in the order of their creation: once the node
+        has replied to a later one, it has discovered the first one.
         """
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
@@ -105,7 +105,7 @@ class Harness:
         return self._reply(self._clients[name], kind.Request(**fields))
 
     def _reply(self, client: Any, request: Any, again: float = float("inf")) -> Any:
-        """`again`: s without a reply after which the request is sent once more."""
+        """`again`: the request is repeated after this time without a reply, s."""
         self.wait(client.service_is_ready, client.srv_name)
         sent, futures = 0.0, list[Any]()
 
@@ -121,19 +121,20 @@ class Harness:
 
     @property
     def diagnostics(self) -> list[DiagnosticArray]:
-        """What has come of /diagnostics, since this was asked for first."""
+        """Messages of /diagnostics since the first use of this property."""
         topic = "/diagnostics"
         return self.received[topic] if topic in self.received else self.hear(DiagnosticArray, topic)
 
     def status(
         self, part: str, condition: Callable[[DiagnosticStatus], Any] = bool, since: int | None = None
     ) -> DiagnosticStatus:
-        """The first status for which something holds, once there is one.
+        """The first status that fulfills the condition; waits for it.
 
-        A message may tell of the time before what a test has just done: the condition says what is waited for.
+        A message may describe the time before the last step of a test: the condition must express what the test waits
+        for.
 
         Args:
-            part: how its name ends. since: number of the first message that counts; None: the last that has come.
+            part: end of the status's name. since: number of the first message that counts; None: the last one received.
         """
         heard = self.diagnostics
         begin = max(len(heard) - 1, 0) if since is None else since
@@ -155,9 +156,9 @@ class Harness:
         return found[0]
 
     def find(self, name: str) -> None:
-        """Until a node elsewhere has found all that is heard here; what it sends before that is lost.
+        """Wait until a node in another process has discovered all subscriptions here; its earlier messages are lost.
 
-        A reader that was announced after the others has its diagnostics.
+        To check this, a reader that was announced after the others must receive its diagnostics.
         """
         told: list[str] = []
         add = lambda message: told.extend(status.name for status in message.status)  # noqa: E731
@@ -167,14 +168,15 @@ class Harness:
         self.destroy(reader)
 
     def destroy(self, entity: Any) -> None:
-        """A publisher or subscription of the tester."""
+        """Destroy a publisher or subscription of the tester."""
         is_publisher = entity in list(self.node.publishers)
         destroy = self.node.destroy_publisher if is_publisher else self.node.destroy_subscription
         self._between_waits(partial(destroy, entity), "the end of a publisher or subscription")
 
     def _between_waits(self, work: Callable[[], Any], what: str) -> None:
-        """In the thread that spins, between two of its waits: rclpy raises in that thread where it is about to wait for
-        something that another thread destroys, and no callback is to meet a node that another thread is closing."""
+        """Do the work in the spinning thread, between two of its waits. rclpy raises in this thread if it is about to
+        wait for an entity that another thread destroys. And no callback may use a node that another thread is
+        closing."""
         done = Future[Any]()
 
         def run() -> None:
@@ -189,18 +191,18 @@ class Harness:
 
     @staticmethod
     def wait(condition: Callable[[], Any], what: str, timeout: float = 90.0) -> None:
-        """Until it holds; fails saying what was waited for."""
+        """Wait until the condition is true. Fails with `what` in the message."""
         end = time.monotonic() + timeout
         while True:
             began = time.thread_time()
             if condition():
                 return
             assert time.monotonic() < end, f"waited {timeout} s for {what}"
-            # A condition that reads a map leaves the processors to what is waited for.
+            # A condition that reads a map must leave processor time to the process that it waits for.
             time.sleep(max(0.01, 5 * (time.thread_time() - began)))
 
     def close(self) -> None:
-        """Kill the processes, end the thread that spins, close the nodes under test, as programs do, and the rest."""
+        """Kill the processes, end the spinning thread, close the nodes under test as programs do, and then the rest."""
         for process in self._processes:
             process.kill()
             process.wait()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small trees in the layouts of published data sets, made of a simulated drive."""
+"""Small folders in the layouts of published data sets, made from a simulated drive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DRIVE_360 = "2013_05_28_drive_{}_sync"
 
 
 def kitti_odometry(recording: Path, root: Path, names: tuple[str, ...], count: int, images: bool = False) -> Path:
-    """KITTI odometry: the first scans of a simulated recording under each of these names; images of noise."""
+    """KITTI odometry: the first scans of a simulated recording under each of these names; images are noise."""
     one = first_scans(recording, count, root / "one")
     (root / "sequences").mkdir()
     (root / "poses").mkdir()
@@ -41,7 +41,7 @@ def kitti_odometry(recording: Path, root: Path, names: tuple[str, ...], count: i
 
 
 def kitti_360(recording: Path, root: Path, names: tuple[str, ...], count: int) -> Path:
-    """KITTI-360 without images: drives of these numbers; the first frame has no pose, as in the original."""
+    """KITTI-360 without images: drives with these numbers. The first frame has no pose, as in the original."""
     source = KittiSource(recording)
     assert source.poses is not None
     T_lidar_cam = se3.make(R_AHEAD, [0.8, 0.3, -0.2])

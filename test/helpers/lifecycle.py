@@ -10,19 +10,19 @@ from lifecycle_msgs.srv import ChangeState, GetState
 
 
 class Manager:
-    """What a lifecycle manager does with a node, over its services."""
+    """Requests of a lifecycle manager to a node, over its services."""
 
     def __init__(self, harness: Any, name: str) -> None:
         self._harness, self._name = harness, name
 
     def change(self, *transitions: int) -> bool:
-        """Whether all of them were made."""
+        """Request the transitions. Returns whether all of them succeeded."""
         made = (Transition(id=transition) for transition in transitions)
         return all(self._call(ChangeState, "change_state", transition=one).success for one in made)
 
     @property
     def state(self) -> str:
-        """Its label."""
+        """Label of the node's state."""
         return str(self._call(GetState, "get_state").current_state.label)
 
     def _call(self, kind: type, service: str, **fields: Any) -> Any:

@@ -27,7 +27,7 @@ uint8 line
 
 @cache
 def livox_store(ros1: bool = False) -> Any:
-    """A type store that knows the message."""
+    """A type store that contains the message."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
@@ -37,7 +37,7 @@ def livox_store(ros1: bool = False) -> Any:
 
 
 def custom_object(stamp: int, points: np.ndarray, seconds: np.ndarray, frame: str, ros1: bool) -> Any:
-    """The message of points (N, 3) m at (N,) s after the stamp (ns)."""
+    """Message of points (N, 3), m, at (N,) s after the stamp (ns)."""
     types = livox_store(ros1).types
     time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
     head = {"seq": 0} if ros1 else {}
@@ -53,7 +53,7 @@ def custom_object(stamp: int, points: np.ndarray, seconds: np.ndarray, frame: st
 def custom_message(
     stamp: int, points: np.ndarray, seconds: np.ndarray, frame: str = "livox", ros1: bool = False
 ) -> bytes:
-    """The same, as it is on the wire: CDR, or as ROS 1 has it."""
+    """The same message serialized: CDR, or the format of ROS 1."""
     store, message = livox_store(ros1), custom_object(stamp, points, seconds, frame, ros1)
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     return bytes(serialize(message, "livox_ros_driver2/msg/CustomMsg"))

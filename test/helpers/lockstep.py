@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag, played here, and a node that makes frames of it as slam_node does, and notes them."""
+"""A bag player in this process, and a node that makes frames from it as slam_node does, and records them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OPTIONS = Options(
 
 
 def play(bag: Path, lockstep: bool = True, **options: Any) -> None:
-    """In this process, to its end."""
+    """Play a bag in this process, to its end."""
     player = rclpy.create_node("bag_player", use_global_arguments=False)
     try:
         BagPlayer(player, replace(OPTIONS, bag=bag, lockstep=lockstep, **options)).play()
@@ -40,7 +40,8 @@ class Listener(GuardedNode):
     """Makes frames as slam_node does, and publishes an odometry for each.
 
     Args:
-        second: topic of a second LiDAR. gnss: of fixes. busy: s before it looks at a cloud, as beside other work.
+        second: topic of a second LiDAR. gnss: topic of fixes. busy: delay before a cloud is processed, s, as under
+    load.
     """
 
     def __init__(self, second: str = "", gnss: str = "", busy: float = 0.0, **options: Any) -> None:
@@ -72,7 +73,7 @@ class Listener(GuardedNode):
 
 
 def contents(frame: Frame) -> list[Any]:
-    """All that is in it, bit for bit."""
+    """All contents of a frame, bit for bit."""
     images = [
         (i.pixels.tobytes(), i.camera.K.tobytes(), i.camera.T_lidar_cam.tobytes(), i.camera.size, i.camera.distortion)
         for i in frame.images

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A search for loops that finds what it is told: the search itself is tested elsewhere."""
+"""A loop search with given results: the search itself is tested elsewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpm2_core.slam.loops.closure import LoopCloser
 
 
 class KnownLoops(LoopCloser):
-    """Finds `found` of the newest node."""
+    """Returns `found` for the newest node."""
 
     channels = None
 

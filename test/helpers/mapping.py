@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of mapper_node send to it, and see of its map; `mapper` is the fixture of test/dpm2_ros."""
+"""Messages to mapper_node, and the state of its map; `mapper` is the fixture of test/dpm2_ros."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ S, OTHER = "5f3a9c01", "00000bad"  # sessions
 
 
 class Wires:
-    """Publishers of a robot's keyframes: of their poses, of what they saw, of their clouds."""
+    """Publishers of a robot's keyframes: of their poses, payloads and clouds."""
 
     def __init__(self, harness: Any, namespace: str = "") -> None:
         kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))
@@ -34,11 +34,11 @@ class Wires:
         self.pose, _, self.cloud = self.all
 
     def wait(self) -> None:
-        """For whoever makes the map."""
+        """Wait for the subscriptions of the mapper."""
         self._harness.wait(lambda: all(wire.get_subscription_count() for wire in self.all), "the mapper's ears")
 
     def send(self, keyframe: Keyframe, name: str, weights: str = "", cloud_first: bool = False) -> None:
-        """Its three messages."""
+        """Publish the three messages of a keyframe."""
         pose = edge_to_msg(keyframe.T_odom_kf, np.eye(6) * 1e-4, keyframe.stamp, "odom", name)
         parts = list(zip(self.all, (pose, *payload_to_msgs(keyframe, name, weights)), strict=True))
         for wire, part in reversed(parts) if cloud_first else parts:
@@ -46,17 +46,17 @@ class Wires:
 
 
 def core(mapper: Any) -> Mapper:
-    """What makes the map in the node."""
+    """The node's `Mapper`."""
     return mapper.mapper.slam.mapper
 
 
 def keyframes(mapper: Any) -> int:
-    """In the map so far."""
+    """Number of keyframes in the map so far."""
     return len(core(mapper).keyframes)
 
 
 def mapped(mapper: Any, count: int) -> None:
-    """Until so many keyframes are in the map, and all that has to do with them is done."""
+    """Wait until `count` keyframes are in the map, and all their processing is done."""
     mapper.status("mapper_node: mapper", having(keyframes=count, waiting=0))
 
 
@@ -65,7 +65,8 @@ def points(seed: int) -> np.ndarray:
 
 
 def placed(mapper: Any) -> tuple[Callable[..., None], list[TFMessage]]:
-    """What publishes an odometry at its origin, of a stamp (ns) and in a frame, and the transforms that come of it."""
+    """A function that publishes an odometry at its origin with a stamp (ns) and a frame, and the transforms
+    received."""
     odometry, heard = mapper.publisher(Odometry, "/dpm2/odom"), mapper.hear(TFMessage, "/tf")
     mapper.wait(lambda: odometry.get_subscription_count() and mapper.found_by(mapper.mapper, "/tf"), "connections")
 
@@ -76,8 +77,8 @@ def placed(mapper: Any) -> tuple[Callable[..., None], list[TFMessage]]:
 
 
 def taken_in(mapper: Any) -> None:
-    """Until the mapper has heard of every keyframe that was sent: a pose behind theirs has been rejected. What is sent
-    on another topic may come before or after."""
+    """Wait until the mapper has received every keyframe that was sent: a pose sent after them has been rejected.
+    Messages on other topics may arrive before or after."""
     before = sum(mapper.mapper.rejections.values())
     mapper.wires.pose.publish(edge_to_msg(np.eye(4), np.eye(6), 1000, "odom", "no keyframe"))
     mapper.wait(lambda: sum(mapper.mapper.rejections.values()) > before, "the rejection")
@@ -90,7 +91,7 @@ def send_all(mapper: Any, *ids: int, session: str = S, shift: float = 0.0) -> No
 
 
 def rejections(mapper: Any) -> dict[str, int]:
-    """As they are published."""
+    """Rejections as published in the diagnostics."""
     for message in reversed(mapper.diagnostics):
         for status in message.status:
             if status.name == "mapper_node: messages":

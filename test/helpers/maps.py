@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of a ring road and of laps, made without a drive: for what shows, writes or searches maps; what is written into
-map files."""
+"""Maps of a ring road and of laps, made without a drive, for tests that show, write or search maps; contents of map
+files."""
 
 from __future__ import annotations
 
@@ -35,10 +35,11 @@ FIX = Fix(5, np.array([49.0, 8.4, 110.5]), np.diag([4.0, 4, 16]), np.array([0.1,
 
 
 def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -> MapData:
-    """Keyframes around a circle, counterclockwise from its rightmost place; walls of 8 m on both sides of the road.
+    """Map of keyframes around a circle, counterclockwise from its rightmost point, with walls of 8 m on both sides of
+    the road.
 
     Args:
-        points: of each cloud. image: width and height of the thumbnails, which are noise; None: none.
+        points: number per cloud. image: width and height of the thumbnails, which are noise; None: no thumbnails.
     """
     rng = np.random.default_rng(1)
     radius = max(15.0, SPACING * count / (2 * np.pi))
@@ -53,9 +54,9 @@ def ring(count: int, points: int = 2000, image: tuple[int, int] | None = None) -
 
 
 def in_laps(clouds: Sequence[Points], poses: Array, laps: int, seen: Sequence[Descriptors]) -> MapData:
-    """A map of so many laps past the first places, of which the later ones borrow, and past the other places once.
+    """Map of `laps` laps past the first places, in which later laps borrow, and one pass along the other places.
 
-    `poses`: (N, 4, 4) of all keyframes, of which there are fewer clouds (M, 4), and descriptors `seen`, at the first.
+    `poses`: (N, 4, 4) of all keyframes. There are fewer `clouds` (M, 4) and descriptors `seen`, those of the first lap.
     """
     count = len(clouds)
     keyframes = [Keyframe(i, i, i, T, NO_POINTS, None, "", seen[i % count], session=1) for i, T in enumerate(poses)]
@@ -68,7 +69,7 @@ def in_laps(clouds: Sequence[Points], poses: Array, laps: int, seen: Sequence[De
 
 
 def stored(clouds: Iterable[Points], origin: Array | None = None) -> CloudStore:
-    """Keyframe clouds, each (M, 4), seen from where the LiDAR was (3,), m; from the origin where that is not given."""
+    """Store of keyframe clouds, each (M, 4), seen from the LiDAR's position `origin` (3,), m; by default the origin."""
     store = CloudStore()
     for cloud in clouds:
         store.append(pack_cloud(cloud, origin))
@@ -76,12 +77,12 @@ def stored(clouds: Iterable[Points], origin: Array | None = None) -> CloudStore:
 
 
 def change(node: int, keyframe: Keyframe, thumbnail: bytes | None = None) -> Change:
-    """A keyframe that is where it was driven."""
+    """A keyframe at its odometry pose."""
     return Change([(node, keyframe, pack_cloud(keyframe.cloud), thumbnail)], poses={node: keyframe.T_odom_kf})
 
 
 def execute(path: Path, *statements: str | tuple[str, tuple[object, ...]]) -> None:
-    """SQL on a file that is closed."""
+    """Execute SQL on a file that is closed."""
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         for statement in statements:
             connection.execute(*([statement] if isinstance(statement, str) else statement))

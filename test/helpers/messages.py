@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as plain objects: what the decoders are given where no ROS is."""
+"""Messages as plain objects, as input to the decoders without ROS."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ TINY = {
 
 
 def tiny(**changes: dict[str, object]) -> NetworkSettings:
-    """The tiny network with sections changed."""
+    """Settings of the tiny network with changed sections."""
     tree = {key: {**value, **changes.get(key, {})} if isinstance(value, dict) else value for key, value in TINY.items()}
     return settings_from(NetworkSettings, tree)
 

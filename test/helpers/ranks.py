@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of one training step on two places; of two processes each has one of them.
+"""Gradients of one training step on two places; with two processes, each has one of the places.
 
 ranks.py PACKED NETWORK: folder of packed drives, settings of the network as JSON.
 """
@@ -24,7 +24,7 @@ from dpm2_core.network.settings import NetworkSettings
 
 
 def gradients(packed: str, network: NetworkSettings, rank: int = 0, world: int = 1) -> dict[str, Tensor]:
-    """By the names of the parameters; of more than one process, each of which has one of the places, their mean."""
+    """Gradients by parameter name. With several processes, each has one of the places, and the result is the mean."""
     settings = RegistrationTrainingSettings(pairs=2, sets=0)
     torch.manual_seed(0)
     module = RegistrationTraining(network, LossSettings(near=16, own=8))
@@ -40,7 +40,7 @@ def gradients(packed: str, network: NetworkSettings, rank: int = 0, world: int =
 
 
 def main(packed: str, network: str) -> dict[str, Tensor]:
-    """Those of all processes, in each of them."""
+    """Gradients of all processes, in each of them."""
     with process_group() as (rank, world, _):
         return gradients(packed, NetworkSettings.model_validate_json(network), rank, world)
 

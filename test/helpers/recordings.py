@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings and their messages for the tests of bags, and what a source makes of them."""
+"""Recordings and their messages for the tests of bags, and what a source reads from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ Message = tuple[float, str, Any]
 def write_bag(
     folder: Path, kinds: Mapping[str, str], messages: Iterable[tuple[int, str, bytes]], types: Any = None
 ) -> Path:
-    """A recording of serialized messages, each with its log time (ns) and topic; `kinds`: the type of each topic."""
+    """Write a recording of serialized messages, each with its log time (ns) and topic; `kinds`: the type of each
+    topic."""
     types = types or get_typestore(Stores.ROS2_JAZZY)
     with Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}

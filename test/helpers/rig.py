@@ -50,7 +50,7 @@ class Rig:
         self.lidar.publish(message)
 
     def send_and_wait(self, *numbers: int, **changes: Any) -> None:
-        """One after the other, each when the one before has come out."""
+        """Send clouds one by one, each after the odometry of the previous one was received."""
         for n in numbers:
             before = len(self.odom)
             self.send(n, **changes)
@@ -59,25 +59,26 @@ class Rig:
     def status(
         self, part: str, condition: Callable[[DiagnosticStatus], Any], since: int | None = None
     ) -> DiagnosticStatus:
-        """The first for which that holds."""
+        """The first status of a part that fulfills the condition."""
         found: DiagnosticStatus = self.harness.status(f"slam_node: {part}", condition, since)
         return found
 
     def processed(self, count: int) -> DiagnosticStatus:
-        """The status of the odometry once so many clouds have been processed: what comes of a cloud may come before."""
+        """Status of the odometry once `count` clouds have been processed. Other results of a cloud may arrive
+        before."""
         return self.status("odometry", having(processed=count), since=0)
 
     def mapped(self, count: int) -> None:
-        """Until so many keyframes are in the map, and all that has to do with them is done."""
+        """Wait until `count` keyframes are in the map, and all their processing is done."""
         self.status("mapper", having(keyframes=count, waiting=0))
 
     @property
     def keyframes(self) -> int:
-        """In the map of the node."""
+        """Number of keyframes in the map of the node."""
         return len(self.node.slam.mapper.keyframes)
 
     def off(self, pose: Callable[[int], Array]) -> float:
-        """How far the poses that came out are from where they should be, (4, 4) by their number, m at most."""
+        """Largest position error of the published poses, m. `pose`: true pose (4, 4) by number."""
         poses = [transform_matrix(message.pose.pose) for message in self.odom]
         return max(float(np.linalg.norm((T - pose(n))[:3, 3])) for n, T in enumerate(poses))
 
@@ -110,7 +111,7 @@ class Camera:
 
 
 def record_frames(r: Rig) -> list[Any]:
-    """What the odometry is given."""
+    """Frames that the odometry receives from now on."""
     frames: list[Any] = []
     process = r.node.slam.odometry.process
 
@@ -123,7 +124,7 @@ def record_frames(r: Rig) -> list[Any]:
 
 
 def publish_static(r: Rig, parent: str, child: str, T: Any) -> None:
-    """By a publisher of its own, as drivers and robot_state_publisher are."""
+    """Publish a transform with a separate publisher, as drivers and robot_state_publisher do."""
     publisher = r.harness.publisher(TFMessage, "/tf_static", latched=True)
     publisher.publish(TFMessage(transforms=[transform_to_msg(T, 0, parent, child)]))
     r.wait(lambda: child in r.node.calibration.transforms.frames, "/tf_static")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans of a LiDAR with 16 beams in a box with boxes in it, by rays: a furnished room, or a street under the sky."""
+"""Scans of a LiDAR with 16 beams in a box that contains boxes, by ray casting: a furnished room, or a street under the
+sky."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ REACH = 90.0
 
 
 def boxes(low: tuple[float, float], high: tuple[float, float], count: int, size: Array, seed: int = 0) -> Array:
-    """(count, 2, 3) low and high corners of boxes on the floor, 1 m and more off the line y = 0."""
+    """Low and high corners (count, 2, 3) of boxes on the floor, at least 1 m off the line y = 0."""
     rng = np.random.default_rng(seed)
     at = np.column_stack([rng.uniform(low[0], high[0], count), rng.uniform(1.0, high[1], count)])
     at[:, 1] = np.where(rng.random(count) < 0.5, at[:, 1], at[:, 1] * low[1] / high[1] - size[1])
@@ -29,14 +30,14 @@ def boxes(low: tuple[float, float], high: tuple[float, float], count: int, size:
 
 
 def scan(T: Array, hull: Array, things: Array, seed: int) -> Points:
-    """(N, 4) from a pose T_world_lidar (4, 4), or one for each ray, within a hull (2, 3) with things (K, 2, 3) in it;
-    1 cm of noise."""
+    """Scan (N, 4) from a pose T_world_lidar (4, 4), or from one pose per ray, within a hull (2, 3) that contains things
+    (K, 2, 3); 1 cm of noise."""
     return _measured(_distances(T, hull, things), seed)
 
 
 def _distances(T: Array, hull: Array, things: Array) -> Array:
-    """Of each ray."""
-    # (3, N), so that the largest of three is taken of whole rows.
+    """Distance of each ray."""
+    # (3, N), so that the largest of three is taken over whole rows.
     origin = np.atleast_2d(T[..., :3, 3]).T
     rays = np.ascontiguousarray(np.einsum("...ij,...j->...i", T[..., :3, :3], RAYS).T)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -62,31 +63,31 @@ FURNITURE = boxes((-2.3, -1.9), (2.0, 1.5), 6, np.array([0.6, 0.4, 0.9]))
 HALL = np.array([[-3, -2, 0], [3, 2, 2.6]])
 _CORNER = np.array([[[-3, -2, 0], [-2.4, -0.5, 0.8]], [[-1, -2, 0], [0.4, -1.5, 1.9]]])
 BOTH_ENDS = np.concatenate([_CORNER, np.sort(_CORNER * [-1, -1, 1], axis=1)])
-"""Things in the hall, which looks the same from its other end."""
-CABINET = np.array([[[-3, 1.2, 0], [-2.2, 2, 1.2]]])  # by which the ends of the hall are told apart
+"""Objects in the hall, which looks the same from its other end."""
+CABINET = np.array([[[-3, 1.2, 0], [-2.2, 2, 1.2]]])  # distinguishes the ends of the hall
 ROUND = [
     (-1.5, -1, 0), (-0.5, -1, 0), (0.5, -1, 0), (1.5, -1, 0), (1.5, 0, 90), (1.5, 1, 90),
     (1.5, 1, 180), (0.5, 1, 180), (-0.5, 1, 180), (-1.5, 1, 180), (-1.5, 1, 270), (-1.5, 0, 270),
 ]  # fmt: skip
-"""A way round the hall: x and y, m, and heading, degrees."""
+"""Poses around the hall: x and y, m, and heading, degrees."""
 STREET = np.array([[-80, -20, 0], [200, 20, 500.0]])
 HOUSES = boxes((-70, -16), (190, 16), 40, np.array([6, 4, 7.0]), 1)
 
 
 def standing(x: float, y: float, heading: float) -> Array:
-    """(4, 4) of a LiDAR 0.6 m above the floor; the heading in degrees."""
+    """Pose (4, 4) of a LiDAR 0.6 m above the floor; the heading in degrees."""
     return se3.make(se3.rotation(np.array([0, 0, np.radians(heading)])), [x, y, 0.6])
 
 
 def frames(poses: Array, street: bool = False, start: int = 0) -> list[Frame]:
-    """At 10 Hz, from the `start`-th on."""
+    """Frames at 10 Hz, numbered from `start`."""
     hull, things = (STREET, HOUSES) if street else (ROOM, FURNITURE)
     return [Frame((start + i) * 10**8, scan(T, hull, things, start + i), index=start + i) for i, T in enumerate(poses)]
 
 
 def turning(count: int) -> tuple[list[Frame], Array]:
-    """Frames of a robot in the street and their (count, 4, 4) true poses: it stands for 1 s, then drives at 1.5 m/s and
-    swings at up to 100 deg/s, the LiDAR tilted by 0.1 rad. Points have times; an IMU errs as real ones do."""
+    """Frames of a robot in the street, and its (count, 4, 4) true poses. It stands for 1 s, then drives at 1.5 m/s and
+    swings at up to 100 deg/s, with the LiDAR tilted by 0.1 rad. Points have times, and the IMU has realistic errors."""
     since = lambda t: np.maximum(t - 1.5, 0)  # noqa: E731
 
     def poses(t: Array) -> Array:
@@ -110,6 +111,7 @@ def turning(count: int) -> tuple[list[Frame], Array]:
 
 
 def walk(count: int) -> Array:
-    """(count, 4, 4) a circle of 0.7 m about the middle of the room, 0.6 m above the floor, begun at a halt."""
+    """Poses (count, 4, 4) on a circle of 0.7 m around the center of the room, 0.6 m above the floor, starting at
+    rest."""
     angle = np.cumsum(np.minimum(np.arange(count) * 0.01, 0.08))
     return np.array([se3.exp([0, 0, a, 0, 0, 0]) @ se3.make(np.eye(3), [0.7, 0, 0.6]) for a in angle])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud and an image of something that looks like a street."""
+"""A cloud and an image that look like a street."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dpm2_core.geometry import se3
 
 
 def boxes(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
-    """(points, 3) float32 on the ground and on the faces of boxes, 1.7 m below to 8 m above the sensor."""
+    """Points (points, 3) float32 on the ground and on the faces of boxes, 1.7 m below to 8 m above the sensor."""
     ground = np.column_stack([noise.uniform(-40, 40, (points // 2, 2)), np.full(points // 2, -1.7)])
     parts = [ground]
     count = 25
@@ -25,7 +25,7 @@ def boxes(noise: np.random.Generator, points: int = 4000) -> np.ndarray:
 
 
 def make_image(noise: np.random.Generator, size: tuple[int, int] = (128, 64)) -> Image:
-    """A forward-looking camera with a random image, (width, height)."""
+    """Random image of a forward-looking camera; `size` is (width, height)."""
     K = np.array([[60.0, 0, size[0] / 2 - 0.5], [0, 60.0, size[1] / 2 - 0.5], [0, 0, 1]])
     T_lidar_cam = se3.make(R_AHEAD, [0.3, 0.05, -0.1])
     pixels = noise.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training that is stopped on its way."""
+"""Interrupt a training."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dpm2_core.learning import trainer
 
 
 def stopped(train: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train until Ctrl-C comes, right after the first checkpoint."""
+    """Train until Ctrl-C, which is raised right after the first checkpoint."""
     save = trainer.save_checkpoint
 
     def save_and_stop(*arguments: Any) -> None:

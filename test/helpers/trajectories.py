@@ -12,6 +12,6 @@ from dpm2_core.frame import Array
 
 
 def write_indexed(path: Path, poses: Array, numbers: Sequence[int]) -> None:
-    """Poses (N, 4, 4) in KITTI's format, each after the number of its frame."""
+    """Write poses (N, 4, 4) in KITTI's format, each after the number of its frame."""
     rows = np.column_stack([numbers, poses[:, :3].reshape(-1, 12)])
     np.savetxt(path, rows, ["%d"] + ["%.12e"] * 12)
