@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small recordings made on the spot: a KITTI sequence of a few points per scan, and bags of any messages."""
+"""Small generated recordings: a KITTI sequence with a few points per scan, and bags of any messages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Tr: 0 -1 0 0.01 0 0 -1 -0.05 1 0 0 -0.3
 
 @pytest.fixture
 def kitti_folder(tmp_path: Path) -> Callable[..., Path]:
-    """Makes ROOT/sequences/07 and returns it: `numbers` scans of 60 points, images of 40 x 30, a straight drive."""
+    """Creates ROOT/sequences/07 and returns it: `numbers` scans of 60 points, images of 40 x 30, a straight drive."""
 
     def make(numbers: Sequence[int] = range(5), images: bool = True) -> Path:
         folder, rng = tmp_path / "kitti" / "sequences" / "07", np.random.default_rng(0)
@@ -64,7 +64,7 @@ class BagMaker:
         return bag_messages.header(round(stamp * 1e9), frame)
 
     def cloud(self, stamp: float, x: float = 1.0, count: int = 60, frame: str = "velo_link") -> Any:
-        """`count` points whose x says which cloud it is."""
+        """`count` points whose x identifies the cloud."""
         return self.cloud_of(stamp, point_columns(np.full((count, 4), [x, 2, 3, 0.5], np.float32)), frame)
 
     def cloud_of(self, stamp: float, columns: Mapping[str, np.ndarray], frame: str = "velo_link") -> Any:
@@ -72,7 +72,7 @@ class BagMaker:
         return self.new("sensor_msgs/PointCloud2", header=self.header(stamp, frame), **fields)
 
     def image(self, stamp: float, value: int = 0, encoding: str = "mono8", size: tuple[int, int] = (8, 6)) -> Any:
-        """A gray image whose value says which one it is."""
+        """A gray image whose value identifies it."""
         return self.new("sensor_msgs/Image", header=self.header(stamp, "cam"), height=size[1], width=size[0],
                         encoding=encoding, is_bigendian=0, step=size[0],
                         data=np.full(size[0] * size[1], value, np.uint8))  # fmt: skip
@@ -99,8 +99,8 @@ class BagMaker:
         zstd: bool = False,
         compression: str = "STORAGE",
     ) -> Path:
-        """Messages as (log time in s, topic, message or bytes of a cloud); `silent`: (topic, type) without any;
-        `compression`: what `zstd` compresses, STORAGE (the chunks), MESSAGE or FILE."""
+        """Write messages (log time in s, topic, message or bytes of a cloud). `silent`: (topic, type) of topics without
+        messages. `compression`: what `zstd` compresses, STORAGE (the chunks), MESSAGE or FILE."""
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin[plugin])

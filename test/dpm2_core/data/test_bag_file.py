@@ -37,14 +37,14 @@ def test_a_truncated_mcap_gives_what_is_whole(recording: Path, bare: bool) -> No
     mcap(recording).write_bytes(whole[: int(0.9 * len(whole))])
     source = BagSource(mcap(recording) if bare else recording)
     frames = list(source.frames())
-    assert 60 <= len(frames) == len(source) < 100  # a chunk holds 65 of them
+    assert 60 <= len(frames) == len(source) < 100  # a chunk contains 65 of them
     assert [frame.points[0, 0] for frame in frames] == list(range(len(frames)))
     assert all(frame.problem is None and len(frame.points) == 1000 for frame in frames)
     assert f"truncated or never closed (File end magic is invalid.); {len(frames)} messages" in source.notes[0]
 
 
 def test_every_cut_is_survived(bags: Any, tmp_path: Path) -> None:
-    """Wherever a small file is cut: some frames, all of them good, or one clear error."""
+    """Wherever a small file is cut, the result is all three frames, or one clear error."""
     bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]))
     whole, rejected = mcap(bag).read_bytes(), []
     for size in range(0, len(whole), 97):
@@ -102,7 +102,8 @@ def test_a_damaged_sqlite_bag_is_named(bags: Any, tmp_path: Path, keep: int) -> 
 
 
 def test_bytes_overwritten_in_the_middle_never_crash(recording: Path) -> None:
-    """Inside a cloud they change points, elsewhere a record: frames, failed ones, or an end that the notes explain."""
+    """Within a cloud they change points, elsewhere a record. The result is frames, failed frames, or an end that the
+    notes explain."""
     whole, rng = mcap(recording).read_bytes(), np.random.default_rng(0)
     for place in rng.integers(1000, len(whole) - 6000, 12):
         mcap(recording).write_bytes(whole[:place] + rng.bytes(200) + whole[place + 200 :])
@@ -116,7 +117,7 @@ def test_a_damaged_chunk_ends_the_drive_and_says_so(bags: Any, tmp_path: Path) -
     messages = [(1 + 0.1 * i, POINTS, bags.cloud(1 + 0.1 * i, i, count=1000)) for i in range(100)]
     bag = bags.write(tmp_path / "b", messages, zstd=True)
     whole = mcap(bag).read_bytes()
-    second = whole.index(b"\x28\xb5\x2f\xfd", whole.index(b"\x28\xb5\x2f\xfd") + 4)  # where a zstd frame begins
+    second = whole.index(b"\x28\xb5\x2f\xfd", whole.index(b"\x28\xb5\x2f\xfd") + 4)  # start of a zstd frame
     mcap(bag).write_bytes(whole[:second] + bytes(20) + whole[second + 20 :])
     source = BagSource(bag)
     frames = list(source.frames())
@@ -129,7 +130,7 @@ def test_a_damaged_chunk_ends_the_drive_and_says_so(bags: Any, tmp_path: Path) -
 
 
 def split(bags: Any, folder: Path, plugin: str = "MCAP", compressed: bool = False) -> list[Path]:
-    """Twelve files of two clouds each whose numbers have no zeros before them, and no metadata.yaml."""
+    """Twelve files of two clouds each, with numbers without leading zeros, and no metadata.yaml."""
     folder.mkdir()
     for n in range(12):
         times = [1 + 0.2 * n, 1.1 + 0.2 * n]
@@ -152,7 +153,7 @@ def split(bags: Any, folder: Path, plugin: str = "MCAP", compressed: bool = Fals
 def test_a_split_recording_whose_last_file_is_cut(
     bags: Any, tmp_path: Path, plugin: str, keep: float, count: int, note: str
 ) -> None:
-    """All that is whole, in order of time, and the file that is not is named."""
+    """All intact messages are read in time order, and the damaged file is named."""
     last = split(bags, tmp_path / "drive", plugin)[-1]
     last.write_bytes(last.read_bytes()[: int(keep * last.stat().st_size)])
     source = BagSource(last.parent)
@@ -171,7 +172,7 @@ def test_a_split_recording_without_metadata_is_read_in_order_of_time(bags: Any, 
 def test_a_damaged_chunk_costs_the_messages_of_its_file_alone(bags: Any, tmp_path: Path) -> None:
     files = split(bags, tmp_path / "drive", compressed=True)
     whole = files[5].read_bytes()
-    chunk = whole.index(b"\x28\xb5\x2f\xfd")  # where a zstd frame begins
+    chunk = whole.index(b"\x28\xb5\x2f\xfd")  # start of a zstd frame
     files[5].write_bytes(whole[:chunk] + bytes(20) + whole[chunk + 20 :])
     source = BagSource(tmp_path / "drive")
     assert [frame.points[0, 0] for frame in source.frames()] == [*range(10), *range(12, 24)]
@@ -184,7 +185,7 @@ def test_a_damaged_chunk_costs_the_messages_of_its_file_alone(bags: Any, tmp_pat
 @pytest.mark.parametrize("metadata", [True, False])
 @pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
 def test_messages_that_are_compressed_one_by_one(bags: Any, tmp_path: Path, plugin: str, metadata: bool) -> None:
-    """Also where no metadata.yaml says that they are."""
+    """Also if no metadata.yaml declares the compression."""
     bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]), plugin, zstd=True, compression="MESSAGE")
     if not metadata:
         (bag / "metadata.yaml").unlink()
@@ -197,7 +198,7 @@ def test_messages_that_are_compressed_one_by_one(bags: Any, tmp_path: Path, plug
 def test_files_that_are_compressed_are_named_with_what_unpacks_them(
     bags: Any, tmp_path: Path, plugin: str, metadata: bool
 ) -> None:
-    """And are read once they are unpacked."""
+    """They are read once they are unpacked."""
     bag = bags.write(tmp_path / "a bag", clouds(bags, [1, 2, 3]), plugin, zstd=True, compression="FILE")
     if not metadata:
         (bag / "metadata.yaml").unlink()
@@ -212,7 +213,7 @@ def test_files_that_are_compressed_are_named_with_what_unpacks_them(
 
 
 def test_files_that_metadata_does_not_name_are_not_read(bags: Any, tmp_path: Path) -> None:
-    """Such as a copy that is cut to size. Topics without a message are those of the metadata."""
+    """For example a copy that is cut to size. Topics without a message are those of the metadata."""
     bag = bags.write(tmp_path / "b", clouds(bags, [1, 2, 3]), silent=[("/scan", "sensor_msgs/msg/LaserScan")])
     (bag / "copy.mcap").write_bytes(mcap(bag).read_bytes())
     source = BagSource(bag)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are read: clouds, cameras, their places, and ground truth."""
+"""Which topics of a bag are read: clouds, cameras, their poses, and ground truth."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_only_camera_is_taken_and_several_are_left(bags: Any, tmp_path: Path
 
 
 def test_what_is_compressed_beside_the_raw_images_is_no_second_camera(bags: Any, tmp_path: Path) -> None:
-    """As image_transport publishes it, and `ros2 bag record -a` records it: no camera was used then."""
+    """image_transport publishes it, and `ros2 bag record -a` records it. Previously, no camera was used then."""
     jpeg = cv2.imencode(".jpg", np.full((6, 8), 9, np.uint8))[1].ravel()
     packed = bags.new("sensor_msgs/CompressedImage", header=bags.header(1, "cam"), format="jpeg", data=jpeg)
     sent = [*clouds(bags, [1]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (1, f"{IMAGE}/compressed", packed)]
@@ -104,7 +104,7 @@ def test_without_camera_info_images_are_left_out(bags: Any, tmp_path: Path) -> N
 
 
 def test_the_first_camera_info_of_use_counts(bags: Any, tmp_path: Path) -> None:
-    """Drivers send zeros before the calibration is there. With zeros alone the drive goes on without images."""
+    """Drivers send zeros before the calibration is available. With only zeros, the drive continues without images."""
     zeros = bags.info(1)
     zeros.k = np.zeros(9)
     messages = [*clouds(bags, [1]), (0.9, INFO, zeros), (1, IMAGE, bags.image(1, 7))]
@@ -120,7 +120,7 @@ def test_the_first_camera_info_of_use_counts(bags: Any, tmp_path: Path) -> None:
 
 
 def test_depth_is_no_image(bags: Any, tmp_path: Path) -> None:
-    """Alone it needs no place either; beside a camera it leaves no choice open."""
+    """Alone, it needs no extrinsics either. Next to a camera, it does not make the choice ambiguous."""
     depth = bags.image(1, 3, encoding="16UC1", size=(16, 6))
     depth.width = 8
     messages = [*clouds(bags, [1]), (1, "/depth/image", depth), (1, "/depth/camera_info", bags.info(1))]
@@ -139,14 +139,14 @@ def test_depth_is_no_image(bags: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("child", ["velo_link", "base_link"])
 def test_odometry_is_interpolated_at_the_clouds(bags: Any, tmp_path: Path, child: str) -> None:
-    """Also when it is that of another frame, here 1 m behind the LiDAR."""
+    """Also if it is that of another frame, here 1 m behind the LiDAR."""
     messages = [
         *clouds(bags, [1, 1.25, 1.5, 3]),
         (1, "/tf_static", bags.transform("base_link", "velo_link", (1, 0, 0))),
     ]
     messages += [(t, "/truth", bags.odometry(t, x, child)) for t, x in ((1, 10), (1.5, 20), (2, 20))]
     bag = bags.write(tmp_path / "b", by_time(messages))
-    assert BagSource(bag).poses is None  # only KITTI's topics are taken for truth unasked
+    assert BagSource(bag).poses is None  # by default, only KITTI's topics are used as ground truth
     poses = BagSource(bag, InputSettings(ground_truth_topic="/truth")).poses
     np.testing.assert_allclose(poses[:3, 0, 3], np.array([10, 15, 20]) + (child == "base_link"), atol=1e-9)
     assert np.isnan(poses[3]).all()
@@ -161,7 +161,7 @@ def test_a_truth_of_the_lidar_with_a_leading_slash(bags: Any, tmp_path: Path, ch
 
 
 def test_a_truth_whose_frame_is_not_connected_is_left_out_or_named(bags: Any, tmp_path: Path) -> None:
-    """A note where the topic was found, an error that names it where it was asked for."""
+    """A note if the topic was found, an error that names it if it was requested."""
     topic = "/ground_truth/odom"
     bag = bags.write(tmp_path / "b", [*clouds(bags, [1]), (1, topic, bags.odometry(1, 0, "body"))])
     source = BagSource(bag)
@@ -174,7 +174,7 @@ def test_a_truth_whose_frame_is_not_connected_is_left_out_or_named(bags: Any, tm
 
 
 def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
-    """As by a clock that counts leap seconds; a stamp of zero is that of the recording."""
+    """For example from a clock that counts leap seconds. A zero stamp is replaced by the time of recording."""
     messages = [*clouds(bags, [1, 1.5]), *((t, "/truth", bags.odometry(t + 37, 0)) for t in (1, 1.5))]
     messages += [(t, "/unstamped", bags.odometry(0, x)) for t, x in ((1, 10), (1.5, 20))]
     bag = bags.write(tmp_path / "b", by_time(messages))
@@ -189,7 +189,7 @@ def test_a_truth_of_another_time_is_said(bags: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("damaged", "why"), [(False, "no rigid transform"), (True, "is damaged")])
 def test_an_invalid_true_pose_costs_itself(bags: Any, tmp_path: Path, damaged: bool, why: str) -> None:
-    """A cloud there gets the pose between those of its neighbors."""
+    """A cloud at this time receives the pose interpolated between its neighbors."""
     truth = [bags.odometry(1 + 0.5 * i, x) for i, x in enumerate((0.0, 99.0, 10.0))]
     if damaged:
         truth[1].header.frame_id = "no text"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: clouds in their order, images by time, and every kind of damage to stamps."""
+"""Bags: clouds in order, images by time, and every kind of damage to stamps."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_stamps_are_the_headers_else_those_of_recording(bags: Any, tmp_path: Pat
 
 
 def test_times_of_recording_that_no_clock_shows(bags: Any, tmp_path: Path) -> None:
-    """MCAP has 64 bits for them, of which a stamp has 63."""
+    """MCAP stores them with 64 bits, a stamp has 63."""
     messages = [(5, POINTS, bags.cloud(4.9)), (1.2e10, POINTS, bags.cloud(0))]
     source = BagSource(bags.write(tmp_path / "b", messages))
     assert [frame.stamp for frame in source.frames()] == source.stamps.tolist() == [4_900_000_000, 2**63 - 1]
@@ -56,7 +56,8 @@ def test_a_clock_that_was_set_is_told_from_a_pause_by_the_time_of_recording(bags
 def test_a_clock_that_was_set_ahead_by_less_than_a_second_is_no_pause(
     bags: Any, tmp_path: Path, recorded: tuple[float, ...], stepped: bool
 ) -> None:
-    """Where the cloud was recorded when it was due: not after a pause, nor with what was kept on the way before it."""
+    """This is so if the cloud was recorded when it was due: neither after a pause, nor together with clouds that were
+    held back before it."""
     times = zip((1.0, 1.1, *recorded), (1.0, 1.1, 1.8, 1.9, 2.0), strict=True)
     source = BagSource(bags.write(tmp_path / "b", [(at, POINTS, bags.cloud(stamp)) for at, stamp in times]))
     assert [frame.stepped for frame in source.frames()] == [False, False, stepped, False, False]
@@ -70,7 +71,7 @@ def test_compressed_images(bags: Any, tmp_path: Path) -> None:
 
 
 def test_images_join_the_nearest_cloud(bags: Any, tmp_path: Path) -> None:
-    """A camera at 15 Hz, out of phase, recorded up to 0.2 s late: each cloud finds the nearest by stamp."""
+    """A camera at 15 Hz, out of phase, recorded up to 0.2 s late: each cloud receives the nearest image by stamp."""
     times = [round(1 + 0.1 * i, 3) for i in range(10)]
     shots = [round(0.99 + i / 15, 3) for i in range(16)]
     late = np.random.default_rng(0).uniform(0, 0.2, len(shots))
@@ -100,7 +101,7 @@ def test_a_camera_that_stops_or_starts_late(bags: Any, tmp_path: Path, shots: li
 
 
 def test_images_that_do_not_fit_are_not_missing(bags: Any, tmp_path: Path) -> None:
-    """As of a camera that was switched to another size: they are there, and within the tolerance."""
+    """For example from a camera that was switched to another size: they exist, and are within the tolerance."""
     times = [1 + 0.1 * i for i in range(6)]
     images = [(t, IMAGE, bags.image(t, i, size=(4, 3) if i > 1 else (8, 6))) for i, t in enumerate(times[:5])]
     source = BagSource(bags.write(tmp_path / "b", by_time([*clouds(bags, times), *rig(bags), *images])))
@@ -183,7 +184,7 @@ def test_stamps_that_repeat_jump_back_or_stop_lose_no_frame(
 @pytest.mark.parametrize("off", [-0.4, 0.4, 1, 60, -60])
 @pytest.mark.parametrize("count", [1, 3, 4])
 def test_stamps_that_are_off_are_put_between_their_neighbors(bags: Any, tmp_path: Path, off: float, count: int) -> None:
-    """Up to three in a row: more are a clock that was set. An image finds its cloud all the same."""
+    """Up to three in a row: more are a clock that was set. Images are still associated with their clouds."""
     true = 10 + 0.1 * np.arange(20)
     stamps = true + off * ((np.arange(20) >= 8) & (np.arange(20) < 8 + count))
     messages: list[Message] = rig(bags)

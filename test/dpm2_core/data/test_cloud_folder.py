@@ -51,7 +51,7 @@ def test_pcd_files_in_every_encoding(tmp_path: Path, encoding: str) -> None:
 
 @pytest.mark.parametrize("scale", [1, 10**3, 10**6, 10**9])
 def test_names_that_are_times(tmp_path: Path, scale: int) -> None:
-    """PLY files without times of their points: said once."""
+    """PLY files without point times: this is reported once."""
     for n in range(3):
         write_ply(tmp_path / f"{(EPOCH + n) * scale}.ply", np.zeros((5, 4), np.float32) + n + 1)
     source = CloudFolder(tmp_path)
@@ -62,7 +62,7 @@ def test_names_that_are_times(tmp_path: Path, scale: int) -> None:
 
 @pytest.mark.parametrize("name", ["2023-11-14_22-13-2{}_750", "scan-20231114T22132{}.750", "2023-11-14-22-13-2{}-75"])
 def test_names_that_are_dates(tmp_path: Path, name: str) -> None:
-    """As loggers name files; decimals of the second as far as they go."""
+    """Names that loggers give to files, with as many decimals of the second as there are."""
     for n in range(3):
         write_ply(tmp_path / f"{name.format(n)}.ply", np.zeros((5, 4), np.float32) + n + 1)
     found = [frame.stamp for frame in CloudFolder(tmp_path).frames()]
@@ -71,7 +71,7 @@ def test_names_that_are_dates(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("names", [("251370668", "251371071"), ("2023-13-14_22-13-20", "2023-13-14_22-13-21")])
 def test_names_that_only_look_like_times(tmp_path: Path, names: tuple[str, str]) -> None:
-    """Milliseconds since a start were seconds in 1977, 403 apart; a month 13."""
+    """Previously, milliseconds since a start were taken for seconds in 1977, 403 apart. A month 13 is no date."""
     for n, name in enumerate(names):
         write_ply(tmp_path / f"{name}.ply", np.zeros((5, 4), np.float32) + n + 1)
     assert [frame.stamp for frame in CloudFolder(tmp_path).frames()] == [0, 100_000_000]
@@ -79,7 +79,7 @@ def test_names_that_only_look_like_times(tmp_path: Path, names: tuple[str, str])
 
 @pytest.mark.parametrize("name", ["cloud_{}_{}.ply", "{}-{}.ply"])
 def test_names_that_are_seconds_and_nanoseconds(tmp_path: Path, name: str) -> None:
-    """In the order of both; with fewer digits the nanoseconds have no zeros before them."""
+    """Sorted by both. Nanoseconds with fewer digits have no leading zeros."""
     stamps = [EPOCH * 10**9 + k * 10**8 + 82 for k in range(8, 13)]
     for n, stamp in enumerate(stamps):
         write_ply(tmp_path / name.format(*divmod(stamp, 10**9)), np.zeros((5, 4), np.float32) + n + 1)
@@ -118,7 +118,8 @@ def test_names_of_several_numbers_are_in_the_order_of_all(tmp_path: Path, names:
 def test_numbers_that_are_missing_are_scans_that_are(
     tmp_path: Path, numbers: tuple[int, ...], scans: tuple[int, ...], missing: int
 ) -> None:
-    """Without their time the odometry took a real drive of which 78 of 175 scans were kept for another one, 6 m off."""
+    """Without their time, the odometry took a real drive, of which 78 of 175 scans were kept, for another one: 6 m
+    off."""
     for n, number in enumerate(numbers):
         write_ply(
             tmp_path / f"{'ab'[n % 2] * (len(set(numbers)) < len(numbers))}scan_{number}.ply",
@@ -142,7 +143,7 @@ def test_a_damaged_file_is_a_failed_frame(tmp_path: Path) -> None:
 
 
 def only_frame(folder: Path) -> tuple[Frame, int]:
-    """The frame of a folder of one scan, and how many bytes it took at most to read it."""
+    """The frame of a folder with one scan, and the peak memory for reading it, bytes."""
     source = CloudFolder(folder)
     tracemalloc.start()
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JPEG and PNG that are whole, and what is no image any more."""
+"""Complete JPEG and PNG images, and damaged ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ JPEGS = {
         ("restarting", [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]),
     )
 }
-# With a smaller JPEG within it, whose end is not its own, and with filling behind it, as some drivers send.
+# With an embedded smaller JPEG, whose end is not that of the image, and with padding at the end, as from some drivers.
 JPEGS["within"] = JPEGS["plain"][:2] + b"\xff\xe1" + struct.pack(">H", len(SMALL) + 2) + SMALL + JPEGS["plain"][2:]
 JPEGS["filled"] = JPEGS["plain"] + bytes(16)
 
@@ -31,12 +31,13 @@ JPEGS["filled"] = JPEGS["plain"] + bytes(16)
 @pytest.mark.parametrize("jpeg", JPEGS.values(), ids=JPEGS)
 def test_a_whole_jpeg_is_decoded(jpeg: bytes) -> None:
     decoded = decode_compressed(jpeg, (64, 48))
-    assert np.abs(decoded[:, :, ::-1].astype(int) - PIXELS).mean() < 4  # of 256: what JPEG loses
+    assert np.abs(decoded[:, :, ::-1].astype(int) - PIXELS).mean() < 4  # of 256: the loss of JPEG
 
 
 @given(st.sampled_from(list(JPEGS)), st.floats(0, 1))
 def test_a_jpeg_that_is_cut_off_is_an_error(name: str, part: float) -> None:
-    """OpenCV 4 makes gray of what is missing, without an error: half a picture was one of a place."""
+    """OpenCV 4 fills the missing part with gray, without an error. Previously, half an image counted as an image of a
+    place."""
     jpeg = JPEGS[name].rstrip(b"\0")
     with pytest.raises(ValueError, match=r"cut off|damaged"):
         decode_compressed(jpeg[: int(part * (len(jpeg) - 1))])

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""KITTI and others to bags: nothing changes on the way, and what fails or is killed leaves nothing that looks whole."""
+"""KITTI and other sources to bags: nothing changes, and a failed or killed conversion leaves nothing that looks
+complete."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ STAMP = 1_700_000_000_000_000_000  # ns
 
 
 def assert_same_drive(bag: BagSource, folder: KittiSource, count: int | None = None) -> None:
-    """Of the first `count` frames of the folder, or of all."""
+    """Compare a bag with the first `count` frames of the folder, or with all."""
     assert len(bag) == (len(folder) if count is None else count)
     assert bag.vertical_angle_correction_deg == folder.vertical_angle_correction_deg
     for ours, theirs in zip(bag.frames(), folder.frames(0, count), strict=True):
@@ -115,7 +116,7 @@ def test_topics_frames_and_qos_are_those_of_kitti2bag(kitti_folder: MakeFolder, 
     assert {topic for topic, name in durability.items() if name == "TRANSIENT_LOCAL"} == latched
     order = [topic for topic, _, _ in bag.messages(list(bag.types))][2:6]
     camera, truth = naming.KITTI.camera, naming.KITTI.truth
-    assert order == [f"{camera}/camera_info", naming.IMAGE, f"{truth}/odom", naming.POINTS]  # the image is there before
+    assert order == [f"{camera}/camera_info", naming.IMAGE, f"{truth}/odom", naming.POINTS]  # the image comes first
 
 
 def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path) -> None:
@@ -129,7 +130,7 @@ def test_part_of_a_drive_without_images(kitti_folder: MakeFolder, tmp_path: Path
 
 
 def test_a_bare_sequence_becomes_a_lidar_bag(kitti_folder: MakeFolder, tmp_path: Path) -> None:
-    """No calibration, no poses: points alone, and nothing made up for the rest."""
+    """No calibration, no poses: only points, and nothing is invented for the rest."""
     folder = kitti_folder(images=False)
     for path in (folder / "calib.txt", folder / "times.txt", folder.parents[1] / "poses" / "07.txt"):
         path.unlink()
@@ -203,13 +204,13 @@ convert(KittiSource(sys.argv[1]), Path(sys.argv[2]), progress=progress)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert not out.exists()
-    convert(KittiSource(folder), out)  # and the next try clears up
+    convert(KittiSource(folder), out)  # and the next attempt cleans up
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "kitti"]
     assert len(BagSource(out)) == 5
 
 
 def test_a_full_disk_is_an_error_without_leftovers(kitti_folder: MakeFolder, tmp_path: Path) -> None:
-    """A limit on the size of files raises the OSError that a full disk does; the bag that was there survives."""
+    """A limit on the file size raises the same OSError as a full disk. The existing bag survives."""
     folder, out = kitti_folder(), tmp_path / "bag"
     convert(KittiSource(folder), out, (0, 1))
     np.zeros((200_000, 4), "<f4").tofile(folder / "velodyne" / "000004.bin")
@@ -235,7 +236,7 @@ def test_command_line(kitti_folder: MakeFolder, tmp_path: Path) -> None:
 
 
 def test_a_setting_of_the_slam_is_an_error(kitti_folder: MakeFolder, tmp_path: Path) -> None:
-    """The help named one as its example, and it did nothing."""
+    """Previously, the help named one as its example, and it had no effect."""
     done = dpm2("convert", kitti_folder(), tmp_path / "bag", "--set", "slam.map.voxel=1")
     assert done.returncode == 2
     assert "allowed here: input" in done.stderr
@@ -243,7 +244,7 @@ def test_a_setting_of_the_slam_is_an_error(kitti_folder: MakeFolder, tmp_path: P
 
 
 def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_path: Path) -> None:
-    """Frames without a pose have none in the bag either: no zero pose, no repeated one."""
+    """Frames without a pose have none in the bag either: neither a zero pose nor a repeated one."""
     folder = kitti_folder()
     (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
     convert(KittiSource(folder), tmp_path / "bag")
@@ -253,7 +254,7 @@ def test_ground_truth_starts_where_the_drive_does(kitti_folder: MakeFolder, tmp_
 
 
 class OtherDrive(IndexedSource):
-    """A source as any other: two cameras with distortion, times of points, an IMU, GNSS, stamps since 1970."""
+    """A source with all kinds of data: two cameras with distortion, point times, an IMU, GNSS, stamps since 1970."""
 
     truth = "here"
 
@@ -268,7 +269,7 @@ class OtherDrive(IndexedSource):
         ]  # fmt: skip
 
     def frame(self, position: int) -> Frame:
-        """The second has no image of the left camera, and each has the last sample of the one before once more."""
+        """The second frame has no image of the left camera. Each frame repeats the last sample of the previous one."""
         rng, stamp = np.random.default_rng(position), STAMP + position * 10**8
         points = np.c_[rng.uniform(-20, 20, (30, 3)), rng.uniform(size=30)].astype(np.float32)
         pixels = rng.integers(0, 256, (2, 20, 40, 3)).astype(np.uint8)
@@ -321,7 +322,8 @@ def test_a_folder_of_clouds_by_command(tmp_path: Path) -> None:
 
 
 def test_the_first_camera_is_that_although_its_images_come_late(tmp_path: Path) -> None:
-    """By what the source knows. And an image that two clouds have is written once."""
+    """The source determines which camera is the first. And an image that is associated with two clouds is written
+    once."""
     drive = OtherDrive()
     drive.camera = drive.cameras[1]  # type: ignore[attr-defined]
     convert(drive, tmp_path / "bag")

@@ -21,8 +21,8 @@ STAMP = 1_700_000_000_000_000_000  # ns
 
 
 def test_clouds_are_recorded_at_the_end_of_their_sweeps(tmp_path: Path) -> None:
-    """As drivers send them, so that who plays the bag has the samples of a sweep by then. One point far from the others
-    changes no order, and sweeps that overlap a little are no clock that was set."""
+    """As drivers publish them, so that a player has published the samples of a sweep by then. One distant point changes
+    no order, and sweeps that overlap a little are not taken for a clock that was set."""
     drive = [frame_of(STAMP + i * 10**8, i, STAMP + i * 10**8 + np.arange(1, 11) * 10**7) for i in range(10)]
     ends = [0.101] * 5 + [1.5] + [0.1] * 4
     drive = [replace(f, time_offset=np.float32([0, end / 2, end])) for f, end in zip(drive, ends, strict=True)]
@@ -40,7 +40,7 @@ def test_clouds_are_recorded_at_the_end_of_their_sweeps(tmp_path: Path) -> None:
 
 
 def frame_of(stamp: int, index: int, samples: np.ndarray, stepped: bool = False) -> Frame:
-    """Three points with its number as coordinates, and an IMU's samples at these stamps, ns."""
+    """Three points with the frame's number as coordinates, and IMU samples at these stamps, ns."""
     imu = Inertial(samples, np.ones((len(samples), 3)), np.ones((len(samples), 3)))
     return Frame(stamp, np.full((3, 4), index, np.float32), index=index, imu=imu, stepped=stepped)
 
@@ -49,11 +49,11 @@ def frame_of(stamp: int, index: int, samples: np.ndarray, stepped: bool = False)
     "stamps",
     [
         [STAMP, STAMP + 10**8, STAMP - 10**9, STAMP - 9 * 10**8],  # set back while driving
-        [5 * 10**9, 5 * 10**9 + 10**8, STAMP, STAMP + 10**8],  # set once it hears of the time
+        [5 * 10**9, 5 * 10**9 + 10**8, STAMP, STAMP + 10**8],  # set when the time becomes known
     ],
 )
 def test_the_order_is_kept_where_the_clock_is_set(tmp_path: Path, stamps: list[int]) -> None:
-    """Players and readers go by the time of recording, and nothing is lost."""
+    """Players and readers use the recording time, and nothing is lost."""
     frames = [frame_of(stamp, index, np.array([stamp - 10**7])) for index, stamp in enumerate(stamps)]
     convert(InMemory(frames), tmp_path / "bag")
     bag = open_bag(tmp_path / "bag")
@@ -66,7 +66,7 @@ def test_the_order_is_kept_where_the_clock_is_set(tmp_path: Path, stamps: list[i
 
 @pytest.mark.parametrize("period", [10**8, 2 * 10**8])
 def test_a_clock_that_was_set_ahead_is_no_pause_in_the_bag(tmp_path: Path, period: int) -> None:
-    """Of ten clouds the sixth is 2 s ahead, with ten samples of an IMU each; none is lost there."""
+    """The sixth of ten clouds is 2 s ahead. Each cloud has ten IMU samples, and none is lost there."""
     stamps = [STAMP + index * period + (2 * 10**9 if index > 4 else 0) for index in range(10)]
     ago = np.arange(10)[::-1] * period // 10
     drive = [frame_of(stamp, index, stamp - ago, index == 5) for index, stamp in enumerate(stamps)]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corruptions hit the fraction of frames that was asked for, the same ones for the same seed, and do what they say."""
+"""Corruptions affect the requested fraction of frames, the same ones for the same seed, and have the described
+effect."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ N = 20
 
 
 class Drive(IndexedSource):
-    """Twenty frames of 2,000 points and one image, whose brightness is its number."""
+    """Twenty frames of 2,000 points and one image, whose brightness shows the frame's number."""
 
     truth = "poses/drive.txt"
 
@@ -103,7 +104,7 @@ def test_one_corruption_does_not_move_another() -> None:
 
 
 def segment_meets(box: Box, point: np.ndarray) -> bool:
-    """By brute force: 4,000 places on the segment, any of them in the box?"""
+    """Brute force: whether any of 4,000 positions on the segment is in the box."""
     places = np.linspace(0, 1, 4000)[:, None] * point
     inside = np.abs(se3.transform(se3.inverse(box.T_lidar_box), places)) <= box.half
     return bool(inside.all(1).any())
@@ -139,13 +140,13 @@ def test_rays_along_the_axes_of_a_box_and_points_that_are_none() -> None:
 
 
 def test_dust_returns_its_share_of_pulses_from_near_by() -> None:
-    """Along the same ray; what 0.3 moves 0.6 moves alike."""
+    """The points stay on their rays. What 0.3 moves, 0.6 moves in the same way."""
     clean = [frame.points for frame in Drive().frames()]
     some, many = ([frame.points for frame in corrupted(dust=fraction)] for fraction in (0.3, 0.6))
     for points, fewer, more in zip(clean, some, many, strict=True):
         away, nearer = (np.linalg.norm(p[:, :3].astype(float), axis=1) for p in (points, more))
         moved = nearer < away - 1e-3
-        np.testing.assert_allclose(moved.mean(), 0.6, atol=0.05)  # hardly anything of 60 m is within 6 m
+        np.testing.assert_allclose(moved.mean(), 0.6, atol=0.05)  # hardly any point of 60 m is within 6 m
         assert nearer[moved].min() > 0.39
         assert nearer[moved].max() < 6.01
         np.testing.assert_allclose(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds as the drivers of eight LiDARs send them: each decodes, and the motion during the sweep is undone.
+"""Clouds as published by the drivers of eight LiDARs: each is decoded and deskewed.
 
 Layouts (names, types, offsets, step, origin of the times) are those that the drivers' PointField lists declare.
 """
@@ -21,11 +21,11 @@ from test.helpers.livox import custom_message
 
 STAMP = 1_700_000_000_250_000_000
 TWIST = np.array([0, 0, 1.0, 8.0, 0, 0])
-"""A turn of 57 deg/s at 8 m/s."""
+"""A rotation of 57 deg/s at 8 m/s."""
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 LAYOUTS: dict[str, tuple[int, dict[str, tuple[str, int]], str, float, bool]] = {
-    # step, fields with type and offset, the one with the time, its units a second, whether it counts from the epoch
+    # step, fields with type and offset, the time field, its units per second, whether it counts from the epoch
     "Ouster (ouster-ros, PointXYZI + t)": (
         48, {"x": ("f4", 0), "y": ("f4", 4), "z": ("f4", 8), "intensity": ("f4", 16), "t": ("u4", 20),
              "reflectivity": ("u2", 24), "ring": ("u2", 26), "ambient": ("u2", 28), "range": ("u4", 32)},
@@ -59,7 +59,8 @@ LAYOUTS: dict[str, tuple[int, dict[str, tuple[str, int]], str, float, bool]] = {
 
 
 def sweep() -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) of a wall at x = 20 m, each where the LiDAR was at its time (N,) s after the stamp."""
+    """Points (N, 3) of a wall at x = 20 m, each in the LiDAR frame at its time, and these times (N,), s after the
+    stamp."""
     seconds = np.arange(2000) * 5e-5
     rng = np.random.default_rng(0)
     wall = np.column_stack([np.full(2000, 20.0), rng.uniform(-15, 15, 2000), rng.uniform(-1, 5, 2000)])
@@ -68,7 +69,7 @@ def sweep() -> tuple[np.ndarray, np.ndarray]:
 
 
 def laid_out(name: str) -> Any:
-    """The sweep as a PointCloud2 of one driver."""
+    """The sweep as a PointCloud2 of this driver."""
     step, fields, time, units, absolute = LAYOUTS[name]
     points, seconds = sweep()
     dtype = np.dtype({"names": list(fields), "formats": [kind for kind, _ in fields.values()],
@@ -86,7 +87,7 @@ def laid_out(name: str) -> Any:
 
 
 def thickness(message: Any, settings: InputSettings | None = None) -> tuple[float, str]:
-    """How thick the wall is after de-skewing, m, and what was said of the times."""
+    """Thickness of the wall after de-skewing, m, and the problem that is reported for the times."""
     builder = FrameBuilder(settings or InputSettings(), Calibration("/points"), pytest.fail)
     frame = builder.frame(STAMP, message, 0)
     assert len(frame.points) == 2000
@@ -116,4 +117,4 @@ def test_a_cloud_without_times_says_so() -> None:
     smeared, problem = thickness(message)
     assert smeared > 0.5
     assert problem == "no time field: not de-skewed"
-    assert thickness(message, InputSettings(time_field=""))[1] == ""  # asked for
+    assert thickness(message, InputSettings(time_field=""))[1] == ""  # as requested

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes of bags and hostile publishers: to the scan they precede, with covariance and antenna, or out, counted."""
+"""Fixes of bags and hostile publishers: each is associated with the next scan, with covariance and antenna, or left out
+and counted."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ COVARIANCE = (4.0, 0, 0, 0, 4, 0, 0, 0, 16)
 
 
 def nav(bags: Any, stamp: float, place: tuple = (49.0, 8.4, 110.0), **other: Any) -> Any:
-    """A message; `other`: status, covariance, kind, frame."""
+    """A NavSatFix message; `other`: status, covariance, kind, frame."""
     return bags.new(
         "sensor_msgs/NavSatFix",
         header=bags.header(stamp, other.get("frame", "gnss")),
@@ -39,7 +40,7 @@ def nav(bags: Any, stamp: float, place: tuple = (49.0, 8.4, 110.0), **other: Any
 
 
 def drive(bags: Any, **other: Any) -> list[tuple[float, str, Any]]:
-    """Clouds at 1.0 to 1.9 s; fixes at 1.05 and 1.35 s, which come 0.12 s late."""
+    """Clouds at 1.0 to 1.9 s; fixes at 1.05 and 1.35 s, which arrive 0.12 s late."""
     clouds = [(1 + 0.1 * i, POINTS, bags.cloud(1 + 0.1 * i)) for i in range(10)]
     fixes = [(t + 0.12, "/fix", nav(bags, t, (49.0, 8.4 + t, 110.0), **other)) for t in (1.05, 1.35)]
     return sorted([*clouds, *fixes], key=lambda m: m[0])
@@ -57,12 +58,12 @@ def test_a_cloud_has_the_fix_that_came_before_it(bags: Any, tmp_path: Path) -> N
     np.testing.assert_allclose(fixes[2].antenna, [0.3, 0.2, 1.0])
     np.testing.assert_allclose(np.diag(fixes[2].covariance), [4, 4, 16], atol=1e-3)
     assert [frame.fix is not None for frame in source.frames()].count(True) == 2  # read again
-    assert all(frame.fix is None for frame in BagSource(path).frames())  # off
+    assert all(frame.fix is None for frame in BagSource(path).frames())  # GNSS is off
 
 
 @pytest.mark.parametrize("ahead", [18, -18])
 def test_fixes_of_another_clock_are_said(bags: Any, tmp_path: Path, ahead: int) -> None:
-    """As of a receiver that counts leap seconds, by which every other clock goes."""
+    """For example from a receiver whose clock differs from all others by the leap seconds."""
     messages = [*drive(bags), *((t, "/other", nav(bags, t + ahead, frame="velo_link")) for t in (1.05, 1.35))]
     path = bags.write(tmp_path / "b", sorted(messages, key=lambda m: m[0]))
     source = BagSource(path, InputSettings(gnss_topic="/other"))
@@ -84,7 +85,8 @@ def test_an_antenna_without_a_place_is_at_the_lidar_and_said(bags: Any, tmp_path
 
 
 def test_the_antenna_of_a_fix_is_not_that_of_another_receiver(bags: Any, tmp_path: Path) -> None:
-    """Two on one topic, 6 m apart: the fixes of one had the antenna of the other, and the map another heading."""
+    """Two receivers on one topic, 6 m apart. Previously, the fixes of one had the antenna of the other, and the map had
+    another heading."""
     place = {"gnss": (3, 0, 0), "rear": (-3, 0, 0)}
     tree = [(0.5, "/tf_static", bags.transform("velo_link", frame, xyz)) for frame, xyz in place.items()]
     rear = [(t + 0.01, topic, nav(bags, t - 0.12, frame="rear")) for t, topic, _ in drive(bags) if topic == "/fix"]
@@ -97,11 +99,12 @@ def test_the_antenna_of_a_fix_is_not_that_of_another_receiver(bags: Any, tmp_pat
 
 
 def test_an_antenna_without_a_place_is_known_until_it_has_one(bags: Any) -> None:
-    """Clouds without a fix of their own, nine of ten, took the problem away: /diagnostics mostly said "in use"."""
+    """Previously, clouds without a fix of their own, nine of ten, cleared the problem: /diagnostics mostly reported "in
+    use"."""
     fixes, calibration, said = FixBuffer(), Calibration(POINTS, gnss_topic="/fix"), list[str]()
     builder = FrameBuilder(InputSettings(gnss_topic="/fix"), calibration, said.append, gnss=fixes)
     known = []
-    for i in range(30):  # 10 Hz clouds, 1 Hz fixes; /tf_static comes before the last of these
+    for i in range(30):  # 10 Hz clouds, 1 Hz fixes; /tf_static arrives before the last of these
         stamp = SECOND + i * SECOND // 10
         if i % 10 == 0:
             fixes.add(stamp, nav(bags, stamp / SECOND))
@@ -121,13 +124,14 @@ def test_a_topic_that_is_not_there(bags: Any, tmp_path: Path) -> None:
 
 
 def test_what_is_not_known(bags: Any) -> None:
-    """No fix is none; without a covariance that of a plain receiver; without an altitude the height says nothing.
+    """No fix returns None. Without a covariance, that of a plain receiver is assumed. Without an altitude, the height
+    has no weight.
 
-    A variance of 0 along one axis alone was taken for 1 cm: a receiver that states none of its heights lost 104 of 120
-    fixes to it, and one that sends altitude 0 pressed the map flat.
+    Previously, a variance of 0 along one axis alone was taken for 1 cm. A receiver that states none of its heights lost
+    104 of 120 fixes to it, and one that sends altitude 0 flattened the map.
     """
     assert decode_fix(nav(bags, 1.0, (NAN, NAN, NAN), status=-1), SECOND) is None
-    assert decode_fix(nav(bags, 1.0, status=-2), SECOND) is not None  # a driver that sets no status
+    assert decode_fix(nav(bags, 1.0, status=-2), SECOND) is not None  # a driver that does not set the status
     for assumed in ({"kind": 0}, {"covariance": np.zeros(9)}):
         fix = decode_fix(nav(bags, 1.0, **assumed), SECOND)
         np.testing.assert_allclose(np.diag(fix.covariance), [25, 25, 100], atol=1e-3)
@@ -177,12 +181,13 @@ def test_a_flood_and_stamps_of_the_future_do_no_harm(bags: Any) -> None:
     assert fix.stamp == SECOND + 499
     assert buffer.take(2 * SECOND) is None
     buffer.add(5 * SECOND // 2, message)
-    assert buffer.take(2 * SECOND) is None  # not of this scan yet
+    assert buffer.take(2 * SECOND) is None  # not for this scan yet
     assert buffer.take(3 * SECOND) is not None
 
 
 def test_a_fast_receiver_does_not_push_out_what_a_waiting_cloud_needs(bags: Any) -> None:
-    """At 100 Hz a cloud that was taken up 1 s late, as on a busy machine, found no fix; it may be 30 clouds late."""
+    """Previously, at 100 Hz a cloud that was processed 1 s late, as on a busy machine, found no fix. It may be 30
+    clouds late."""
     buffer, message = FixBuffer(), nav(bags, 1.0)
     for k in range(400):
         buffer.add(SECOND + k * SECOND // 100, message)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that attack: nothing of them is executed, little memory is taken, and the drive is read without them."""
+"""Malicious recordings: nothing in them is executed, little memory is used, and the drive is read without them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dpm2_core.errors import UsageError
 
 
 def png(width: int, height: int) -> bytes:
-    """One color, in a thousandth of the bytes that it is decoded to."""
+    """An image of one color, in a thousandth of the bytes that it is decoded to."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -40,7 +40,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def jpeg(width: int, height: int) -> bytes:
-    """A small one whose header claims another size."""
+    """A small JPEG whose header claims another size."""
     data = bytearray(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
     at = data.index(b"\xff\xc0")
     data[at + 5 : at + 9] = struct.pack(">HH", height, width)
@@ -78,7 +78,7 @@ def test_a_image_that_is_a_bomb(image: bytes, size: tuple[int, int] | None) -> N
 
 
 def rig(bags: Any) -> list[tuple[float, str, Any]]:
-    """A cloud, and a camera beside it."""
+    """A cloud, and a camera."""
     transform = bags.transform("velo_link", "cam", (0.1, 0.2, 0.3))
     return [(1, "/points", bags.cloud(1)), (1, "/tf_static", transform), (1, "/cam/camera_info", bags.info(1))]
 
@@ -93,7 +93,7 @@ def test_a_bag_with_such_images_is_read_without_them(bags: Any, tmp_path: Path) 
 
 
 def test_transforms_and_a_calibration_that_are_none_cost_themselves(bags: Any, tmp_path: Path) -> None:
-    """Also where their names would write to a terminal."""
+    """Also if their names contain control sequences of a terminal."""
     wrong, info = bags.transform("base", "\x1b[2Jgripper", (0.0, np.nan, 0.0)), bags.info(1)
     info.k = np.full(9, np.nan)
     image = (1, "/cam/image_raw", bags.image(1, 7))
@@ -107,7 +107,7 @@ def test_transforms_and_a_calibration_that_are_none_cost_themselves(bags: Any, t
 
 
 def test_types_that_a_bag_defines_are_not_used(bags: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither one whose module could be imported, nor another idea of what a cloud is."""
+    """Neither a type whose module could be imported, nor another definition of a cloud."""
     package = tmp_path / "lib" / "evil" / "msg"
     package.mkdir(parents=True)
     (package.parent / "__init__.py").write_text("")
@@ -131,7 +131,7 @@ def test_types_that_a_bag_defines_are_not_used(bags: Any, tmp_path: Path, monkey
 
 @pytest.mark.parametrize("table", ["messages", "topics"])
 def test_a_database_that_computes_its_messages(bags: Any, tmp_path: Path, table: str) -> None:
-    """A view without end in place of a table."""
+    """An endless view in place of a table."""
     folder = bags.write(tmp_path / "bag", rig(bags), plugin="SQLITE3")
     assert len(BagSource(folder)) == 1
     with closing(sqlite3.connect(next(folder.glob("*.db3")))) as sql:
@@ -151,7 +151,7 @@ def test_a_database_that_computes_its_messages(bags: Any, tmp_path: Path, table:
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_database_that_metadata_calls_otherwise_is_not_opened(bags: Any, tmp_path: Path, packed: bool) -> None:
-    """Nor unpacked: what looks like no database is not checked as one."""
+    """It is not unpacked either: a file that does not look like a database is not checked as one."""
     folder = bags.write(tmp_path / "bag", rig(bags), plugin="SQLITE3")
     database, metadata = folder / "bag.db3", folder / "metadata.yaml"
     with closing(sqlite3.connect(database)) as sql:
@@ -176,7 +176,7 @@ def test_a_database_that_metadata_calls_otherwise_is_not_opened(bags: Any, tmp_p
 
 
 def test_a_message_that_is_a_bomb(bags: Any, tmp_path: Path) -> None:
-    """It costs its frame alone."""
+    """It costs only its own frame."""
     bomb = zstd.compress(bytes(600 << 20))
     source = BagSource(bags.write(tmp_path / "bag", [*rig(bags), (2, "/points", bomb)]))
     tracemalloc.start()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image and CameraInfo decoding: against OpenCV, and on damaged messages."""
+"""Decoding of Image and CameraInfo: compared with OpenCV, and for damaged messages."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
 def test_the_upper_bits_that_a_camera_uses_count(bits: int) -> None:
-    """Many cameras leave those above zero: of 12 bits the upper 8 of 16 are nearly black."""
+    """Many cameras leave the bits above zero: with 12 bits, the upper 8 of 16 are nearly black."""
     pixels = GRAY.astype(np.uint16) << (bits - 8)
     pixels[0, 0] = (1 << bits) - 1
     decoded = image_messages.decode_image(image(pixels, "mono16"))[..., 0]
@@ -104,7 +104,7 @@ def test_bayer_patterns_give_the_color_they_were_made_from(pattern: str, bits: i
 
 
 def test_a_compressed_mosaic_gets_its_color() -> None:
-    """image_transport compresses a Bayer image as it is; one whose format says bgr8 has its color already."""
+    """image_transport compresses a Bayer image as it is. An image whose format contains bgr8 is already in color."""
     color = np.array([200, 120, 40], np.uint8)
     mosaic = np.empty((8, 8), np.uint8)
     for i, letter in enumerate("gbrg"):
@@ -128,7 +128,7 @@ def test_compressed_images() -> None:
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
 def test_the_upper_bits_of_a_png_count_as_those_of_an_image(bits: int) -> None:
-    """By the upper eight of its 16 a camera of 12 bits is nearly black."""
+    """In the upper eight of its 16 bits, an image of a 12-bit camera is nearly black."""
     pixels = np.linspace(0, 2**bits - 1, 48).astype(np.uint16).reshape(6, 8)
     data = cv2.imencode(".png", pixels)[1].reshape(-1)
     decoded = image_messages.decode_image(SimpleNamespace(header=header(), format="mono16; png compressed ", data=data))
@@ -144,7 +144,7 @@ def test_the_upper_bits_of_a_png_count_as_those_of_an_image(bits: int) -> None:
         (SimpleNamespace(**(vars(image(RGB, "rgb8")) | {"width": 0})), "0 x 6"),
         (SimpleNamespace(format="jpeg", data=b"\xff\xd8garbage"), "'jpeg' and 9 bytes cannot be decoded"),
         (SimpleNamespace(format="png", data=b""), "0 bytes cannot be decoded"),
-        (image(GRAY.astype(np.uint16), "16UC1"), "encoding '16UC1' is not supported"),  # depth in mm, as REP 118 has it
+        (image(GRAY.astype(np.uint16), "16UC1"), "encoding '16UC1' is not supported"),  # depth in mm, by REP 118
         (SimpleNamespace(format="16UC1; compressedDepth png", data=b"12345"), "compressedDepth"),
         (SimpleNamespace(format="16UC1; png compressed ", data=b"12345"), "format '16UC1; png compressed ' is not sup"),
     ],
@@ -164,7 +164,7 @@ def test_camera_of_a_rectified_image_has_the_rectified_intrinsics() -> None:
 
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
 def test_the_info_of_a_raw_image_beside_its_rectified_one(model: str) -> None:
-    """image_proc publishes image_rect beside the CameraInfo of the raw image: P counts, without distortion."""
+    """image_proc publishes image_rect with the CameraInfo of the raw image: P applies, without distortion."""
     raw = info(d=[0.1, 0.0, 0.0, 0.01], distortion_model=model, header=header())
     for topic in ("/front/image_rect", "/front/image_rect_color/compressed", "/kitti/camera_color_left/image_raw"):
         of_topic = image_messages.info_of(topic, raw)
@@ -186,7 +186,7 @@ def test_the_info_of_a_raw_image_beside_its_rectified_one(model: str) -> None:
 )
 @pytest.mark.parametrize("topic", ["/front/image_raw", "/front/image_rect"])
 def test_the_info_of_a_part_of_the_sensor(changes: dict[str, Any], size: tuple[int, int], topic: str) -> None:
-    """A ray falls on the pixel of the whole sensor, less the corner of the part, in pixels of the binned image."""
+    """A ray falls on the pixel of the whole sensor, minus the corner of the part, in pixels of the binned image."""
     D, ray = [0.1, 0.0, 0.0, 0.01, 0.0], np.array([0.1, -0.2, 1.0])
     whole, part = (
         image_messages.decode_camera(image_messages.info_of(topic, one), np.eye(4), "front")
@@ -199,7 +199,7 @@ def test_the_info_of_a_part_of_the_sensor(changes: dict[str, Any], size: tuple[i
 
 
 def test_an_ideal_fisheye_has_no_coefficients() -> None:
-    """Of a simulator: the light is where the angle says, not where a pinhole camera has it."""
+    """From a simulator: a light is where its angle says, not where a pinhole camera would have it."""
     k = [200.0, 0, 320, 0, 200, 240, 0, 0, 1]
     msg = info(distortion_model="equidistant", d=[0.0] * 4, k=k, p=np.zeros(12))
     pixels = np.zeros((480, 640, 3), np.uint8)
@@ -212,7 +212,8 @@ def test_an_ideal_fisheye_has_no_coefficients() -> None:
 
 
 def test_a_fisheye_becomes_a_pinhole_camera() -> None:
-    """A light at a known direction is where the pinhole camera says, to a pixel; the fisheye had it elsewhere."""
+    """In the rectified image, a light in a known direction is at its pinhole projection, to a pixel. In the fisheye
+    image it was elsewhere."""
     d = (0.05, -0.01, 0.002, -0.0005)
     msg = info(distortion_model="equidistant", d=list(d), p=np.zeros(12), k=[300.0, 0, 320, 0, 300, 240, 0, 0, 1])
     ray = np.array([0.6, -0.4, 1.0])

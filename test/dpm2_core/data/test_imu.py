@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of an IMU, of bags, folders and hostile publishers: to the scan they belong to, or out, counted."""
+"""IMU samples of bags, folders and hostile publishers: each is associated with its scan, or left out and counted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 def imu(bags: Any, stamp: float, rates: tuple = (0.1, 0.2, 0.3), forces: tuple = (0.0, 0.0, 9.8), **other: Any) -> Any:
-    """A message; `other`: frame, rates_known, forces_known."""
+    """An Imu message; `other`: frame, rates_known, forces_known."""
     message = bag_messages.imu(round(stamp * 1e9), np.array(rates, float), np.array(forces, float))
     message.header.frame_id = other.get("frame", "imu_link")
     message.angular_velocity_covariance = np.full(9, 0.0 if other.get("rates_known", True) else -1.0)
@@ -34,14 +34,14 @@ def imu(bags: Any, stamp: float, rates: tuple = (0.1, 0.2, 0.3), forces: tuple =
 
 
 def drive(bags: Any, until: float = 2.0, **other: Any) -> list[tuple[float, str, Any]]:
-    """Clouds at 1.0 to 1.9 s; samples at 100 Hz until a time, logged as they come."""
+    """Clouds at 1.0 to 1.9 s; samples at 100 Hz until `until` s, logged as they arrive."""
     messages = [(1 + 0.1 * i, POINTS, bags.cloud(1 + 0.1 * i)) for i in range(10)]
     samples = [(0.9 + 0.01 * i, "/imu", imu(bags, 0.9 + 0.01 * i, **other)) for i in range(120)]
     return sorted(messages + [s for s in samples if s[0] < until], key=lambda m: m[0])
 
 
 def quarter(bags: Any) -> tuple[float, str, Any]:
-    """The IMU is turned by 90 degrees to the left in the LiDAR's frame."""
+    """Mounting of the IMU: rotated by 90 degrees to the left in the LiDAR's frame."""
     return (0.5, "/tf_static", bags.transform("velo_link", "imu_link", (0.5, 0, 0), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]))
 
 
@@ -56,14 +56,14 @@ def test_each_cloud_has_the_samples_since_the_one_before(bags: Any, tmp_path: Pa
         np.testing.assert_allclose(frame.imu.rates[0], [-0.2, 0.1, 0.3], atol=1e-9)  # along the LiDAR's axes
         np.testing.assert_allclose(frame.imu.forces[0], [0, 0, 9.8], atol=1e-9)
     again = list(source.frames(3, 5))
-    assert [len(frame.imu) for frame in again if frame.imu is not None] == [41, 10]  # what was skipped, too
+    assert [len(frame.imu) for frame in again if frame.imu is not None] == [41, 10]  # those of skipped clouds, too
 
 
 @pytest.mark.parametrize("sweep", [10**8, 18 * 10**7])
 def test_a_cloud_that_was_recorded_at_its_stamp_has_the_samples_of_its_sweep(
     bags: Any, tmp_path: Path, sweep: int
 ) -> None:
-    """The samples up to its last point were recorded after it."""
+    """The samples up to its last point were recorded after the cloud."""
     messages = [quarter(bags), *drive(bags, until=2.2)]
     noise = np.random.default_rng(0)
     for i, (t, topic, _) in enumerate(messages):
@@ -101,8 +101,9 @@ OUSTER = {
 
 @pytest.mark.parametrize("page", OUSTER)
 def test_the_rotation_that_a_page_gives_for_an_ouster_is_its_own(bags: Any, tmp_path: Path, page: str) -> None:
-    """Of the design values in its metadata: clouds are in os_lidar, turned by 180 degrees against the housing, to which
-    its IMU is parallel. A page had none instead: turns were right, forces reversed."""
+    """Compared with the design values in its metadata: clouds are in os_lidar, rotated by 180 degrees against the
+    housing, and its IMU is parallel to the housing. Previously, a page gave no rotation instead: rates were right,
+    forces reversed."""
     lidar_to_sensor, imu_to_sensor = np.diag([-1.0, -1, 1]), np.eye(3)
     messages = drive(bags, frame="os_imu", forces=(1.0, 0.5, 9.8))
     for _, topic, message in messages:
@@ -124,7 +125,7 @@ def test_the_rotation_that_a_page_gives_for_an_ouster_is_its_own(bags: Any, tmp_
 
 
 def test_two_frames_without_a_name_are_not_one(bags: Any, tmp_path: Path) -> None:
-    """Cloud and IMU without a frame_id may be turned any way; what is set by hand still counts."""
+    """Cloud and IMU without a frame_id may have any relative rotation. A manual setting still applies."""
     messages = drive(bags, frame="")
     for _, topic, message in messages:
         if topic == POINTS:
@@ -146,13 +147,14 @@ def test_one_that_stops_is_missed_once(bags: Any, tmp_path: Path) -> None:
 
 
 def test_one_of_zeros_is_left_out_and_said(bags: Any, tmp_path: Path) -> None:
-    """As of a driver that fills in the orientation alone: it counted as one that does not turn, in a bend too."""
+    """For example from a driver that fills in only the orientation. Previously, it counted as not rotating, even in a
+    bend."""
     zeros = {"frame": "velo_link", "rates": (0, 0, 0)}
     source = BagSource(bags.write(tmp_path / "b", drive(bags, forces=(0, 0, 0), **zeros)))
     assert all(frame.imu is None for frame in source.frames())
     said = "its rates and forces are all 0: it measures neither"
     assert source.notes == [f"/imu: {said}; going on without the IMU"]
-    still = BagSource(bags.write(tmp_path / "still", drive(bags, **zeros)))  # of a simulator, at rest
+    still = BagSource(bags.write(tmp_path / "still", drive(bags, **zeros)))  # from a simulator, at rest
     assert all(frame.imu is not None for frame in still.frames())
 
 
@@ -189,7 +191,7 @@ def test_numbers_that_cannot_be_are_rejected(bags: Any, wrong: dict, reason: str
 
 
 def test_a_gyroscope_alone_is_enough(bags: Any) -> None:
-    """Zeros, as realsense2_camera sends them, are what no accelerometer shows."""
+    """Zeros, as realsense2_camera sends them, are never measured by an accelerometer."""
     for unknown in ({"forces_known": False}, {"forces": (NAN, NAN, NAN)}, {"forces": (0, 0, 0)}):
         rates, forces = decode_imu(imu(bags, 1.0, **unknown))
         np.testing.assert_allclose(rates, [0.1, 0.2, 0.3])
@@ -197,7 +199,8 @@ def test_a_gyroscope_alone_is_enough(bags: Any) -> None:
 
 
 def test_two_imus_on_one_topic_are_not_taken_for_one_that_turns(bags: Any, tmp_path: Path) -> None:
-    """The samples of both were turned by the place of the last one. Where the first falls silent the other counts."""
+    """Previously, the samples of both were rotated with the mounting of the last one. If the first IMU falls silent,
+    the other one is used."""
     first = drive(bags, until=1.2, frame="first")
     other = [(t + 0.005, "/imu", imu(bags, t + 0.005, frame="/other")) for t in 0.9 + 0.01 * np.arange(300)]
     late = [(t, POINTS, bags.cloud(t)) for t in (2.0, 3.0, 3.5)]
@@ -222,23 +225,24 @@ def test_unsound_samples_of_a_bag_are_counted(bags: Any, tmp_path: Path) -> None
 
 
 def test_stamps_that_repeat_go_back_or_flood(bags: Any) -> None:
-    """Out, unless time itself has gone back by more than a second, or ahead: then it begins anew."""
+    """They are left out, unless the time itself has gone back by more than a second, or ahead: then the buffer starts
+    anew."""
     buffer = ImuBuffer()
     buffer.add(10 * SECOND, imu(bags, 10))
     for stamp in (10 * SECOND, 9_500_000_000, 10 * SECOND + 100_000):
         with pytest.raises(MessageError, match="ms after the one before"):
             buffer.add(stamp, imu(bags, 10))
     buffer.add(8 * SECOND, imu(bags, 8))
-    assert buffer.take(20 * SECOND, 20 * SECOND) is None  # that at 8 s is too old, and that at 10 s gone
+    assert buffer.take(20 * SECOND, 20 * SECOND) is None  # the sample at 8 s is too old, and that at 10 s is deleted
     buffer.add(8 * SECOND + 10**7, imu(bags, 8))
     buffer.add(10**18, imu(bags, 1))
-    buffer.add(8 * SECOND + 2 * 10**7, imu(bags, 8))  # a stray stamp costs what came before it, no more
+    buffer.add(8 * SECOND + 2 * 10**7, imu(bags, 8))  # an outlier among the stamps costs the samples before it, no more
     found = buffer.take(8 * SECOND, 9 * SECOND)
     assert found.stamps.tolist() == [8 * SECOND + 2 * 10**7]
 
 
 def test_a_clock_that_is_set_back_by_less_than_a_second_costs_no_sample(bags: Any) -> None:
-    """The first three may be late; from the fourth on all count, and those from before no longer do."""
+    """The first three may be late samples. From the fourth on all count, and those from before no longer do."""
     buffer = ImuBuffer()
     for k in range(-50, 1):
         buffer.add(10 * SECOND + k * 10**7, imu(bags, 1))

@@ -17,12 +17,12 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
 
 STAMPS = (1_700_000_000_000_000_000, 1_700_000_000_300_000_000)
-"""ns: of two scans between which two were lost."""
+"""Stamps, ns, of two scans; two scans between them were lost."""
 
 
 @pytest.fixture
 def mulran(tmp_path: Path) -> Path:
-    """Two scans of 64 x 1024 points as MulRan has them, 1 m apart."""
+    """Two scans of 64 x 1024 points in the format of MulRan, 1 m apart."""
     (tmp_path / "KAIST01" / "Ouster").mkdir(parents=True)
     rows = []
     for n in range(2):
@@ -36,7 +36,7 @@ def mulran(tmp_path: Path) -> Path:
 
 
 def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
-    """The times end at the stamp, as KISS-ICP's own de-skewing has it."""
+    """The point times end at the stamp, as in KISS-ICP's own de-skewing."""
     pytest.importorskip("kiss_icp")
     source = open_source(mulran, InputSettings(dataset="mulran"))
     assert isinstance(source, KissSource)
@@ -81,7 +81,7 @@ def test_velodyne_of_helipr(tmp_path: Path) -> None:
 
 
 def test_nclt(tmp_path: Path) -> None:
-    """Names are microseconds, and there is truth for a part of the scans alone; those count."""
+    """File names are microseconds. Only a part of the scans has ground truth, and only these are used."""
     pytest.importorskip("kiss_icp")
     drive = tmp_path / "2012-01-08"
     (drive / "velodyne_sync").mkdir(parents=True)
@@ -98,7 +98,7 @@ def test_nclt(tmp_path: Path) -> None:
 
 
 def test_what_a_loader_lacks_is_said_with_the_error_that_follows(tmp_path: Path) -> None:
-    """Newer College's prints that a package is missing, and fails only at the first scan."""
+    """The loader of Newer College prints that a package is missing, and fails only at the first scan."""
     pytest.importorskip("kiss_icp")
     if importlib.util.find_spec("pyntcloud") is not None:
         pytest.skip("pyntcloud is installed")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""KITTI folders: what is read, and what becomes of missing and damaged parts."""
+"""KITTI folders: what is read, and how missing and damaged parts are handled."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def test_any_subset(kitti_folder: MakeFolder, start: int, stop: int | None, want
 
 
 def test_camera_and_poses_are_of_the_lidar(kitti_folder: MakeFolder) -> None:
-    """P2's last column moves the camera against camera 0; poses turn from camera to LiDAR axes."""
+    """The last column of P2 is the offset of the camera from camera 0. Poses are converted from camera to LiDAR
+    axes."""
     source = KittiSource(kitti_folder())
     assert source.T_cam_lidar is not None
     point = np.array([8.0, 1.0, 0.5, 1.0])
@@ -155,7 +156,7 @@ def test_correction_is_on_for_kitti_and_off_where_the_simulator_says_so(kitti_fo
 
 
 def test_scans_of_another_lidar_in_its_layout_are_not_corrected(kitti_folder: MakeFolder) -> None:
-    """One of 16 beams up to 15 degrees, with what stands around it 5 to 45 m away."""
+    """A LiDAR with 16 beams up to 15 degrees, and objects 5 to 45 m away."""
     folder, noise = kitti_folder(), np.random.default_rng(0)
     angle, up = noise.uniform(-np.pi, np.pi, 8000), np.radians(noise.integers(-7, 8, 8000) * 2)
     away = np.where(up < 0, np.minimum(1.7 / np.maximum(np.tan(-up), 0.01), 45), noise.uniform(5, 45, 8000))
