@@ -226,7 +226,7 @@ def test_small_scans_are_frames_like_others(kitti_folder: MakeFolder, count: int
 
 @pytest.mark.parametrize("calib", [None, "P2: 50 0 20 3 0 50 15 0.1 0 0 1 0.002\n"])
 def test_without_tr_the_lidar_goes_on_alone(kitti_folder: MakeFolder, calib: str | None) -> None:
-    """Never an identity: no camera, no ground truth, and the notes say why."""
+    """The extrinsics are never an identity: no camera, no ground truth, and the notes report why."""
     folder = kitti_folder()
     (folder / "calib.txt").unlink()
     if calib:
@@ -269,7 +269,7 @@ def test_a_damaged_calibration_is_named(kitti_folder: MakeFolder, line: str, mes
 
 
 def test_files_that_end_before_an_excerpt_does_are_not_shifted_to_its_start(kitti_folder: MakeFolder) -> None:
-    """Rows are neither one for each scan nor enough for their numbers: nobody knows whose they are."""
+    """The rows are neither one for each scan nor enough for the scans' numbers, so they cannot be assigned."""
     folder = kitti_folder(numbers=[20, 21, 23])
     (folder / "times.txt").write_text("".join(f"{0.2 * n}\n" for n in range(22)))
     (folder / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(22)))
@@ -282,7 +282,7 @@ def test_files_that_end_before_an_excerpt_does_are_not_shifted_to_its_start(kitt
 
 
 def test_scans_with_a_ring_of_each_point_are_refused(kitti_folder: MakeFolder, noise: np.random.Generator) -> None:
-    """nuScenes' five numbers a point would be read as four, rings and intensities as coordinates."""
+    """Five numbers per point, as in nuScenes, would be read as four: rings and intensities as coordinates."""
     folder, count = kitti_folder(), 32 * 8
     points = np.c_[noise.uniform(-40, 40, (count, 3)), noise.uniform(0, 255, count), np.arange(count) % 32]
     points.astype("<f4").tofile(folder / "velodyne" / "000001.bin")
@@ -293,7 +293,7 @@ def test_scans_with_a_ring_of_each_point_are_refused(kitti_folder: MakeFolder, n
 
 
 def test_integers_are_no_floats(kitti_folder: MakeFolder, noise: np.random.Generator) -> None:
-    """NCLT's four uint16 a point, two points a point: 1e-38 m away, without a word."""
+    """Four uint16 per point, as in NCLT. Previously, two points were read as one, 1e-38 m away, without a warning."""
     folder = kitti_folder()
     noise.integers(0, 2000, (400, 8)).astype("<u2").tofile(folder / "velodyne" / "000001.bin")
     frame = [*KittiSource(folder).frames()][1]
@@ -312,7 +312,7 @@ def test_times_that_end_early_continue_at_their_pace(kitti_folder: MakeFolder) -
 
 @pytest.mark.parametrize("wrong", [1.1, -0.9, 0.0, 1e6])
 def test_a_time_that_is_not_between_its_neighbors_is_taken_to_be(kitti_folder: MakeFolder, wrong: float) -> None:
-    """One of them moved a perfect drive by 2 to 18 m, over a break."""
+    """Previously, one such time moved a perfect drive by 2 to 18 m, over a break."""
     folder = kitti_folder(numbers=range(30))
     times = [0.1 * n + 5 for n in range(30)]
     times[12] = wrong
@@ -398,14 +398,14 @@ def test_no_image_at_all_can_be_read(kitti_folder: MakeFolder) -> None:
 
 
 def test_real_excerpts(kitti_root: Path) -> None:
-    """Sequence 00 holds frames 20-141 with one line each in its text files; 04 has images."""
+    """Sequence 00 contains frames 20-141, with one line for each in its text files; 04 has images."""
     source = KittiSource(kitti_root, InputSettings(sequence="00"))
     assert (len(source), source.numbers[0], source.numbers[-1]) == (122, 20, 141)
     assert source.stamps[0] == 2_073_666_000
     assert source.poses is not None
     whole = KittiSource(kitti_root, InputSettings(sequence="00"))
     (whole.path / "poses.txt").rename(whole.path / "poses.bak")
-    try:  # the 4541 lines of the whole drive must give the same poses, picked by frame number
+    try:  # the 4541 lines of the whole drive must give the same poses, selected by frame number
         picked = KittiSource(whole.path).poses
     finally:
         (whole.path / "poses.bak").rename(whole.path / "poses.txt")
@@ -418,7 +418,7 @@ def test_real_excerpts(kitti_root: Path) -> None:
 
 
 def test_semantic_kitti_poses_are_a_choice(kitti_folder: Callable[..., Path]) -> None:
-    """poses.txt of the sequence's folder, or poses/NN.txt; one that was asked for and is missing is named."""
+    """poses.txt of the sequence's folder, or poses/NN.txt. If the requested file is missing, it is named."""
     folder = kitti_folder(images=False)
     kitti = KittiSource(folder, InputSettings(kitti_poses="kitti")).poses
     with pytest.raises(UsageError, match=r"poses.txt: no such file .*semantic_kitti"):

@@ -36,7 +36,7 @@ def truth(number: int) -> np.ndarray:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Frames 0..4, the poses of 1 and 3 alone, images of 40 x 30."""
+    """Frames 0..4, poses only for 1 and 3, images of 40 x 30."""
     calibration = tmp_path / "calibration"
     calibration.mkdir()
     (calibration / "calib_cam_to_velo.txt").write_text(text(T_LIDAR_CAM[:3]))
@@ -71,7 +71,8 @@ def root(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("missing", [None, "poses.txt"])
 def test_poses_are_of_the_lidar_and_unknown_between(root: Path, missing: str | None) -> None:
-    """Of poses.txt or of cam0_to_world.txt, whose camera is the rectified one; frames without a pose are NaN."""
+    """They are read from poses.txt or cam0_to_world.txt, whose camera is the rectified one. Frames without a pose are
+    NaN."""
     if missing:
         (root / "data_poses" / DRIVE / missing).unlink()
     source = open_source(root)
@@ -97,7 +98,7 @@ def test_frames(root: Path) -> None:
 
 
 def test_without_timestamps_scans_are_as_far_apart_as_of_every_folder(root: Path) -> None:
-    """`input.period` was of no use here."""
+    """Previously, `input.period` had no effect here."""
     (root / "data_3d_raw" / DRIVE / "velodyne_points" / "timestamps.txt").unlink()
     for settings, period in ((InputSettings(), 100_000_000), (InputSettings(period=0.5), 500_000_000)):
         source = open_source(root, settings)
@@ -106,13 +107,14 @@ def test_without_timestamps_scans_are_as_far_apart_as_of_every_folder(root: Path
 
 
 def test_the_lidar_turns_clockwise_from_behind() -> None:
-    """Forward is now, left was a quarter of a turn earlier; it was later, which doubled the distortion of a scan."""
+    """Forward is at the stamp, and left was a quarter of a rotation earlier. Previously, it was later, which doubled
+    the distortion of a scan."""
     points = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]], np.float32)
     np.testing.assert_allclose(azimuth_time(points), [0, -0.025, 0.025], atol=1e-7)
 
 
 def test_points_are_moved_as_by_the_devkit() -> None:
-    """kitti360Scripts moves a point by the part azimuth / 2 pi of the way from this pose to the previous one."""
+    """kitti360Scripts moves a point by the fraction azimuth / 2 pi of the motion from this pose to the previous one."""
     points = np.array([[3, 9, 0, 1], [-8, 2, 1, 1], [4, -7, 2, 1], [20, 0, 0, 1]], np.float32)
     T_previous_now = se3.exp([0, 0, 0.02, 1.4, 0, 0])  # 14 m/s, a curve
     part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
@@ -123,7 +125,7 @@ def test_points_are_moved_as_by_the_devkit() -> None:
 
 
 def test_pose_files_are_read_by_themselves(root: Path) -> None:
-    """13 or 17 numbers a line, as `dpm2 eval` gets them."""
+    """13 or 17 numbers per line, as input for `dpm2 eval`."""
     for name in ("poses.txt", "cam0_to_world.txt"):
         trajectory = read_trajectory(root / "data_poses" / DRIVE / name)
         assert trajectory.keys.tolist() == [1, 3]
@@ -131,7 +133,7 @@ def test_pose_files_are_read_by_themselves(root: Path) -> None:
 
 
 def test_what_is_missing_is_named(root: Path) -> None:
-    """A drive that is not there, no scans, a damaged scan, no calibration."""
+    """A missing drive, a damaged scan, a damaged pose file, a missing calibration."""
     with pytest.raises(UsageError, match=rf"no sequence 0003.*{DRIVE}"):
         open_source(root, InputSettings(sequence="0003"))
     assert open_source(root, InputSettings(sequence="0009")).name == DRIVE

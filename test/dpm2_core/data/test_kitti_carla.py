@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""KITTI-CARLA from a small tree in its own layout: a pose a millisecond, points with their own time, no intensity."""
+"""KITTI-CARLA from a small tree in its own layout: one pose per millisecond, points with their own times, no
+intensity."""
 
 from __future__ import annotations
 
@@ -21,12 +22,12 @@ _NAMES = {"<f4": "float32", "<u4": "uint32"}
 
 
 def truth(seconds: float) -> np.ndarray:
-    """T_world_lidar at a time: 10 m/s in a bend."""
+    """T_world_lidar at a time, in a bend at 10 m/s."""
     return se3.exp([0, 0, 0.2 * seconds, 10 * seconds, 0, 0])
 
 
 def write_sweep(path: Path, start: float, count: int = 50) -> None:
-    """Points of one wall at x = 20 m in the world, each as seen from where the LiDAR was at its time."""
+    """Write points of one wall at x = 20 m in the world, each in the LiDAR frame at its time."""
     vertices = np.zeros(count, _VERTEX)
     times = start + np.linspace(0, 0.099, count)
     world = np.c_[np.full(count, 20.0), np.linspace(-5, 5, count), np.linspace(0, 2, count)]
@@ -40,7 +41,7 @@ def write_sweep(path: Path, start: float, count: int = 50) -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Town01: three sweeps with images, poses for 0.3 s."""
+    """Town01: three sweeps with images, and poses for 0.3 s."""
     folder = tmp_path / "Town01" / "generated"
     (folder / "frames").mkdir(parents=True)
     (folder / "images_rgb").mkdir()
@@ -54,7 +55,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_frames_poses_and_times(root: Path) -> None:
-    """A pose a sweep, of its first point; the cosine stands where the intensity would."""
+    """One pose per sweep, that of its first point. The cosine replaces the intensity."""
     source = open_source(root)
     assert isinstance(source, KittiCarlaSource)
     assert source.name == "Town01"
@@ -69,7 +70,7 @@ def test_frames_poses_and_times(root: Path) -> None:
 
 
 def test_the_camera_looks_forward(root: Path) -> None:
-    """A point ahead, left and above projects to the upper left; 72 degrees fit across the image."""
+    """A point ahead, to the left and above projects to the upper left. The horizontal field of view is 72 degrees."""
     camera = open_source(root).frames().__next__().images[0].camera
     x, y, z = se3.transform(se3.inverse(camera.T_lidar_cam), np.array([[10.3, 1.0, 0.9]]))[0]
     np.testing.assert_allclose([x, y, z], [-1, -1, 10], atol=1e-12)
@@ -77,7 +78,7 @@ def test_the_camera_looks_forward(root: Path) -> None:
 
 
 def test_what_is_missing_or_damaged(root: Path) -> None:
-    """A sweep cut short costs its frame alone; without poses there is no ground truth; an unknown town is named."""
+    """A truncated sweep costs only its own frame. Without poses there is no ground truth. An unknown town is named."""
     folder = root / "Town01" / "generated"
     sweep = folder / "frames" / "frame_0001.ply"
     sweep.write_bytes(sweep.read_bytes()[:-5])

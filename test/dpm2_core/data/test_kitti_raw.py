@@ -29,7 +29,7 @@ def text(*numbers: object) -> str:
 
 @pytest.fixture
 def date(tmp_path: Path) -> Path:
-    """A drive to the north at 49 degrees, 2 m a frame, and climbing; the heading is then a quarter of a turn."""
+    """A drive to the north at 49 degrees of latitude, 2 m per frame, and climbing. Its yaw is about 90 degrees."""
     date = tmp_path / "2011_09_26"
     drive = date / DRIVE
     for folder in ("velodyne_points/data", "image_02/data", "oxts/data"):
@@ -54,7 +54,8 @@ def date(tmp_path: Path) -> Path:
 
 
 def test_frames(date: Path) -> None:
-    """By number, also after one that is missing; points as measured but for the known error of the sensor's angles."""
+    """Frames by number, also after a missing one. Points are as measured, except for the known error of the sensor's
+    angles."""
     source = open_source(date / DRIVE)
     assert isinstance(source, KittiRawSource)
     assert (len(source), source.name, source.notes) == (3, DRIVE, [])
@@ -64,15 +65,15 @@ def test_frames(date: Path) -> None:
     assert frames[0].stamp % 10**9 == 251199337
     raw = np.fromfile(date / DRIVE / "velodyne_points/data/0000000001.bin", "<f4").reshape(-1, 4)
     points = frames[0].points
-    np.testing.assert_allclose(points[:, 3], raw[:, 3] / 255)  # intensities above 1 are of 0..255
+    np.testing.assert_allclose(points[:, 3], raw[:, 3] / 255)  # intensities above 1 mean a range of 0..255
     np.testing.assert_allclose(points[:, :3], correct_vertical_angle(raw, HDL64_CORRECTION_DEG)[:, :3])
     left, right = points[:, 1] > 0, points[:, 1] < 0
-    assert (frames[0].time_offset[left] < 0).all()  # it turns clockwise, and faces forward at the stamp
+    assert (frames[0].time_offset[left] < 0).all()  # it rotates clockwise, and faces forward at the stamp
     assert (frames[0].time_offset[right] > 0).all()
 
 
 def test_the_left_color_camera(date: Path) -> None:
-    """A point in front of it falls where P_rect_02 R_rect_00 T_cam_lidar has it."""
+    """A point in front of it projects to where P_rect_02 R_rect_00 T_cam_lidar puts it."""
     (image,) = next(open_source(date / DRIVE).frames(2)).images
     assert (image.pixels == 30).all()
     P = np.array([[50, 0, 20, 3], [0, 50, 15, 0.5], [0, 0, 1, 0.004]])
@@ -126,7 +127,7 @@ def test_what_cannot_be_read_is_named(date: Path, file: str, content: str | None
 
 def test_a_drive_without_scans_is_said_to_be_none(date: Path) -> None:
     for scan in (date / DRIVE / "velodyne_points/data").iterdir():
-        scan.rename(scan.with_suffix(".txt"))  # as those of an unsynchronized drive are
+        scan.rename(scan.with_suffix(".txt"))  # as in an unsynchronized drive
     with pytest.raises(UsageError, match=r"no scans .*want a drive that is `_sync`"):
         open_source(date / DRIVE)
 
@@ -139,7 +140,7 @@ def test_without_calibration_the_points_count(date: Path) -> None:
 
 
 def test_a_drive_on_another_disk_with_smaller_images(date: Path, tmp_path: Path) -> None:
-    """A link beside the calibration, and JPEG as many copies have."""
+    """A link next to the calibration, and JPEG images as in many copies."""
     (tmp_path / "disk").mkdir()
     (date / DRIVE).rename(tmp_path / "disk" / "drive")
     (date / DRIVE).symlink_to(tmp_path / "disk" / "drive")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files whose index is missing or leads to some of their messages only, as writers other than rosbag2's make."""
+"""MCAP files whose index is missing or covers only some of their messages, as writers other than rosbag2's make
+them."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ COUNT = 20
 
 
 def write(bags: Any, file: Path, ros1: bool = False, profile: str = "ros2", **options: Any) -> Path:
-    """Clouds at 10 Hz with their numbers as x, each second one written before the one that came before it, and a
-    message of a channel without a schema."""
+    """Clouds at 10 Hz with their numbers as x, every second one written before its predecessor, and a message of a
+    channel without a schema."""
     with file.open("wb") as stream:
         writer, kind = Writer(stream, **options), "sensor_msgs/msg/PointCloud2"
         writer.start(profile=profile, library="test")
@@ -58,7 +59,7 @@ NO_SUMMARY = {"repeat_channels": False, "use_statistics": False, "use_summary_of
 def test_all_messages_are_read_in_order_whatever_the_index_lacks(
     bags: Any, tmp_path: Path, options: dict[str, Any]
 ) -> None:
-    """Nor is such a file, which is whole, called damaged or cut."""
+    """Such a file is complete, and is not reported as damaged or truncated."""
     source = open_source(write(bags, tmp_path / "drive.mcap", **options))
     assert len(source) == COUNT
     assert [frame.points[0, 0] for frame in source.frames()] == list(range(COUNT))

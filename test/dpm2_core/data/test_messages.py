@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PointCloud2 decoding: against plain struct decoding, and on damaged messages."""
+"""PointCloud2 decoding: compared with plain struct decoding, and for damaged messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 
 @st.composite
 def raw_clouds(draw: st.DrawFn) -> tuple[SimpleNamespace, np.ndarray]:
-    """A PointCloud2 of random layout, written by struct one value at a time, and the xyz it holds."""
+    """A PointCloud2 of random layout, written with struct one value at a time, and its xyz."""
     big, height, width = draw(st.booleans()), draw(st.integers(1, 4)), draw(st.integers(0, 6))
     names = draw(st.permutations(["x", "y", "z", "ring", "tag"]))
     fields, offset = [], draw(st.integers(0, 3))
@@ -80,7 +80,7 @@ def test_the_packed_layout_is_not_copied() -> None:
         ("intensity", np.uint8([0, 1, 51]), [0, 1 / 255, 0.2]),  # an integer 1 is dark, not full
         ("intensity", np.uint16([0, 1, 255]), [0, 1 / 255, 1]),
         ("Intensity", np.uint16([0, 13107, 65535]), [0, 0.2, 1]),
-        ("intensity", np.float64([0, np.nan, 255]), [0, 0, 1]),  # an unknown intensity does not make the point unknown
+        ("intensity", np.float64([0, np.nan, 255]), [0, 0, 1]),  # an unknown intensity does not make the point invalid
         ("intensity", np.float32([-1, np.inf, 1]), [0, 0, 1]),
         ("ring", np.uint8([1, 2, 3]), [0, 0, 0]),
     ],
@@ -90,7 +90,7 @@ def test_intensity_is_scaled_to_one(name: str, value: np.ndarray, want: list[flo
     before = bytes(msg.data)
     points, _ = messages.decode_points(msg)
     np.testing.assert_allclose(points[:, 3], want, rtol=1e-6)
-    assert bytes(msg.data) == before  # the message itself is left alone
+    assert bytes(msg.data) == before  # the message itself is not changed
 
 
 def test_intensity_max_is_obeyed() -> None:
@@ -141,7 +141,7 @@ def test_row_step_of_a_single_row_is_not_needed() -> None:
 
 @pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"])
 def test_written_columns_come_back(kind: str) -> None:
-    """What `cloud_fields` writes, `cloud_view` reads: any type, and features of many values a point."""
+    """`cloud_view` reads what `cloud_fields` writes: any type, and features with many values per point."""
     rng = np.random.default_rng(1)
     columns = {"x": rng.normal(size=7).astype("f4"), "feature": rng.integers(0, 100, (7, 16)).astype(kind)}
     view = messages.cloud_view(SimpleNamespace(**messages.cloud_fields(columns, SimpleNamespace)), columns)
@@ -150,7 +150,7 @@ def test_written_columns_come_back(kind: str) -> None:
 
 
 def test_real_rclpy_messages_decode_alike() -> None:
-    """The duck typing holds for the classes that the node gets, with array.array data."""
+    """The duck typing works for the classes that the node receives, with array.array data."""
     sensor_msgs = pytest.importorskip("sensor_msgs.msg")
     columns = xyz(50, intensity=np.linspace(0, 1, 50, dtype=np.float32), t=np.arange(50, dtype=np.uint32) * 2_000_000)
     fields = messages.cloud_fields(columns, sensor_msgs.PointField)

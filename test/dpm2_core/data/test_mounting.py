@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag says by /tf_static which way is up for its LiDAR, as it does to the nodes."""
+"""/tf_static in a bag gives the up direction of its LiDAR, as it does for the nodes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dpm2_core.geometry import se3
 from ...helpers.rooms import boxes, scan
 
 Roll = tuple[float, float]
-"""Of a frame in its parent, with its pitch, degrees."""
+"""Roll and pitch of a frame in its parent, degrees."""
 
 
 def rotation(turn: Roll) -> NDArray[np.float64]:
@@ -30,7 +30,8 @@ def rotation(turn: Roll) -> NDArray[np.float64]:
 def read(
     bags: Any, folder: Path, links: Sequence[tuple[str, str, Roll]], turn: Roll = (0, 0), first: Sequence[Any] = ()
 ) -> BagSource:
-    """A bag of two clouds of a street, of a LiDAR that is mounted with a turn; `first`: messages of clouds before."""
+    """A bag of two clouds of a street, from a LiDAR that is mounted with a rotation; `first`: cloud messages before
+    them."""
     hull, things = np.array([[-60, -12, 0], [60, 12, 30.0]]), boxes((-40, -8), (40, 8), 20, np.array([4.0, 2.0, 2.0]))
     points = scan(se3.make(np.eye(3), [0, 0, 1.7]), hull, things, 0)
     columns = point_columns(se3.transform(se3.make(rotation(turn).T, np.zeros(3)), points))
@@ -50,7 +51,7 @@ def said(source: BagSource) -> list[str]:
 
 @pytest.mark.parametrize(("turn", "up"), [((180, 0), (0, 0, -1)), ((0, 30), (-0.5, 0, 0.75**0.5))])
 def test_up_is_that_of_the_root_above_the_lidar(bags: Any, tmp_path: Path, turn: Roll, up: tuple[float, ...]) -> None:
-    """And not of what the base moves in; a tilt is said, since the map turns by it."""
+    """And not that of the frame in which the base moves. A tilt is reported, because it rotates the map."""
     links = [("odom", "base_link", (90.0, 0.0)), ("base_link", "velo_link", turn)]
     source = read(bags, tmp_path, links, turn)
     np.testing.assert_allclose(ups(source), [up, up], atol=1e-9)
@@ -70,7 +71,7 @@ def test_a_lidar_that_stands_or_of_which_nothing_is_known_has_its_own_z(
 
 
 def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path: Path) -> None:
-    """A camera, of which the extrinsics are often told the other way: its z looks ahead."""
+    """A camera, whose extrinsics are often published as their inverse: its z axis points ahead."""
     source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))])
     assert ups(source).tolist() == [[0, 0, 1]] * 2
     (note,) = said(source)
@@ -80,14 +81,14 @@ def test_a_root_in_which_the_ground_is_not_level_is_no_base(bags: Any, tmp_path:
 
 
 def test_a_driver_that_begins_with_an_empty_cloud_says_nothing_of_the_ground(bags: Any, tmp_path: Path) -> None:
-    """The next one does."""
+    """The next cloud shows it."""
     source = read(bags, tmp_path, [("camera_optical", "velo_link", (0, -90))], first=[bags.cloud(0.9, count=0)])
     assert ups(source).tolist() == [[0, 0, 1]] * 3
     assert "which is not used as base" in said(source)[0]
 
 
 def test_a_converted_bag_has_the_mount(bags: Any, tmp_path: Path) -> None:
-    """Its LiDAR is in the same place of its base, and as tilted: it leads to the same map, level as before."""
+    """Its LiDAR has the same pose in its base, with the same tilt: it leads to the same map, level as before."""
     source = read(bags, tmp_path, [("odom", "base", (0.0, 0.0)), ("base", "velo_link", (0, 30))], (0, 30))
     convert(source, tmp_path / "converted")
     converted = BagSource(tmp_path / "converted")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of an Ouster: a sphere around the sensor, by Ouster's own package to packets and files, and back."""
+"""Recordings of an Ouster: a sphere around the sensor, written to packets and files by Ouster's own package, and
+read."""
 
 from __future__ import annotations
 
@@ -19,12 +20,12 @@ from dpm2_core.extras import MissingPackageError
 
 START, PERIOD = 1_700_000_000_000_000_000, 100_000_000  # ns
 COLUMNS, SWEEPS = 512, 3
-LOST = 16  # columns of the second sweep, the first packet of it
-PORT, IMU_PORT = 7502, 7503  # of UDP
+LOST = 16  # columns of the second sweep, its first packet
+PORT, IMU_PORT = 7502, 7503  # UDP
 
 
 def sensor(number: int = 7) -> Any:
-    """Its metadata."""
+    """Metadata of a sensor."""
     core = pytest.importorskip("ouster.sdk.core", reason="no ouster-sdk: make setup")
     lidar = core.SensorInfo.from_default(core.LidarMode(COLUMNS, 10))
     lidar.sn, lidar.config.udp_port_lidar, lidar.config.udp_port_imu = number, PORT, IMU_PORT
@@ -33,7 +34,7 @@ def sensor(number: int = 7) -> Any:
 
 
 def sweeps(info: Any) -> list[Any]:
-    """Of 10, 11 and 12 m; the uppermost beam sees nothing. Reflectivity 51 is 0.2."""
+    """Sweeps of 10, 11 and 12 m. The uppermost beam has no returns. Reflectivity 51 is an intensity of 0.2."""
     from ouster.sdk import core
 
     made = []
@@ -66,7 +67,7 @@ def osf(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def pcap(tmp_path: Path) -> Path:
-    """Packets of UDP as tcpdump writes them, and the metadata beside it."""
+    """UDP packets as tcpdump writes them, with the metadata next to them."""
     info = sensor()
     from ouster.sdk import core
 
@@ -76,7 +77,7 @@ def pcap(tmp_path: Path) -> Path:
         packets = core.frame_to_packets(sweep, core.PacketFormat(info), info.init_id, info.sn)
         blocks += [packet_of(PORT, bytes(packet.buf), n) for packet in packets]
         for stamp in range(START + n * PERIOD, START + (n + 1) * PERIOD, PERIOD // 10):
-            # Of its system, the accelerometer and the gyroscope; in g and degrees per second.
+            # Times of the system, accelerometer and gyroscope; in g and degrees per second.
             sample = struct.pack("<QQQ6f", stamp, stamp, stamp, 0, 0, 1, 0, 0, np.degrees(0.5))
             blocks.append(packet_of(IMU_PORT, sample, n))
     path.write_bytes(b"".join(blocks))
@@ -85,7 +86,7 @@ def pcap(tmp_path: Path) -> Path:
 
 
 def packet_of(port: int, data: bytes, sweep: int) -> bytes:
-    """A UDP packet as it is in a .pcap, with the time of its arrival."""
+    """A UDP packet as in a .pcap file, with its arrival time."""
     udp = struct.pack(">HHHH", port, port, 8 + len(data), 0)
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(data), 0, 0x4000, 64, 17, 0) + b"\1" * 4 + b"\2" * 4
     frame = b"\0" * 12 + b"\x08\x00" + ip + udp + data
@@ -111,7 +112,7 @@ def test_points_times_and_intensities(kind: str, request: pytest.FixtureRequest)
         assert frame.stamp == START + n * PERIOD + first
         span = (COLUMNS - 1) * PERIOD // COLUMNS - first
         np.testing.assert_allclose([frame.time_offset.min(), frame.time_offset.max()], [0, span * 1e-9], atol=1e-6)
-        # One turn clockwise: each azimuth is where the sensor was at that time.
+        # One clockwise rotation: each azimuth is that of the sensor at that time.
         turned = np.unwrap(np.arctan2(*frame.points[: COLUMNS - lost, 1::-1].T.astype(float)))
         slope = np.polyfit(frame.time_offset[: COLUMNS - lost], turned, 1)[0]
         np.testing.assert_allclose(slope, -2 * np.pi * 1e9 / PERIOD, rtol=0.01)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud gets the image nearest in time, whatever comes between, and waits for it no longer than it must."""
+"""A cloud receives the image nearest in time, whatever arrives in between, and waits for it no longer than
+necessary."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def serialized(stamp: int) -> bytes:
 
 
 def record(clouds: list[tuple[int, int]], images: list[tuple[int, int]]) -> list[RawMessage]:
-    """Both as (stamp, delay until it is recorded), ms after START; what is recorded at once comes in this order."""
+    """Clouds and images, both as (stamp, delay until recording), ms after START. Messages of the same recording time
+    are in this order."""
     messages = [(topic, (START + stamp + delay) * MS, serialized(START + stamp))
                 for topic, sent in (("/cloud", clouds), ("/image", images)) for stamp, delay in sent]  # fmt: skip
     return sorted(messages, key=lambda message: message[1])
@@ -35,7 +37,7 @@ def record(clouds: list[tuple[int, int]], images: list[tuple[int, int]]) -> list
 def paired(
     messages: list[RawMessage], tolerance: float = 0.05, offset: int = 0, silent: tuple[str, ...] = ()
 ) -> dict[int, int | None]:
-    """The stamp of each cloud to that of its image, ms after START; `silent`: other topics that clouds wait for."""
+    """Stamp of each cloud -> stamp of its image, ms after START; `silent`: other topics that clouds wait for."""
     images, out, waiting = Beside(tolerance), {}, deque[tuple[int, RawMessage]]()
     others = {"/image": offset * MS, **dict.fromkeys(silent, 0)}
     for topic, _, data in clouds_after_others(messages, ["/cloud"], others, waiting):
@@ -55,7 +57,8 @@ def paired(
     offset=st.integers(-40, 40),
 )
 def test_each_cloud_has_the_nearest_image_of_the_recording(shots: list[int], delays: list[int], offset: int) -> None:
-    """Of a camera with gaps and any rhythm, ahead of the clouds or behind them, as long as its images come in order."""
+    """For a camera with gaps and any frame rate, ahead of the clouds or behind them, as long as its images arrive in
+    order."""
     times = [int(shot) for shot in shots]
     images = list(zip(times, delays, strict=False))
     found = paired(record([(100 * n, 30) for n in range(20)], images), offset=offset)
@@ -72,7 +75,7 @@ def test_an_image_joins_the_cloud_that_was_recorded_before_it_for_a_while(delay:
 
 
 def test_a_cloud_that_waits_keeps_its_image() -> None:
-    """However many come meanwhile, here of a camera at 200 Hz while an IMU is silent."""
+    """However many images arrive meanwhile, here from a camera at 200 Hz while an IMU is silent."""
     messages = record([(100 * n, 0) for n in range(20)], [(5 * n, 10) for n in range(400)])
     assert paired(messages, silent=("/imu",)) == {100 * n: 100 * n for n in range(20)}
 
@@ -83,7 +86,7 @@ def test_one_image_serves_two_clouds() -> None:
 
 @pytest.mark.parametrize("stray", [-60_000, 60_000])
 def test_one_stamp_far_off_costs_its_image_alone(stray: int) -> None:
-    """Ahead or behind: clouds are not sent off for it, and the images around it stay."""
+    """Ahead or behind: clouds are not released because of it, and the images around it are kept."""
     messages = record([(100 * n, 0) for n in range(10)], [(100 * n, 40) for n in range(10)])
     messages.insert(7, ("/image", messages[6][1], serialized(START + stray)))
     assert paired(messages) == {100 * n: 100 * n for n in range(10)}
@@ -104,14 +107,14 @@ def test_without_a_camera_nothing_is_held_back() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    """Whatever the stamps of images are; and clouds wait no longer than half a second for a camera that is silent."""
+    """Whatever the stamps of images are. Clouds wait no longer than half a second for a silent camera."""
     images = Beside(0.05)
     for n in range(10 * BUFFER):
         images.add(n * JUMP, n)
     assert images.nearest(0) is None
     kept, clouds = WeakSet[Beside](), [100 * n * MS for n in range(2 * BUFFER)]
     for n in range(1000):
-        message = Beside(0.05)  # as anything that a WeakSet takes
+        message = Beside(0.05)  # any object that a WeakSet accepts
         kept.add(message)
         images.add(10 * n * MS, message, clouds)
     del message

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The PLY files, read back by the rules of the format alone."""
+"""PLY files, read back by the rules of the format alone."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_points_of_another_shape_are_rejected(tmp_path: Path) -> None:
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
-    """Properties by name, in the order asked for; a missing one, a text file and a short one are rejected by name."""
+    """Properties by name, in the requested order. A missing property, a text file and a truncated file are rejected by
+    name."""
     points = np.random.default_rng(0).normal(size=(10, 4)).astype(np.float32)
     path = tmp_path / "map.ply"
     write_ply(path, points)
@@ -73,7 +74,7 @@ def _coded(coding: str, points: np.ndarray, body: bytes) -> bytes:
 
 
 def test_big_endian_and_ascii_are_read(tmp_path: Path) -> None:
-    """As MeshLab, Open3D and PCL write them; a drive of such scans was one of unreadable ones."""
+    """As written by MeshLab, Open3D and PCL. Previously, all scans of such a drive were unreadable."""
     points = np.array([(1.25, 4_000_000_000, 255), (-1e-3, 0, 0), (float("nan"), 7, 1)],
                       [("x", "<f8"), ("t", "<u4"), ("intensity", "u1")])  # fmt: skip
     text = "\r\n".join(" ".join(str(value) for value in row) for row in points.tolist()).encode()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times of points: units, origins, and what is no time."""
+"""Point times: units, origins, and invalid times."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RAMP = np.linspace(0, 0.1, 5)
         ("timestamp", STAMP * 1e-9 + RAMP, RAMP, 1e-6),  # Hesai: epoch in s; a double resolves 0.24 us there
         ("timestamp", STAMP + RAMP * 1e9, RAMP, 1e-6),  # Livox PointCloud2: epoch in ns
         ("timestamp", STAMP * 1e-3 + RAMP * 1e6, RAMP, 1e-6),
-        ("timestamp", 7200.0 + RAMP, RAMP, 1e-6),  # clock of the sensor since it was switched on
+        ("timestamp", 7200.0 + RAMP, RAMP, 1e-6),  # clock of the sensor since power-on
         ("t", np.uint32([1_800_000_000, 1_800_050_000, 1_800_100_000]), [0, 0.05, 0.1], 1e-6),  # us of the hour
     ],
 )
@@ -54,7 +54,8 @@ def test_times_that_tell_nothing() -> None:
 
 
 def test_a_unit_in_the_name_outweighs_the_span() -> None:
-    """Returns of a scan of 1 ms, the first of a sensor that was just switched on: by the span alone they were s."""
+    """Returns of a scan of 1 ms, the first of a sensor that was just switched on. By the span alone, the unit would be
+    s."""
     ramp = np.float64([0, 0.5, 1.0])
     np.testing.assert_allclose(messages.decode_points(cloud(xyz(3, time_ms=ramp)))[1], ramp * 1e-3, atol=1e-9)
     np.testing.assert_allclose(messages.decode_points(cloud(xyz(3, time_ms=ramp)), time_unit="s")[1], ramp, atol=1e-9)
@@ -72,7 +73,7 @@ def test_why_there_are_no_times_is_said(columns: dict[str, np.ndarray], reason: 
 
 
 def test_few_points_take_the_unit_of_their_type() -> None:
-    """Two points 1 us apart: the span says nothing, an integer is then ns and a float s."""
+    """Two points 1 us apart: the span shows nothing. An integer is then in ns and a float in s."""
     np.testing.assert_allclose(messages.decode_points(cloud(xyz(2, t=np.uint32([0, 1000]))))[1], [0, 1e-6])
     np.testing.assert_allclose(messages.decode_points(cloud(xyz(2, t=np.float32([0, 1e-6]))))[1], [0, 1e-6])
     stamps = STAMP * 1e-9 + np.array([0, 1e-6])
@@ -91,7 +92,7 @@ def test_missing_returns_do_not_spoil_the_times() -> None:
 
 @pytest.mark.parametrize("began", [5.0, STAMP * 1e-9])
 def test_a_time_of_zero_among_absolute_ones_means_nothing(began: float) -> None:
-    """As of a missing return whose point was moved into the vehicle's frame; by a clock of the sensor or by UTC."""
+    """For example a missing return whose point was transformed into the vehicle's frame; with a sensor clock or UTC."""
     _, clean = messages.decode_points(cloud(xyz(4, timestamp=began + np.array([0, 0.05, 0.07, 0.1]))))
     _, time = messages.decode_points(cloud(xyz(5, timestamp=np.append(began + np.array([0, 0.05, 0.07, 0.1]), 0.0))))
     np.testing.assert_array_equal(time, np.append(clean, 0))
@@ -102,7 +103,8 @@ def test_a_time_of_zero_among_absolute_ones_means_nothing(began: float) -> None:
 @pytest.mark.parametrize("unit", ["s", "ns"])
 @pytest.mark.parametrize("began", [0.05, 0.3, 1.0, 1.7, 2.5])
 def test_absolute_times_of_a_clock_that_has_just_begun(began: float, unit: str) -> None:
-    """As of a simulation, for layouts of Hesai, RoboSense and Livox: taken for relative they put points 1.7 s off."""
+    """As in a simulation, for layouts of Hesai, RoboSense and Livox. Taken as relative times, they put points 1.7 s
+    off."""
     ramp, stamp = np.linspace(0, 0.1, 200), round(began * 1e9)
     for first in (0.0, -0.1) if began > 0.1 else (0.0,):  # stamped at its first or its last point
         time = (began + first + ramp) * (1e9 if unit == "ns" else 1)
@@ -113,7 +115,7 @@ def test_absolute_times_of_a_clock_that_has_just_begun(began: float, unit: str) 
 
 
 def test_times_that_mean_nothing_are_none() -> None:
-    """Unsigned ones from before the stamp: as zeros nearly all of them would have passed for known."""
+    """Unsigned times from before the stamp: as zeros, nearly all of them would count as known."""
     early = np.uint32(np.arange(-20_000_000, 80_000_000, 1_000_000) % 2**32)
     msg = cloud(xyz(100, t=early))
     assert messages.decode_points(msg)[1] is None
@@ -125,7 +127,8 @@ def test_times_that_mean_nothing_are_none() -> None:
     ("began", "unit"), [(0, 1e-6), (0, 1e-9), (0, 1), (STAMP * 1e-9, 1), (60e9, 1e-9), (5.0, 1)]
 )  # fmt: skip
 def test_one_time_that_is_far_off_spoils_no_other(began: float, unit: float, wrong: float) -> None:
-    """As of a damaged packet: it took the unit from the others, or their beginning. Tolerance: float64 of an epoch."""
+    """For example of a damaged packet. Previously, it changed the unit of the others, or their start. The tolerance is
+    that of an epoch in float64."""
     ramp = np.linspace(0, 0.1, 1000)
     time = began + ramp / unit
     spoiled = time.copy()
@@ -139,13 +142,13 @@ def test_one_time_that_is_far_off_spoils_no_other(began: float, unit: float, wro
 
 
 def test_two_times_years_apart_are_no_sweep() -> None:
-    """Nothing says which of the two is right: neither point is moved by more than a sweep can last."""
+    """Nothing shows which of the two is right: neither point is moved by more than the longest sweep."""
     _, offset = messages.decode_points(cloud(xyz(2, timestamp=np.array([5.0, STAMP * 1e-9 + 1e8]))))
     assert offset is None or np.abs(offset).max() <= 2.0
 
 
 def test_times_that_no_sweep_can_have_are_left_out() -> None:
-    """They would move the points to anywhere; the other points keep theirs."""
+    """They would move points anywhere; the other points keep their times."""
     _, offset = messages.decode_points(cloud(xyz(5, t=np.array([0.0, 0.05, 0.1, 1e300, np.nan]))), time_unit="s")
     np.testing.assert_allclose(offset[:3], [0, 0.05, 0.1])
     assert np.isfinite(offset).all()

@@ -40,7 +40,7 @@ def test_near_points_are_over_far_ones_and_redder() -> None:
     near, far = (painted(Image(BLACK, camera), cloud)[60, 80] for cloud in (both, both[1:]))
     np.testing.assert_array_equal(near, painted(Image(BLACK, camera), both[::-1])[60, 80])
     assert int(near[0]) - int(near[2]) > int(far[0]) - int(far[2])
-    assert (BLACK == 0).all()  # the image itself stays
+    assert (BLACK == 0).all()  # the image itself is not changed
 
 
 def test_the_lens_bends_and_a_wrong_extrinsic_shows() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds that are sent again, whole or in part."""
+"""Clouds that are published again, completely or in part."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def cloud(rng: np.random.Generator, count: int = 30_000) -> Points:
 
 
 def kept(*clouds: Points) -> int:
-    """How many points of the last cloud are."""
+    """Number of points of the last cloud that are kept."""
     part = RepeatedPart()
     return [len(part.new(Frame(index, points)).points) for index, points in enumerate(clouds)][-1]
 
@@ -44,7 +44,8 @@ def test_the_array_of_before_may_be_used_again(noise: np.random.Generator) -> No
 
 
 def test_what_is_no_fault_stays(noise: np.random.Generator) -> None:
-    """A robot's own body, or at rest in a simulation without noise all but what moves; a driver's missing returns."""
+    """The robot's own body; at rest in a simulation without noise, everything except moving objects; a driver's missing
+    returns."""
     first, second = cloud(noise), cloud(noise)
     body = np.concatenate([first[:6000], second[6000:]])
     assert kept(first, body) == 30_000
@@ -59,7 +60,7 @@ def test_what_is_no_fault_stays(noise: np.random.Generator) -> None:
 
 
 def test_ranges_in_coarse_steps_stay(noise: np.random.Generator) -> None:
-    """At rest, on the same directions, one in four measures the same again: that is less than what counts."""
+    """At rest, with the same directions, one in four ranges is measured again: this is less than the threshold."""
     directions = noise.normal(size=(30_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distance = noise.uniform(2, 40, 30_000)
@@ -73,7 +74,7 @@ def test_ranges_in_coarse_steps_stay(noise: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("speed", "stuck"), [(0.0, False), (1.0, False), (2.0, True)])
 def test_the_speed_says_whether_a_robot_may_have_stopped(noise: np.random.Generator, speed: float, stuck: bool) -> None:
-    """m/s, whatever the rate of the scans; a repetition that was taken for a halt stays one."""
+    """The speed in m/s counts, whatever the rate of the scans. A repetition that was taken for a halt remains one."""
     points, seen = cloud(noise), RepeatedCloud()
     assert not seen.repeats(Frame(0, points), 5.0)
     seen.keep(np.eye(4), 0.0)
@@ -87,8 +88,8 @@ def test_the_speed_says_whether_a_robot_may_have_stopped(noise: np.random.Genera
 def test_a_sensor_whose_clouds_differ_at_rest_never_sends_the_same_twice(
     noise: np.random.Generator, same: float, step: float, stuck: bool
 ) -> None:
-    """It has noise, as 3 s at rest have shown. Two cases show none: a simulation without noise in which a person walks
-    past, and a robot that creeps at 0.1 m/s."""
+    """3 s at rest have shown that it has noise. Two cases show no noise: a simulation without noise in which a person
+    walks past, and a robot that creeps at 0.1 m/s."""
     seen = RepeatedCloud()
     for index in range(32):
         points = cloud(noise, 1000)

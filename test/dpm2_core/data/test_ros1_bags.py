@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of ROS 1, and Livox' CustomMsg in bags of both, read as any other."""
+"""ROS 1 bags, and Livox' CustomMsg in bags of both ROS versions, are read like any other bag."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SECONDS = np.linspace(0, 0.1, 50)
 
 @pytest.fixture(scope="module")
 def ros1(bags: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Clouds, images, calibration and a Livox' points, three each, by rosbags' own writer."""
+    """Three clouds, images, calibrations and Livox clouds each, written by rosbags."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -49,7 +49,7 @@ def ros1(bags: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def as_ros1(message: Any) -> bytes:
-    """A message of ROS 2, whose header has no number, as ROS 1 serializes it."""
+    """A ROS 2 message, whose header has no sequence number, as ROS 1 serializes it."""
     from rosbags.typesys import Stores, get_typestore
 
     jazzy = get_typestore(Stores.ROS2_JAZZY)
@@ -85,7 +85,7 @@ def test_livox_points_of_a_ros1_bag(ros1: Path) -> None:
 
 @pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
 def test_livox_points_of_a_rosbag2(tmp_path: Path, plugin: str) -> None:
-    """Without the package, and without the definition that the bag brings along."""
+    """Without the message's package, and without the definition in the bag."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     with Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin[plugin]) as writer:
@@ -103,7 +103,7 @@ def test_livox_points_of_a_rosbag2(tmp_path: Path, plugin: str) -> None:
 @pytest.mark.parametrize("frame", ["", "a", "livox_frame", "ab" * 20])
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_what_ros1_and_ros2_serialize_is_alike(frame: str, count: int) -> None:
-    """Wherever the name of the frame puts the fields behind it."""
+    """Whatever the length of the frame's name, which shifts the fields behind it."""
     want = custom_message(10**9, POINTS[:count], SECONDS[:count], frame)
     message = cloud_of_custom(want)
     assert (message.header.frame_id, message.width) == (frame, count)
@@ -126,7 +126,7 @@ def test_damaged_livox_messages_are_named() -> None:
 
 
 def test_damaged_ros1_bags(ros1: Path, tmp_path: Path) -> None:
-    """Cut anywhere: one clear line; overwritten anywhere: frames, failed ones, or an end that the notes explain."""
+    """Cut anywhere: one clear line. Overwritten anywhere: frames, failed ones, or an end that the notes explain."""
     from dpm2_core.data.settings import InputSettings
 
     whole, path, rng = ros1.read_bytes(), tmp_path / "b.bag", np.random.default_rng(0)
@@ -153,7 +153,7 @@ def test_types_that_are_not_known_are_only_named(ros1: Path) -> None:
 
 
 def test_a_folder_of_split_bags_is_one_recording(bags: Any, tmp_path: Path) -> None:
-    """In order of time, not of names; one that is cut is left out, and named."""
+    """In time order, not by name. A truncated bag is left out, and named."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 

@@ -18,7 +18,7 @@ from test.helpers.recordings import IMAGE, INFO, POINTS, Message, by_time, cloud
 
 
 def test_clouds_of_a_second_lidar_join_in_the_frame_of_the_first(bags: Any, tmp_path: Path) -> None:
-    """It stands 2 m to the left, and is 40 ms late: its points say when they were taken."""
+    """It is mounted 2 m to the left, and its clouds are 40 ms later: their points have this time."""
     second = [(t + 0.04, "/second", bags.cloud(t + 0.04, x=10 * t, frame="left")) for t in (1, 1.1, 1.3)]
     tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
     bag = bags.write(tmp_path / "b", by_time([*clouds(bags, [1, 1.1, 1.2, 1.3]), *second, tree]))
@@ -34,7 +34,7 @@ def test_clouds_of_a_second_lidar_join_in_the_frame_of_the_first(bags: Any, tmp_
 
 
 def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any, tmp_path: Path) -> None:
-    """Drivers send zeros for them, or NaN. Their times go with them."""
+    """Drivers send zeros for them, or NaN. Their times are removed, too."""
     columns = {name: np.full(60, value, np.float32) for name, value in (("x", 5.0), ("y", 2.0), ("z", 3.0))}
     columns["t"] = np.linspace(0, 0.1, 60, dtype=np.float32)
     for name in "xyz":
@@ -52,7 +52,8 @@ def test_missing_returns_of_a_second_lidar_are_no_points_at_its_place(bags: Any,
 def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
     bags: Any, tmp_path: Path, ahead: float, missing: int
 ) -> None:
-    """Too far apart, or stamps of another clock: as of a camera, nothing else says that its points are missing."""
+    """Too far apart, or with stamps of another clock: as for a camera, nothing else reports that its points are
+    missing."""
     times = [1, 1.2, 1.4, 1.6]
     second = [(t + 0.01, "/second", bags.cloud(t + ahead, frame="left")) for t in times]
     tree = (1, "/tf_static", bags.transform("velo_link", "left", (0, 2, 0)))
@@ -65,8 +66,9 @@ def test_clouds_of_a_second_lidar_that_do_not_fit_are_counted(
 
 @pytest.mark.parametrize(("clock", "later"), [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.7, 0.0), (0.0, 0.1)])
 def test_a_second_lidar_with_another_clock_is_named(bags: Any, tmp_path: Path, clock: float, later: float) -> None:
-    """By some periods: its clouds join others than those that they were measured with. A sweep's length between the
-    times of recording says nothing of a clock: one driver may stamp the start, the other one the end."""
+    """Its clock differs by some periods, so its clouds are joined with others than those measured at the same time. A
+    difference of one sweep between the recording times does not show another clock: one driver may stamp the start, the
+    other one the end."""
     times = np.arange(10, 13, 0.1).round(1)
     second = [(t + 0.05 + later, "/second", bags.cloud(t + clock, frame="left")) for t in times]
     first = [(t + 0.05, POINTS, bags.cloud(t)) for t in times]
@@ -98,7 +100,7 @@ def test_a_second_lidar_without_a_place_is_left_out(bags: Any, tmp_path: Path) -
 
 
 def test_two_lidars_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp_path: Path) -> None:
-    """As slam_node, which rejects them: what the second one sees is no motion of the first. One name of a frame has a
+    """They are rejected, as in slam_node: what the second LiDAR sees is no motion of the first. A frame's name has a
     slash in ROS 1 and none in ROS 2."""
     frames = ["velo_link", "left", "/velo_link", "left"]
     sent = [(t, POINTS, bags.cloud(t, frame=frame)) for t, frame in zip((1, 1.1, 1.2, 1.3), frames, strict=True)]
@@ -115,8 +117,9 @@ def test_two_lidars_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp
 
 
 def test_two_cameras_on_one_topic_are_not_taken_for_one_that_jumps(bags: Any, tmp_path: Path) -> None:
-    """As of drivers in namespaces that are remapped to one topic. The other's images are nearer to the clouds, and its
-    calibration comes first: the images of the camera that was heard first count, with its calibration."""
+    """For example of drivers in namespaces that are remapped to one topic. The other camera's images are nearer to the
+    clouds, and its calibration arrives first. The camera whose image arrives first is used, with its own
+    calibration."""
     sent = [(0.9, INFO, bags.info(0.9)), *clouds(bags, [1, 1.1, 1.2])]
     sent[0][2].header.frame_id, sent[0][2].width = "left", 4
     for n, t in enumerate((1, 1.1, 1.2)):
@@ -140,14 +143,14 @@ def of_frame(message: Any, frame: str) -> Any:
 
 
 def rear(bags: Any, times: list[float]) -> list[Message]:
-    """A camera 1 m behind the LiDAR; its values are 100 and up."""
+    """A camera 1 m behind the LiDAR, with gray values of 100 and more."""
     images = [(t, REAR, of_frame(bags.image(t, 100 + n), "rear")) for n, t in enumerate(times)]
     info, place = of_frame(bags.info(1), "rear"), bags.transform("velo_link", "rear", (-1, 0, 0))
     return [(1, REAR_INFO, info), (1, "/tf_static", place), *images]
 
 
 def all_seen(source: BagSource) -> list[list[int]]:
-    """The gray values of each frame's images."""
+    """Gray values of each frame's images."""
     return [[int(image.pixels[0, 0, 0]) for image in frame.images] for frame in source.frames()]
 
 
@@ -155,7 +158,8 @@ TWO = InputSettings(second_image_topic=REAR)
 
 
 def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: Path) -> None:
-    """Out of phase; each misses some clouds, which costs the other nothing. The second alone is one more camera."""
+    """The cameras are out of phase. Each misses some clouds, which does not affect the other. The second camera alone
+    is an ordinary camera."""
     times = [1.0, 1.1, 1.2, 1.3, 1.4]
     ahead = [(t, IMAGE, bags.image(t, n)) for n, t in enumerate((1.01, 1.11, 1.41))]
     recorded = [*clouds(bags, times), *rig(bags), *ahead, *rear(bags, [0.97, 1.17, 1.27, 1.37])]
@@ -170,7 +174,7 @@ def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: 
     assert f"1 of 5 frames have no image of {REAR} (within 0.05 s)" in source.notes
     assert all_seen(BagSource(bag, InputSettings(image_topic=IMAGE))) == [[0], [1], [], [], [2]]
     assert all_seen(BagSource(bag, InputSettings(image_topic=REAR))) == [[100], [], [101], [102], [103]]
-    placed = InputSettings(second_image_topic=REAR, T_lidar_cam=(0.5, 0, 0, 0, 0, 0, 1))  # of the first one alone
+    placed = InputSettings(second_image_topic=REAR, T_lidar_cam=(0.5, 0, 0, 0, 0, 0, 1))  # only of the first one
     (first, *_) = BagSource(bag, placed).frames()
     assert [image.camera.T_lidar_cam[0, 3] for image in first.images] == [0.5, -1]
     alone = bags.write(tmp_path / "alone", by_time([*clouds(bags, times), *rear(bags, times)]))
@@ -178,7 +182,8 @@ def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: 
 
 
 def test_a_second_camera_that_cannot_be_used_is_named(bags: Any, tmp_path: Path) -> None:
-    """It was asked for: an error, as of a camera that is; images that cannot be read cost themselves."""
+    """It was requested, so this is an error, as for the first camera. Images that cannot be read cost only
+    themselves."""
     first = [*clouds(bags, [1, 2]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (2, IMAGE, bags.image(2, 8))]
     second = rear(bags, [1, 2])
     cases: list[tuple[list[Message], str]] = [

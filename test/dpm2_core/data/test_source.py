@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening whatever the user points at, and reading ahead."""
+"""Opening any kind of recording, and reading ahead."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_prefetch_keeps_order_and_reads_ahead() -> None:
     ahead = prefetch(items(), depth=2)
     assert next(ahead) == 0
     deadline = time.monotonic() + 60
-    while len(read) < 4 and time.monotonic() < deadline:  # the one given out, two queued, one in hand
+    while len(read) < 4 and time.monotonic() < deadline:  # one returned, two queued, one waiting
         time.sleep(0.01)
     assert read == [0, 1, 2, 3]
     assert list(ahead) == list(range(1, 10))
@@ -96,7 +96,7 @@ def test_closing_prefetch_ends_its_thread() -> None:
 
 @pytest.mark.parametrize("text", ["10:5", "3:3", ":0"])
 def test_an_empty_range_is_said_to_be_one(text: str) -> None:
-    """It was said how many frames there are, which are enough."""
+    """Previously, the error stated the number of frames, which is sufficient."""
     with pytest.raises(UsageError, match=f"--frames {text}: want a before b in a:b"):
         parse_range(text)
 

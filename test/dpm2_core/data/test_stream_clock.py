@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What counts as time and as a pause, by the stamps alone."""
+"""Time and pauses, determined from the stamps alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_stamps_that_do_not_advance_count_as_a_period() -> None:
 
 
 def test_two_stamps_of_a_fast_stream_that_come_close_count_as_one_of_its_periods() -> None:
-    """Of 100 Hz, stamped on arrival: two that were 4 ms apart counted as 0.1 s."""
+    """At 100 Hz, stamped on arrival. Previously, two stamps that were 4 ms apart counted as 0.1 s."""
     clock = StreamClock()
     for stamp in range(0, 100, 10):
         clock.advance(stamp * 10**6)
@@ -33,7 +33,7 @@ def test_of_a_fast_stream_a_stamp_that_jumps_back_counts_as_one_of_its_periods()
 
 @pytest.mark.parametrize("back", [150, 300, 1000, 5000, 3_600_000])
 def test_one_stamp_that_jumps_back_makes_no_pause(back: int) -> None:
-    """Back by so many ms; a clock that is set back goes on from there."""
+    """Back by `back` ms. A clock that is set back continues from there."""
     clock = StreamClock()
     stamps = [1000, 1100, 1200 - back, 1300, 1400, 1500 - back, 1600 - back, 1700 - back]
     assert [clock.advance(stamp * 10**6) for stamp in stamps] == pytest.approx([0.1] * 8)
@@ -64,7 +64,7 @@ def test_time_that_goes_back_by_more_than_a_second_is_told_until_somebody_has_lo
 
 
 def test_lost_frames_and_two_of_a_burst_do_not_change_the_usual_period() -> None:
-    """Before five periods none is usual."""
+    """Before five periods there is no usual period."""
     clock = StreamClock()
     for stamp in (0, 100, 200, 300, 400):
         clock.advance(stamp * 10**6)
@@ -76,7 +76,7 @@ def test_lost_frames_and_two_of_a_burst_do_not_change_the_usual_period() -> None
 
 def test_a_period_that_was_corrected_counts_as_it_was() -> None:
     clock = StreamClock()
-    clock.correct(5.0)  # before the first frame nothing
+    clock.correct(5.0)  # no effect before the first frame
     for stamp in range(0, 1000, 10):
         clock.advance(stamp * 10**6)
         clock.correct(0.1)
@@ -85,7 +85,7 @@ def test_a_period_that_was_corrected_counts_as_it_was() -> None:
 
 
 def test_two_frames_at_a_time_are_a_rhythm() -> None:
-    """Two frames at a time are no pause between, and a gap or two in a stream still are."""
+    """There is no pause between pairs of frames, but a gap or two in a regular stream still are pauses."""
     clock = StreamClock()
     for stamp in (800 * i + j for i in range(6) for j in (0, 100)):
         clock.advance(stamp * 10**6)
@@ -97,7 +97,7 @@ def test_two_frames_at_a_time_are_a_rhythm() -> None:
 
 
 def test_a_pause_is_longer_than_the_rhythm_of_the_stream() -> None:
-    """A stream of one frame per second does not pause each second; before two periods its rhythm is not known."""
+    """A stream of one frame per second does not pause each second. Before two periods its rate is not known."""
     clock = StreamClock()
     for second in range(2):
         clock.advance(second * 10**9)

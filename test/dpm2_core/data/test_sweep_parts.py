@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds that are parts of a sweep are joined to whole sweeps, and only those."""
+"""Clouds that are parts of a sweep are joined to whole sweeps; other clouds are not."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ PERIOD = 10_000_000  # ns from one part to the next
 
 
 def part(i: int, *, span: float = 0.01, period: int = PERIOD, points: int = 50) -> Frame:
-    """A part of which each point has x = i and y = its time, s after the first part's stamp."""
+    """A part in which each point has x = i and y = its time, s after the first part's stamp."""
     offset = np.linspace(0, span, points, dtype=np.float32)
     data = np.zeros((points, 4), np.float32)
     data[:, 0], data[:, 1] = i, i * period * 1e-9 + offset
@@ -26,7 +26,7 @@ def part(i: int, *, span: float = 0.01, period: int = PERIOD, points: int = 50) 
 
 
 def numbers(sweep: Frame | None) -> list[int]:
-    """Which parts it consists of."""
+    """Numbers of the parts in a sweep."""
     return [] if sweep is None else np.unique(sweep.points[:, 0]).tolist()
 
 
@@ -36,7 +36,8 @@ def joined(frames: Sequence[Frame]) -> list[Frame | None]:
 
 
 def test_ten_parts_make_a_sweep_at_the_stamp_of_the_last() -> None:
-    """The first part is handed on at once, as nothing tells yet that it is one, and is in the first sweep too."""
+    """The first part is passed on at once, because nothing shows yet that it is a part. It is in the first sweep,
+    too."""
     first, *between, sweep = joined([part(i) for i in range(10)])
     assert numbers(first) == [0]
     assert between == [None] * 8
@@ -59,7 +60,7 @@ def test_each_part_is_in_one_sweep() -> None:
     [
         [part(i, span=0.1, period=100_000_000) for i in range(8)],  # a spinning LiDAR
         [part(i, span=0.001, period=100_000_000) for i in range(8)],  # a flash LiDAR
-        [part(i, span=0.1, period=2_000_000) for i in range(8)],  # whole sweeps that arrived together, stamped then
+        [part(i, span=0.1, period=2_000_000) for i in range(8)],  # whole sweeps, stamped on arrival at once
         [replace(part(i), time_offset=None) for i in range(8)],  # nothing shows whether these are parts
     ],
     ids=["spinning", "flash", "burst", "untimed"],
@@ -74,7 +75,7 @@ def test_what_a_pause_interrupts_is_not_joined_across_it() -> None:
 
 
 def test_lost_parts_leave_a_hole() -> None:
-    """A node that is too slow drops clouds: the sweep ends where it would have ended."""
+    """A node that is too slow drops clouds: the sweep ends where it would have ended otherwise."""
     *_, sweep = joined([part(i) for i in (0, 1, 2, 6, 9)])
     assert numbers(sweep) == [0, 1, 2, 6, 9]
 
@@ -89,7 +90,8 @@ def test_a_part_without_a_return_is_waited_through_and_an_unreadable_one_is_hand
 
 
 def test_a_sweep_has_what_the_other_sensors_measured_during_it() -> None:
-    """All samples of the IMU, the nearest image of each camera timed from the new stamp, and what was dropped."""
+    """All IMU samples, the nearest image of each camera, with its time relative to the new stamp, and the number of
+    dropped frames."""
     camera = Camera(np.array([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]]), np.eye(4), (8, 8))
     frames = []
     for i in range(10):
@@ -115,7 +117,8 @@ def test_the_arrays_of_a_part_may_be_used_again() -> None:
 
 
 def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
-    """Each sweep of a simulated drive sent in ten parts: a pose for each part, those between two sweeps predicted."""
+    """Each sweep of a simulated drive is sent in ten parts. Each part has a pose; those between two sweeps are
+    predicted."""
     frames, poses = make_drive("city", 20, deskewed=False)
     slam, tracked = make_slam(SlamSettings()), []
     for frame in frames:
@@ -129,5 +132,5 @@ def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
     assert [t.registration.method == BETWEEN for t in tracked[10:]] == ([True] * 9 + [False]) * 19
     assert not any(t.failed for t in tracked)
     assert tracked[-1].state is State.TRACKING
-    # of sweeps; those of whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
+    # error of the sweeps: whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
     assert off(tracked[9::10], poses).max() < 0.06

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A thumbnail is a JPEG like any other that says with which camera it was taken; what it says is checked."""
+"""A thumbnail is an ordinary JPEG that contains the calibration of its camera. This calibration is checked."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ CAMERA = Camera(
 
 
 def picture() -> Image:
-    """Red, and brighter to the right."""
+    """A red image, brighter to the right."""
     pixels = np.zeros((240, 640, 3), np.uint8)
     pixels[..., 0] = np.linspace(0, 255, 640)
     return Image(pixels, CAMERA)
 
 
 def with_comment(text: bytes) -> bytes:
-    """A thumbnail whose comment says something else."""
+    """A thumbnail with another comment."""
     jpeg = thumbnail(picture(), 320)
     (length,) = struct.unpack_from(">H", jpeg, 4)
     return jpeg[:4] + struct.pack(">H", len(text) + 2) + text + jpeg[4 + length :]
@@ -45,7 +45,7 @@ def changed(**fields: Any) -> bytes:
 
 
 def test_image_and_camera_come_back() -> None:
-    """Pixels to what JPEG loses, the camera exactly, for the smaller size."""
+    """Pixels up to JPEG's loss, the camera exactly, for the smaller size."""
     jpeg = thumbnail(picture(), 320)
     back = image_of(jpeg)
     small = cv2.resize(picture().pixels, (320, 120), interpolation=cv2.INTER_AREA)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single times that are off are found, whatever they are; clocks that were set are left as they are."""
+"""Single wrong times are detected, whatever they are; clocks that were set are not changed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_one_that_is_off_by_more_than_a_period_is_found(which: int, off: float, 
     if not times[which - 1] < times[which] < times[which + 1]:
         found = np.flatnonzero(out_of_order(times))
         assert len(found) == 1
-        assert abs(found[0] - which) <= (off < 0.3)  # of two that have changed places either may be the wrong one
+        assert abs(found[0] - which) <= (off < 0.3)  # if two have changed places, either may be the wrong one
 
 
 @pytest.mark.parametrize("times", [TIMES, TIMES[:1], TIMES[:0], np.r_[TIMES, TIMES + 1.05], np.r_[TIMES, TIMES + 60]])
@@ -39,7 +39,7 @@ def test_at_most_three_in_a_row() -> None:
 
 
 def test_the_ends_have_one_neighbor() -> None:
-    """Nothing says what they are."""
+    """Nothing shows whether they are right."""
     for which in (0, -1):
         times = TIMES.copy()
         times[which] += 50 if which == 0 else -50
@@ -58,7 +58,7 @@ def test_the_ends_have_one_neighbor() -> None:
 def test_whatever_the_stamps_each_message_comes_once_and_in_the_order_of_recording(
     sent: list[tuple[str, int, int]],
 ) -> None:
-    """A stamp of 0 takes the time of recording, which may be later than any stamp."""
+    """A stamp of 0 is replaced by the recording time, which may be later than any stamp."""
     messages = [
         (topic, time, restamped(b"\0\1\0\0" + bytes(8) + number.to_bytes(4), stamp))
         for number, (topic, stamp, time) in enumerate(sent)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory files keep what they were given, and what does not belong together is rejected."""
+"""Trajectory files keep their contents, and trajectories that do not belong together are rejected."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_kitti_keeps_poses_to_a_nanometer(tmp_path: Path) -> None:
     poses = _poses(20)
     write_kitti(tmp_path / "t.txt", poses)
     read = read_trajectory(tmp_path / "t.txt")
-    np.testing.assert_allclose(read.poses, poses, atol=1e-9)  # 13 digits of some 1000 m
+    np.testing.assert_allclose(read.poses, poses, atol=1e-9)  # 13 digits of about 1000 m
     np.testing.assert_array_equal(read.keys, range(20))
     assert read.kind == "kitti"
 
@@ -54,7 +54,7 @@ def test_tum_keeps_stamps_exactly_and_poses_to_a_micrometer(tmp_path: Path) -> N
     write_tum(tmp_path / "t.tum", stamps, _poses(5))
     read = read_trajectory(tmp_path / "t.tum")
     assert (read.kind, read.keys.tolist()) == ("tum", stamps)
-    np.testing.assert_allclose(read.poses, _poses(5), atol=1e-7)  # 12 digits of some 1000 m
+    np.testing.assert_allclose(read.poses, _poses(5), atol=1e-7)  # 12 digits of about 1000 m
 
 
 def test_exponents_comments_and_blank_lines_are_read(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_what_is_no_text_file_is_rejected(tmp_path: Path) -> None:
 
 
 def _trajectory(keys: list[int], kind: str) -> Trajectory:
-    """Poses whose x is their key, so that a match can be recognized."""
+    """Poses whose x is their key, so that a match can be identified."""
     poses = np.tile(np.eye(4), (len(keys), 1, 1))
     poses[:, 0, 3] = keys
     return Trajectory(poses, np.array(keys, np.int64), kind)
@@ -115,8 +115,8 @@ def test_missing_frames_are_found_by_their_number() -> None:
 
 
 def test_lines_are_numbers_only_where_there_is_one_for_each() -> None:
-    """Of an excerpt of frames 20 to 23: as many lines are its frames; enough for all numbers are those of the whole
-    drive; others nobody can place."""
+    """An excerpt of frames 20 to 23. The same number of lines are its frames. Enough lines for all numbers are those of
+    the whole drive. Other numbers of lines cannot be assigned."""
     gt = _trajectory([20, 21, 22, 23], "kitti-indexed")
     assert _x(matched(gt, _trajectory([0, 1, 2, 3], "kitti"))[1]) == [0, 1, 2, 3]
     assert _x(matched(gt, _trajectory(list(range(24)), "kitti"))[1]) == [20, 21, 22, 23]
@@ -125,7 +125,7 @@ def test_lines_are_numbers_only_where_there_is_one_for_each() -> None:
 
 
 def test_nor_are_those_of_the_ground_truth() -> None:
-    """The poses of an excerpt of frames 2 to 5 beside an estimate that has their numbers: line 2 is frame 4."""
+    """The poses of an excerpt of frames 2 to 5, with an estimate that has the frame numbers: line 2 is frame 4."""
     truth = _trajectory([0, 1, 2, 3], "kitti")
     assert _x(matched(truth, _trajectory([2, 3, 4, 5], "kitti-indexed"))[1]) == [2, 3, 4, 5]
     with pytest.raises(UsageError, match=r"4 poses \(kitti\), the estimate 3 .*--gt DRIVE"):
@@ -133,14 +133,14 @@ def test_nor_are_those_of_the_ground_truth() -> None:
 
 
 def test_of_a_faster_estimate_the_nearest_counts() -> None:
-    """At 200 Hz, two samples lie within the tolerance on either side."""
+    """At 200 Hz, two samples on either side are within the tolerance."""
     ms = 10**6
     gt = _trajectory([i * 100 * ms for i in range(11)], "tum")
     assert _x(matched(gt, _trajectory([i * 5 * ms for i in range(201)], "tum"))[1]) == _x(gt.poses)
 
 
 def test_stamps_of_a_few_decimals_match_in_any_order() -> None:
-    """Of the same frames, of which the estimate lacks one: it has failed there."""
+    """Stamps of the same frames. The estimate lacks one frame: it has failed there."""
     s = 10**9
     gt = _trajectory([2 * s, 1 * s, 4 * s, 3 * s], "tum")
     _, est, _ = matched(gt, _trajectory([3 * s - 99_999, s + 50_000, 2 * s], "tum"))
@@ -148,7 +148,8 @@ def test_stamps_of_a_few_decimals_match_in_any_order() -> None:
 
 
 def test_frames_whose_stamps_differ_by_more_than_their_rounding_are_no_failures() -> None:
-    """As of another clock: of an exact estimate with jitter of 0.14 ms 58 of 122 frames counted as failed."""
+    """For example with another clock. Previously, 58 of 122 frames of an exact estimate with a jitter of 0.14 ms
+    counted as failed."""
     gt = _clock(10, 60)
     jitter = np.random.default_rng(0).normal(0, 140_000, 60).astype(np.int64)
     kept = np.delete(np.arange(60), 20)
@@ -157,11 +158,11 @@ def test_frames_whose_stamps_differ_by_more_than_their_rounding_are_no_failures(
     np.testing.assert_array_equal(true, gt.poses)
     np.testing.assert_array_equal(stamps, gt.keys)
     assert np.flatnonzero(np.isnan(found[:, 0, 3])).tolist() == [20]
-    np.testing.assert_allclose(found[kept, 0, 3], true[kept, 0, 3], atol=100_001)  # within the rounding the pose itself
+    np.testing.assert_allclose(found[kept, 0, 3], true[kept, 0, 3], atol=100_001)  # within rounding: the pose itself
 
 
 def test_the_way_across_a_gap_moves_no_frame() -> None:
-    """In a bend, 8 s without a pose: the frames beside them were 0.23 m off."""
+    """In a bend, 8 s without a pose. Previously, the frames next to this gap were 0.23 m off."""
 
     def driven(stamps: np.ndarray) -> Trajectory:
         return Trajectory(se3.exp(stamps[:, None] * 1e-9 * np.array([0, 0, 0.5, 10, 0, 0])), stamps, "tum")
@@ -182,18 +183,19 @@ def _clock(hz: float, count: int, begin: float = 0.0) -> Trajectory:
     ("gt_hz", "est_hz"), [(25, 10), (12.5, 10), (30, 9.97), (15, 9.97), (10.05, 10), (10, 10), (9.97, 10)]
 )
 def test_ground_truth_of_other_stamps_is_interpolated(gt_hz: float, est_hz: float) -> None:
-    """At a steady speed an exact estimate has no error; taken at the nearest pose it was 0.15 m off at 15 m/s, frames
-    further than 10 ms from one were left out, up to 71 %, or an error, and poses in between counted as failed."""
+    """At a constant speed, an exact estimate has no error. Previously, the nearest pose was used: 0.15 m off at 15 m/s.
+    Frames further than 10 ms from a pose were left out, up to 71 %, or an error, and poses in between counted as
+    failed."""
     est = _clock(est_hz, 41, begin=0.047)
     true, found, stamps = matched(_clock(gt_hz, 5 * int(gt_hz)), est)
     np.testing.assert_array_equal(found, est.poses)
     np.testing.assert_array_equal(stamps, est.keys)
-    np.testing.assert_allclose(true[:, 0, 3], found[:, 0, 3], atol=1e-3)  # ns, of which floats of 4e9 hold 5e-7
+    np.testing.assert_allclose(true[:, 0, 3], found[:, 0, 3], atol=1e-3)  # ns; floats of 4e9 resolve 5e-7
 
 
 @pytest.mark.parametrize("est_hz", [10, 200])
 def test_a_slow_ground_truth_counts_at_its_own_stamps(est_hz: int) -> None:
-    """Of 1 Hz it knows nothing of a bend in between: there an exact estimate has 1 % of t_err on KITTI 00."""
+    """At 1 Hz it does not show a bend in between, where an exact estimate has 1 % of t_err on KITTI 00."""
     gt = _clock(1, 5)
     true, found, stamps = matched(gt, _clock(est_hz, 7 * est_hz // 2, begin=0.047))
     np.testing.assert_array_equal(true, gt.poses)
