@@ -205,7 +205,7 @@ def test_a_slow_ground_truth_counts_at_its_own_stamps(est_hz: int) -> None:
 
 
 def test_a_gap_of_the_ground_truth_is_not_bridged() -> None:
-    """Beyond 1 s, as in bags."""
+    """A gap of more than 1 s, as in bags."""
     gt, est = _clock(25, 250), _clock(10, 90, begin=0.047)
     hole = (gt.keys > 3e9) & (gt.keys < 5e9)
     true, _, _ = matched(Trajectory(gt.poses[~hole], gt.keys[~hole], "tum"), est)
@@ -213,7 +213,7 @@ def test_a_gap_of_the_ground_truth_is_not_bridged() -> None:
 
 
 def test_most_stamps_of_the_fewer_are_those_of_the_same_frames() -> None:
-    """At 12.5 Hz a quarter of those of 10 Hz are: by chance."""
+    """At 12.5 Hz, a quarter of the stamps are those of 10 Hz, by chance."""
     ten = _clock(10, 40).keys
     assert same_stamps(ten, ten[[3, 4, 7]] + 99_999)
     assert not same_stamps(ten, _clock(12.5, 60).keys)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The transform tree: any pair of connected frames, and never an identity for those that are not."""
+"""The transform tree: any pair of connected frames, and never an identity for frames that are not connected."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def message(parent: str, child: str, T: Array, scale: float = 1.0) -> SimpleName
 def test_lookup_goes_up_and_down_the_tree() -> None:
     tree = TransformTree()
     tree.add(message("base_link", "velo", pose(1)))
-    tree.add(message("/base_link", "/mast", pose(2), scale=2.0))  # tf1 names, a quaternion that is not unit
+    tree.add(message("/base_link", "/mast", pose(2), scale=2.0))  # tf1 names; the quaternion is not of unit length
     tree.set("mast", "camera", pose(3))
     np.testing.assert_allclose(tree.lookup("velo", "camera"), se3.inverse(pose(1)) @ pose(2) @ pose(3), atol=1e-12)
     np.testing.assert_allclose(tree.lookup("base_link", "camera"), pose(2) @ pose(3), atol=1e-12)

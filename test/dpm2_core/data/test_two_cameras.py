@@ -34,7 +34,7 @@ BACK = replace(AHEAD, T_lidar_cam=np.diag([-1.0, -1, 1, 1]) @ AHEAD.T_lidar_cam,
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Array]:
-    """The bag, whose third cloud has no image behind, and T_first_lidar (FRAMES, 4, 4)."""
+    """The bag, whose third cloud has no rear image, and T_first_lidar (FRAMES, 4, 4)."""
     world, lidar = build_world("straight", "suburb", seed=3, length=150.0), Lidar(LidarConfig(columns=900))
     rng = np.random.default_rng(0)
     poses = [world.drive_pose(3.0 + 0.1 * n) for n in range(FRAMES)]
@@ -53,8 +53,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Array]:
 
 @pytest.mark.slow
 def test_frames_with_two_images_are_described_registered_and_mapped(drive: tuple[Path, Array]) -> None:
-    """By the shipped network alone; the map shows what the first camera saw, and where one image is missing, nothing
-    else is."""
+    """With the shipped network alone. The map shows the images of the first camera, and a missing image affects nothing
+    else."""
     bag, T_first_lidar = drive
     source = BagSource(bag, InputSettings(image_topic="/camera/image_raw", second_image_topic="/camera_2/image_raw"))
     frames = list(source.frames())
@@ -73,7 +73,7 @@ def test_frames_with_two_images_are_described_registered_and_mapped(drive: tuple
     alone = make_slam(settings).process(replace(frames[0], images=frames[0].images[:1])).odometry.keyframe
     described = keyframes[0][1].descriptors
     assert not np.array_equal(described.features, alone.descriptors.features)
-    # Corners of both images are among its places: those of the rear one are behind.
+    # Corners of both images are among its descriptors: those of the rear image are behind.
     of_both = ~(described.xyz[:, None] == alone.descriptors.xyz).all(2).any(1)
     assert (described.xyz[of_both, 0] < 0).any()
     for frame, keyframe in keyframes:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What grows with the motion between two scans is in the covariance, and not in what the scene leaves open."""
+"""Errors that grow with the motion between two scans are in the covariance, but not in the part that the scene leaves
+open."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ def registration() -> Registration:
 
 
 def sigmas(covariance: Array) -> tuple[float, float]:
-    """Of rotation, rad, and position, m, in the best known direction of each."""
+    """Standard deviations of rotation, rad, and position, m, each in its best known direction."""
     turn, way = (np.linalg.eigvalsh(covariance[part, part])[0] for part in (slice(0, 3), slice(3, 6)))
     return float(np.sqrt(turn)), float(np.sqrt(way))
 
@@ -45,7 +46,7 @@ def test_what_the_scene_leaves_open_does_not_depend_on_the_distance(meters: floa
 
 
 def test_errors_that_two_registrations_share_do_not_make_them_agree() -> None:
-    """What is 0.3 m apart is so 40 m away as well."""
+    """Results that are 0.3 m apart are so at a distance of 40 m as well."""
     known = np.eye(6) * 0.01**2
     one, other = (
         with_calibration(Registration(T, known), se3.exp([0, 0, 0, 40, 0, 0]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machine code is kept, and where it cannot be, that is said."""
+"""Machine code is cached, and if it cannot be, this is reported."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ print(twice(1.0) + thrice(1.0))
 
 
 def test_without_a_folder_for_it_that_is_said_once(tmp_path: Path) -> None:
-    """Each start took many seconds longer in silence, as in a container that is read-only."""
+    """Previously, each start took many seconds longer without a message, for example in a read-only container."""
     program, kept = tmp_path / "program.py", tmp_path / "kept"
     program.write_text(PROGRAM)
-    (tmp_path / "__pycache__").touch()  # what is no folder cannot be written into, by root neither
+    (tmp_path / "__pycache__").touch()  # not a folder: even root cannot write into it
     unset = {name: text for name, text in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     environment = unset | {"PYTHONPATH": str(Path(dpm2_core.__file__).parents[1]), "XDG_CACHE_HOME": str(program)}
     for folder, lines in (("", 1), (str(kept), 0)):

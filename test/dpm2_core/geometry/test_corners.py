@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image corners on the surfaces of a scan: they are found again, lie where they are, and look alike from elsewhere."""
+"""Image corners on the surfaces of a scan: they are detected again, have the right position, and look alike from
+elsewhere."""
 
 from __future__ import annotations
 
@@ -24,14 +25,14 @@ def moved(T: Array, points: Points) -> Points:
 
 
 def test_corners_of_a_wall_lie_on_it() -> None:
-    """Of a plane the depth of a pixel is known to the noise of the scan: 1 cm, less where eight points are fitted."""
+    """On a plane the depth of a pixel is known to the noise of the scan: 1 cm, less if eight points are fitted."""
     found = seen(paint(0), 2.0)
     assert len(found.xyz) > 50
     assert np.abs(found.xyz[:, 1] - WALL).max() < 0.05
 
 
 def test_they_meet_again_and_look_alike() -> None:
-    """From 1.5 m farther on a wall without any shape; by chance 7 % would meet, and 1 % be the most alike."""
+    """From 1.5 m farther along a flat wall. By chance, 7 % would meet, and 1 % would be the most similar."""
     wall = paint(1)
     here, there = seen(wall, 2.0), seen(wall, 3.5)
     apart = np.linalg.norm((here.xyz - np.array([1.5, 0, 0], np.float32))[:, None] - there.xyz[None], axis=-1)
@@ -44,21 +45,21 @@ def test_they_meet_again_and_look_alike() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-3, 3), st.lists(st.floats(-5, 5), min_size=3, max_size=3))
 def test_the_axes_of_the_lidar_do_not_matter(yaw: float, t: list[float]) -> None:
-    """Corners follow a change of the LiDAR's axes; 1e-3 m is float32 in the depth of the points."""
+    """Corners follow a change of the LiDAR's axes; 1e-3 m is the accuracy of float32 in the depth of the points."""
     wall = paint(2)
     pixels, cloud = picture(wall, 2.0), scan(2.0, 0)
     T = se3.exp([0.02, -0.03, yaw, 0, 0, 0])
     T[:3, 3] = t
     plain = image_corners(pixels, K, T_LIDAR_CAM, cloud, 500)
     turned = image_corners(pixels, K, T @ T_LIDAR_CAM, moved(T, cloud), 500)
-    # A corner at the very limit of a rule may fall to the other side of it.
+    # A corner exactly at the limit of a rule may fall to the other side of it.
     apart = np.linalg.norm(moved(T, plain.xyz)[:, None] - turned.xyz[None], axis=-1).min(1)
     assert abs(len(plain.xyz) - len(turned.xyz)) <= 2
     assert np.quantile(apart, 0.9) < 1e-3
 
 
 def test_brightness_and_contrast_do_not_matter() -> None:
-    """A camera that exposes half as long sees the same corners, but for what rounds to another gray level."""
+    """With half the exposure, a camera shows the same corners, except where rounding changes the gray level."""
     wall, cloud = paint(3), scan(2.0, 0)
     pixels = picture(wall, 2.0)
     plain = image_corners(pixels, K, T_LIDAR_CAM, cloud, 96)
@@ -84,7 +85,7 @@ def test_as_many_as_asked_and_apart() -> None:
 
 
 def test_no_corner_on_the_border_of_two_surfaces() -> None:
-    """A board 3 m before the wall: a corner whose surroundings are half board, half wall, has no depth."""
+    """A board 3 m in front of the wall: a corner whose neighborhood is half board, half wall has no depth."""
     noise = np.random.default_rng(0)
     board = np.stack([noise.uniform(10, 11, 2000), np.full(2000, 3.0), noise.uniform(-1, 2, 2000)], 1)
     cloud = np.concatenate([scan(0.0, 0), board.astype(np.float32)])
@@ -95,8 +96,8 @@ def test_no_corner_on_the_border_of_two_surfaces() -> None:
 
 
 def test_rain_before_a_wall_does_not_hide_it() -> None:
-    """A fifth of the returns come from drops: of 12 points around a corner, two or three. A plane through all of them
-    would be metres off."""
+    """A fifth of the returns come from drops: two or three of 12 points around a corner. A plane through all of them
+    would be meters off."""
     noise = np.random.default_rng(0)
     cloud = scan(2.0, 0)
     wet = noise.random(len(cloud)) < 0.2

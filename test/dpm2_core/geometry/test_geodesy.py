@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""WGS84 against known values: the ellipsoid's axes, published arcs of a meridian and a parallel, and there and back."""
+"""WGS84 compared with known values: the ellipsoid's axes, published arcs of a meridian and a parallel, and round
+trips."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ def test_on_the_axes_the_radii_are_those_of_the_ellipsoid() -> None:
     [(0, 110574, 111320), (15, 110649, 107550), (45, 111132, 78847), (60, 111412, 55800), (75, 111618, 28902)],
 )
 def test_a_degree_is_as_long_as_published(latitude: float, north: float, east: float) -> None:
-    """Meters a degree on WGS84: P. Osborne, The Mercator Projections (2013), chapter 5."""
+    """Meters per degree on WGS84: P. Osborne, The Mercator Projections (2013), chapter 5."""
     a, b = geodesy.ecef([[latitude - 0.005, 8.0, 0], [latitude + 0.005, 8.0, 0]])
     assert np.linalg.norm(a - b) * 100 == pytest.approx(north, abs=1.0)
     a, b = geodesy.ecef([[latitude, 8.0, 0], [latitude, 8.01, 0]])

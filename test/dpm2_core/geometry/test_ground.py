@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands is distinguished from the ground: on a slope, under a roof, and for either precision of points."""
+"""Objects are distinguished from the ground: on a slope, under a roof, and for either precision of points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_wall_stands_and_a_slope_does_not(dtype: type) -> None:
 
 @pytest.mark.parametrize("reach", [0, 2])
 def test_a_point_mirrored_below_the_ground_lifts_nothing(reach: int) -> None:
-    """A bank of 2 m, steeper than a street and longer than a cell, remains ground to either side."""
+    """A bank of 2 m, steeper than a street and longer than a cell, remains ground on both sides."""
     x, y = np.meshgrid(np.arange(-10, 10, 0.25), np.arange(-10, 10, 0.25))
     ground = np.stack([x.ravel(), y.ravel(), np.where(x < 3, 0.0, -2.0).ravel()], -1)
     mirrored = np.array([[-5.0, 1.0, -9.0], [-4.9, 1.1, -8.0]])
@@ -42,12 +42,13 @@ def test_a_stray_point_far_off_takes_no_memory_and_changes_no_height() -> None:
     height = height_above_ground(np.concatenate([ground, stray]))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 50e6  # four arrays of 1001 by 1001 cells; of 6 by 6 km they were 1.2 GB
+    assert peak < 50e6  # four arrays of 1001 by 1001 cells; for 6 by 6 km they were 1.2 GB
     np.testing.assert_array_equal(height[: len(ground)], height_above_ground(ground))
 
 
 def test_the_ground_below_a_roof_is_not_the_roof() -> None:
-    """A roof of 5 by 5 m over ground that is seen around it alone: shorter than the opening of 7 cells of 1 m."""
+    """A roof of 5 by 5 m over ground that is only visible around it. It is shorter than the opening of 7 cells of 1
+    m."""
     x, y = np.meshgrid(np.arange(-15, 15, 0.25), np.arange(-15, 15, 0.25))
     under = (np.abs(x) < 2.5) & (np.abs(y) < 2.5)
     points = np.stack([x.ravel(), y.ravel(), np.where(under, 3.0, -1.7).ravel()], -1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kabsch: exact, and a rotation whatever the points are."""
+"""Kabsch: exact, and always a rotation, whatever the points are."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_kabsch_is_exact_and_batched(noise: np.random.Generator) -> None:
 def test_kabsch_never_reflects(noise: np.random.Generator) -> None:
     """Mirrored and flat point sets still give a rotation."""
     source = torch.from_numpy(noise.normal(0, 10, (2, 40, 3)))
-    source[1, :, 2] = 0  # coplanar: without the guard the sign of the normal is open
+    source[1, :, 2] = 0  # coplanar: without the guard the sign of the normal is undetermined
     target = source * torch.tensor([1.0, 1.0, -1.0])
     T = weighted_kabsch(source, target, torch.ones(2, 40))
     torch.testing.assert_close(torch.linalg.det(T[:, :3, :3]), torch.ones(2, dtype=torch.float64))

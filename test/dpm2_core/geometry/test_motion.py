@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Constant velocity: predictions compose, their uncertainty grows with time up to what a vehicle can do, and the way
-tells how long a period was of which the stamp is in doubt."""
+"""Constant velocity: predictions compose, and their uncertainty grows with time up to what a vehicle can do. If a stamp
+is doubtful, the distance traveled shows how long the period was."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_no_motion_is_predicted_farther_than_ten_seconds() -> None:
 
 
 def test_an_even_change_of_the_motion_covers_its_mean() -> None:
-    """Straight on, braking from 10 to 4 m/s; and at one motion it is that motion."""
+    """Straight ahead, braking from 10 to 4 m/s. If both motions are equal, it is this motion."""
     before, after = np.array([0, 0, 0, 10.0, 0, 0]), np.array([0, 0, 0, 4.0, 0, 0])
     np.testing.assert_allclose(between(np.eye(4), before, after, 3.0)[:3, 3], [21, 0, 0], atol=1e-9)
     np.testing.assert_allclose(between(np.eye(4), TWIST, TWIST, 3.0), predicted(np.eye(4), TWIST, 3.0), atol=1e-9)
@@ -36,8 +36,8 @@ def test_an_even_change_of_the_motion_covers_its_mean() -> None:
 
 @given(st.floats(-1.0, 1.0), st.floats(0.1, 10.0))
 def test_an_even_turn_that_was_measured_is_one_motion(rate: float, seconds: float) -> None:
-    """But for the ten parts of the time, of which each is taken to be straight: of n parts of a turn by an angle a, the
-    midpoint rule errs by a fraction of (a / n)^2 / 24 of the way."""
+    """Except that each of ten parts of the time is assumed to be straight: for n parts of a rotation by an angle a, the
+    midpoint rule has an error of (a / n)^2 / 24 of the distance."""
     twist = np.array([0, 0, rate, 8.0, 0, 0])
     at = np.append((np.arange(10) + 0.5) / 10, 1.0) * seconds
     T = predicted(np.eye(4), twist, seconds, se3.exp(at[:, None] * twist)[:, :3, :3])
@@ -48,7 +48,7 @@ def test_an_even_turn_that_was_measured_is_one_motion(rate: float, seconds: floa
 
 
 def test_a_turn_that_came_late_leads_less_far_aside() -> None:
-    """From 10 to 5 m/s in two seconds, straight on in the first, across in the second."""
+    """From 10 to 5 m/s in two seconds: ahead in the first, sideways in the second."""
     turns = np.stack([np.eye(3)] * 5 + [se3.rotation(np.array([0, 0, np.pi / 2]))] * 6)
     before, after = np.array([0, 0, 0, 10.0, 0, 0]), np.array([0, 0, 0, 5.0, 0, 0])
     T = between(np.eye(4), before, after, 2.0, turns)
@@ -68,13 +68,15 @@ def test_a_heading_of_which_nothing_is_known_is_uniform() -> None:
 
 
 def test_a_pause_of_more_than_an_hour_is_one_of_an_hour() -> None:
-    """A map takes no keyframe whose place is less certain than 1000 km: after three days none was taken."""
+    """A map rejects a keyframe whose position is less certain than 1000 km. Previously, after three days none was
+    accepted."""
     hour = covariance(10.0, 3600.0, 10.0, OF_VELOCITY)
     np.testing.assert_array_equal(covariance(10.0, 1e9, 10.0, OF_VELOCITY), hour)
 
 
 def test_what_swings_is_uncertain_about_every_axis() -> None:
-    """By 0.5 rad/s for 0.2 s, more than a car is about its heading; and never by more than any turn."""
+    """With 0.5 rad/s for 0.2 s, it is more uncertain than the heading of a car, but never more than an arbitrary
+    rotation."""
     sigma = np.sqrt(np.diag(covariance(1.0, 0.2, 10.0, OF_VELOCITY, turn=0.5)))
     assert (sigma[:3] >= 0.1).all()
     assert (sigma[:3] < 0.12).all()
@@ -92,7 +94,7 @@ def test_an_unknown_velocity_makes_the_prediction_uncertain_along_it() -> None:
 def test_a_direction_that_the_scene_leaves_open_keeps_the_uncertainty_of_the_prediction(
     predicted_sigma: float, seen_sigma: float, heading: float
 ) -> None:
-    """Scene: `seen_sigma` across, 1 m along, which says nothing; prediction alike in both."""
+    """Scene: `seen_sigma` across, 1 m along, which is uninformative. The prediction is the same in both directions."""
     R = se3.exp([0, 0, heading, 0, 0, 0])[:3, :3]
     of_scene = R @ np.diag([1.0, seen_sigma**2, seen_sigma**2]) @ R.T
     result = R.T @ combined(of_scene, predicted_sigma**2 * np.eye(3)) @ R
@@ -101,8 +103,9 @@ def test_a_direction_that_the_scene_leaves_open_keeps_the_uncertainty_of_the_pre
 
 
 def test_scenes_whose_open_directions_differ_a_little_do_not_show_the_way_along_them() -> None:
-    """As of a road seen for 10 m from 15 m/s on: 12 scans with the open direction up to 25 degrees to either side,
-    across it the way is stated to 0.03 m, up and down to 2 mm. The velocity along it fell to 1.9 m/s."""
+    """As for a road that is visible for 10 m, starting with a velocity sigma of 15 m/s. In 12 scans the open direction
+    is up to 25 degrees to either side; across it the translation is stated to 0.03 m, vertically to 2 mm. Previously,
+    the velocity sigma along the road fell to 1.9 m/s."""
     of_velocity = 15.0**2 * np.eye(3)
     for heading in np.radians([25, -10, 15, -25, 5, 20, -15, 25, 0, -20, 10, -5]):
         R = se3.exp([0, 0, heading, 0, 0, 0])[:3, :3]
@@ -120,34 +123,34 @@ def test_a_scene_that_leaves_nothing_open_is_as_certain_as_it_states(predicted_s
 
 
 def test_across_a_tunnel_the_way_stays_known() -> None:
-    """Of walls to all sides the open direction is known to 2 degrees, or 3 cm of a step of 1 m that is not."""
+    """With walls on all sides, the open direction is known to 2 degrees: 3 cm across for an unknown step of 1 m."""
     of_scene = np.diag([1.0, 0.01, 0.01]) ** 2
     turned = turned_open(of_scene, np.diag([1.0, 0.1, 0.1]) ** 2)
     np.testing.assert_allclose(np.sqrt(np.diag(turned)), [1.0, 0.03, 0.03], atol=0.005)
 
 
 def moved(speed: float, seconds: float) -> Array:
-    """Pose (4, 4) so much later, in a slight curve."""
+    """Pose (4, 4) after this time, in a slight curve."""
     return se3.exp(seconds * np.array([0, 0, 0.1, speed, 0, 0]))
 
 
 def found(speed: float, stamped: float, true: float, usual: float = 0.1) -> float:
-    """The period of a frame that came after `true` s."""
+    """Period that is estimated for a frame that arrived after `true` s."""
     ends = [(seconds, moved(speed, seconds)) for seconds in (stamped, usual)]
     return period_by_motion(moved(speed, true), ends[0], ends[1], 10.0)
 
 
 @given(st.floats(5, 40), st.floats(0.3, 1))
 def test_at_a_steady_speed_the_way_is_the_time(speed: float, share: float) -> None:
-    """A frame that was held back by 0.2 s, of which a part was lost frames, and one of a burst."""
+    """A frame that was delayed by 0.2 s, part of which are lost frames, and a frame of a burst."""
     true = 0.1 + 0.2 * (1 - share)
-    assert found(speed, 0.3, true) == pytest.approx(true, abs=0.01 + 0.5 / speed)  # what an acceleration may explain
+    assert found(speed, 0.3, true) == pytest.approx(true, abs=0.01 + 0.5 / speed)  # an acceleration may explain this
     assert found(speed, 0.01, 0.1) == pytest.approx(0.1, abs=1e-3)
 
 
 @given(st.floats(-40, 40), st.floats(-8, 8), st.sampled_from([0.01, 0.05, 0.2, 0.3, 0.6]))
 def test_an_acceleration_of_a_vehicle_leaves_the_stamp(speed: float, acceleration: float, dt: float) -> None:
-    """Of lost frames and of a stream that has become faster: brakes and gas are no delay."""
+    """For lost frames, and for a stream that has become faster: braking and accelerating are no delay."""
     T = moved(speed, dt)
     T[0, 3] += 0.5 * acceleration * dt * dt
     ends = [(seconds, moved(speed, seconds)) for seconds in (dt, 0.1)]
@@ -155,12 +158,12 @@ def test_an_acceleration_of_a_vehicle_leaves_the_stamp(speed: float, acceleratio
 
 
 def test_at_a_halt_the_stamp_is_believed() -> None:
-    """A stream that changes its rate meanwhile would else have the speed of another rate from then on."""
+    """Otherwise, a stream that changes its rate meanwhile would have the speed of another rate from then on."""
     assert found(0.0, 0.05, 0.1) == 0.05
     assert found(0.3, 0.05, 0.1) == 0.05
 
 
 def test_a_way_beyond_both_is_one_of_them() -> None:
-    """Whatever the pose, the period is one that stamp or stream allow."""
+    """Whatever the pose, the period is one that the stamp or the stream allows."""
     assert found(20.0, 0.3, 0.01) == pytest.approx(0.1)
     assert found(20.0, 0.3, 0.9) == pytest.approx(0.3)

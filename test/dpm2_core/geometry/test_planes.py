@@ -21,7 +21,7 @@ def test_agrees_with_eigh(seed: int, log_scale: float, k: int) -> None:
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered) / k)
     scale = values[:, 2]
     assert (np.abs(variances - values[:, 0]) <= 1e-7 * scale + 1e-18).all()  # the cubic loses half of the digits
-    clear = values[:, 1] - values[:, 0] > 1e-3 * scale  # else the normal is not determined
+    clear = values[:, 1] - values[:, 0] > 1e-3 * scale  # else the normal is undetermined
     assert (np.abs(np.einsum("ni,ni->n", normals, vectors[:, :, 0]))[clear] > 1 - 1e-6).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
 
@@ -35,4 +35,4 @@ def test_degenerate_neighborhoods_are_finite() -> None:
         assert np.isfinite(normals).all()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
         np.testing.assert_allclose(variances, 0, atol=1e-12)
-    assert abs(fit_planes(line)[0][0, 0]) < 1e-6  # square to the line
+    assert abs(fit_planes(line)[0][0, 0]) < 1e-6  # perpendicular to the line

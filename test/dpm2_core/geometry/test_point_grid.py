@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grid finds exactly what a search through all points does, however they are spread."""
+"""The grid returns exactly what a search through all points returns, however they are spread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dpm2_core.geometry.point_grid import PointGrid
 
 
 def spread_points(seed: int, count: int) -> np.ndarray:
-    """Dense in one place, sparse around it, and a few very far out."""
+    """Points that are dense in one region, sparse around it, and a few very far away."""
     rng = np.random.default_rng(seed)
     return rng.normal(size=(count, 3)) * rng.choice([0.3, 3.0, 30.0, 300.0], (count, 1), p=[0.5, 0.3, 0.15, 0.05])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rays of pixels against brute force, and exact where the network multiplies in bf16."""
+"""Rays of pixels compared with brute force, and exact where the network multiplies in bf16."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def _camera() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_point_ray_distance_against_brute_force(noise: np.random.Generator) -> None:
-    """The distance to a ray is the least over points along it; the in-front test is the sign of that point."""
+    """The distance to a ray is the minimum over points along it. The in-front test is the sign of the nearest point."""
     K, T = _camera()
     points = torch.from_numpy(noise.uniform(-20, 20, (1, 30, 3)))
     uv = torch.from_numpy(noise.uniform(0, 60, (8, 2)))
     origins, directions = pixel_rays(uv, K, T)
     distance, front = point_ray_distance(points, origins, directions)
-    along = torch.linspace(-60, 60, 24001, dtype=torch.float64)  # steps of 5 mm: at most 2 um of distance off at 1 m
+    along = torch.linspace(-60, 60, 24001, dtype=torch.float64)  # steps of 5 mm: an error of at most 2 um at 1 m
     line = origins[0] + along[:, None, None] * directions[0]
     for n in range(30):
         gaps = (line - points[0, n]).norm(dim=-1)
@@ -49,7 +49,8 @@ def test_rays_and_projection_are_inverse(noise: np.random.Generator) -> None:
 
 
 def test_geometry_is_exact_where_the_network_multiplies_in_bf16(noise: np.random.Generator) -> None:
-    """bf16 put points up to 0.4 m beside their partners, and rays meters beside pixels. Tolerance: float32 at 50 m."""
+    """In bf16, points were up to 0.4 m from their partners, and rays meters from their pixels. Tolerance: float32 at 50
+    m."""
     K, T = (value.float() for value in _camera())
     points = torch.from_numpy(noise.uniform(-50, 50, (1, 30, 3))).float()
     uv = torch.from_numpy(noise.uniform(0, 60, (8, 2))).float()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Farthest points and neighbors against brute force."""
+"""Farthest points and neighbors compared with brute force."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_farthest_points_are_greedy(noise: np.random.Generator, n: int) -> None:
 
 
 def test_the_sampling_starts_where_that_of_the_training_did(noise: np.random.Generator) -> None:
-    """By a k-d tree of five levels, in plain numpy."""
+    """Computed with a k-d tree of five levels, in plain numpy."""
     points = noise.uniform(-30, 30, (3000, 3)).astype(np.float32)
     cell = points
     for _ in range(5):
@@ -48,7 +48,7 @@ def test_the_sampling_starts_where_that_of_the_training_did(noise: np.random.Gen
 
 
 def test_neighbors_beyond_the_radius_repeat_the_nearest(noise: np.random.Generator) -> None:
-    """Nothing farther than the radius is gathered, also where the cloud is smaller than k."""
+    """No point farther than the radius is returned, even if the cloud has fewer than k points."""
     points = noise.uniform(-10, 10, (12, 3)).astype(np.float32)
     index = neighbours(PointGrid(points.astype(float), 2.0), points, 16, 5.0)
     distance = np.linalg.norm(points[index] - points[:, None], axis=2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms are told from streets, by scans of any LiDAR; in doubt nothing is said."""
+"""Rooms are distinguished from streets in scans of any LiDAR; in doubt there is no result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIDDLE = se3.make(np.eye(3), [0, 0, 0.6])
 
 @pytest.mark.parametrize("voxel", [0.0, 0.1, 0.3])
 def test_a_room_and_a_street(voxel: float) -> None:
-    """Of a whole scan and of a keyframe's cloud alike."""
+    """For a whole scan and for a keyframe's cloud."""
     room, street = frames(MIDDLE[None])[0].points, frames(MIDDLE[None], street=True)[0].points
     if voxel:
         room, street = room[voxel_first(room, voxel)], street[voxel_first(street, voxel)]
@@ -30,8 +30,8 @@ def test_a_room_and_a_street(voxel: float) -> None:
 
 
 def test_a_hall_is_a_room_from_wherever_in_it() -> None:
-    """It shows as many cells as what may be either: keyframes a step apart were of a room and of a street, and such
-    descriptors are not compared."""
+    """It shows as many cells as an ambiguous scene. Previously, keyframes a step apart counted as a room and as a
+    street, and such descriptors are not compared."""
     hull = np.array([[-6.3, -6.3, 0], [6.3, 6.3, 5.0]])
     for x in (-2.9, 0.0, 2.9):
         points = scan(se3.make(np.eye(3), [x, 0, 1.3]), hull, FURNITURE, 0)
@@ -40,8 +40,9 @@ def test_a_hall_is_a_room_from_wherever_in_it() -> None:
 
 
 def test_a_yard_that_is_seen_densely_is_none() -> None:
-    """A hand-held LiDAR 70 degrees wide, in a yard: what it sees is near, and much more than of a hall. One scan in 90
-    was of a room, and could not be compared with the others: the odometry was lost there."""
+    """A hand-held LiDAR with a field of view of 70 degrees, in a yard: its points are near, and many more than in a
+    hall. Previously, one scan in 90 counted as a room and could not be compared with the others: the odometry was lost
+    there."""
     rng = np.random.default_rng(0)
     azimuth, elevation = np.radians(rng.uniform(-35, 35, 20_000)), np.radians(rng.uniform(-35, 35, 20_000))
     rays = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
@@ -65,7 +66,7 @@ def test_too_little_says_nothing() -> None:
 
 @pytest.mark.parametrize("sequence", ["00", "04"])
 def test_no_scan_of_kitti_is_a_room(kitti_root: Path, sequence: str) -> None:
-    """What the defaults do on real streets stays as it is."""
+    """The behavior of the defaults on real streets stays the same."""
     source = KittiSource(kitti_root / "sequences" / sequence, InputSettings(images=False))
     assert {is_room(frame.points) for frame in source.frames()} == {False}
 
@@ -89,7 +90,7 @@ def test_a_cabin_encloses_and_a_room_does_not(hull: np.ndarray, enclosed: bool) 
 
 
 def test_a_part_of_the_view_encloses_nothing() -> None:
-    """A door that is open, a LiDAR that looks ahead alone, a handful of points."""
+    """An open door, a LiDAR that only looks ahead, a handful of points."""
     points = scan(MIDDLE, CABIN, np.zeros((0, 2, 3)), 0)
     door = points.copy()
     door[(np.abs(points[:, 1]) < 0.4) & (points[:, 0] > 0.9), :3] *= 8

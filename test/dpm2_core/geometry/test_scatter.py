@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fog and dust are found among surfaces, and hardly any surface among them."""
+"""Fog and dust are detected between surfaces, and hardly any surface is taken for them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_dust_is_found(street: bool, fraction: float) -> None:
     clean = frames(HERE, street)[0].points
     points = in_dust(clean, fraction, np.random.default_rng(0))
     met, found = (points != clean).any(1), scattered(points, 0)
-    assert found[met].mean() > 0.75  # what lies beside a surface is not told from it
+    assert found[met].mean() > 0.75  # points next to a surface are not distinguished from it
     assert found[~met].mean() < 0.1
 
 
@@ -57,7 +57,7 @@ def test_what_is_overhead_is_not_compared_with_the_floor() -> None:
 
 @pytest.mark.parametrize("way", [0, 1, 2])
 def test_a_wall_is_a_surface_where_faces_of_the_cube_meet(way: int) -> None:
-    """Of directions there, some of the strips have points on one face alone."""
+    """In directions there, some of the strips have points on one face only."""
     along = np.random.default_rng(way).uniform(0.5, 4, (5000, 2))
     points = np.ones((5000, 4), np.float32)
     points[:, way] = 2.0
@@ -69,7 +69,7 @@ def test_a_wall_is_a_surface_where_faces_of_the_cube_meet(way: int) -> None:
 @pytest.mark.parametrize("count", [0, 1, 4])
 def test_too_few_points_say_nothing(count: int, least: float) -> None:
     points = np.full((count, 4), 1, np.float32)
-    points.flags.writeable = False  # as those of messages
+    points.flags.writeable = False  # read-only, as in messages
     assert scattered(points, least).tolist() == [False] * count
 
 

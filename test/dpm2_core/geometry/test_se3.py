@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SE(3) obeys the laws of its group and of its exponential map, for every size of rotation and any batch shape."""
+"""SE(3) satisfies the laws of its group and of its exponential map, for every size of rotation and any batch shape."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ TURN = 3.1  # rad; a little below pi, where the logarithm is no longer unique
 
 @st.composite
 def tangents(draw: st.DrawFn, turn: float = TURN, reach: float = 100.0) -> np.ndarray:
-    """(6,) with rotations from exactly zero over the tiniest to `turn` rad, and translations to `reach` m."""
+    """Tangent (6,) with a rotation from exactly zero over tiny angles to `turn` rad, and a translation up to `reach`
+    m."""
     axis = draw(arrays(np.float64, 3, elements=st.floats(-1, 1)))
     length = np.linalg.norm(axis)
     axis = axis / length if length > 1e-3 else np.array([0.0, 0.0, 1.0])
@@ -34,7 +35,7 @@ def _twist_matrix(xi: np.ndarray) -> np.ndarray:
 
 @given(tangents())
 def test_exp_is_the_matrix_exponential(xi: np.ndarray) -> None:
-    # Relative to the translation; the 1e-8 that 1 - cos loses just above the series' end is multiplied by 1e-4 rad.
+    # Relative to the translation. Just above the end of the series, 1 - cos loses 1e-8; this is multiplied by 1e-4 rad.
     np.testing.assert_allclose(se3.exp(xi), scipy.linalg.expm(_twist_matrix(xi)), atol=1e-10)
 
 
@@ -53,7 +54,8 @@ def test_the_way_between_two_poses_is_gone_evenly(start: np.ndarray, step: np.nd
 
 @given(arrays(np.float64, 3, elements=st.floats(-1, 1)), st.floats(0, 1e-7), st.floats(-50, 50))
 def test_half_a_turn_is_no_special_case(axis: np.ndarray, less: float, t: float) -> None:
-    """Where the vector may be either of two, it leads to the same pose; 1e-6 m of 50 m: rounding of half turns."""
+    """Where two rotation vectors are possible, both lead to the same pose; 1e-6 m of 50 m: rounding of half
+    rotations."""
     assume(np.linalg.norm(axis) > 1e-3)
     T = se3.exp(np.r_[axis / np.linalg.norm(axis) * (np.pi - less), t, 1, -t])
     xi = se3.log(T)
@@ -85,13 +87,13 @@ def test_adjoint_moves_a_perturbation_from_right_to_left(t: np.ndarray, xi: np.n
 
 @given(tangents())
 def test_angle_is_exact_down_to_nothing(xi: np.ndarray) -> None:
-    """The trace formula is off by 1e-8 rad near zero, a thousand times what a KITTI figure may be."""
+    """The trace formula is off by 1e-8 rad near zero, a thousand times the error that a KITTI figure may have."""
     assert se3.angle(se3.exp(xi)) == pytest.approx(np.linalg.norm(xi[:3]), abs=1e-14, rel=1e-9)
 
 
 @given(tangents())
 def test_magnitude_is_the_same_from_either_end(xi: np.ndarray) -> None:
-    """From its other end a motion is as long and as large a turn; the tolerance is rounding at 100 m."""
+    """From its other end, a motion has the same length and rotation angle. The tolerance is rounding at 100 m."""
     T = se3.exp(xi)
     meters, degrees = se3.magnitude(T)
     assert degrees == pytest.approx(np.degrees(np.linalg.norm(xi[:3])), abs=1e-6)
@@ -110,7 +112,7 @@ def test_orthonormalised_gives_the_rotation_back_after_rounding(xi: np.ndarray, 
     out = se3.orthonormalized(T + noise)
     np.testing.assert_allclose(out[:3, :3] @ out[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(out[:3, :3]) == pytest.approx(1)
-    assert np.abs(out - T).max() < 0.2  # three entries of 0.05 in each row, and some for the polar factor
+    assert np.abs(out - T).max() < 0.2  # three entries of 0.05 in each row, and a bit more for the polar factor
     np.testing.assert_allclose(se3.orthonormalized(T), T, atol=1e-12)
 
 
@@ -121,7 +123,7 @@ def test_orthonormalised_never_mirrors() -> None:
 
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])
 def test_every_function_takes_any_batch(shape: tuple[int, ...]) -> None:
-    """A batch gives what its members give one by one."""
+    """A batch gives the same results as its members one by one."""
     xi = np.random.default_rng(0).normal(size=(*shape, 6))
     T = se3.exp(xi)
     assert T.shape == (*shape, 4, 4)
@@ -153,7 +155,7 @@ def test_transform_moves_points_and_keeps_what_else_they_carry() -> None:
 
 
 def test_what_is_rigid() -> None:
-    """Rounding passes, wherever it is; damage, reflections and what is not finite do not."""
+    """Rounding is accepted in any entry; damage, reflections and values that are not finite are rejected."""
     T = se3.exp([0.1, -2.0, 0.3, 1e5, 2, -3])
     assert se3.is_rigid(T)
     assert se3.is_rigid(T.astype(np.float32).astype(np.float64))

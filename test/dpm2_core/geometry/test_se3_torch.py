@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SE(3) in torch: agrees with the numpy one, and is twice differentiable at and around the identity and near pi."""
+"""SE(3) in torch: it agrees with numpy, and is twice differentiable at and around the identity and near pi."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def tangent(angle: float) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_agrees_with_numpy(angle: float) -> None:
-    """exp, and log back, on both sides of every border between series and closed form."""
+    """exp, and log back, on both sides of every boundary between series and closed form."""
     xi = tangent(angle)
     T = se3_torch.exp(torch.from_numpy(xi))
     np.testing.assert_allclose(T, se3.exp(xi), atol=1e-12)
@@ -37,7 +37,7 @@ def test_twice_differentiable(angle: float) -> None:
 
 
 def test_inverse_right_jacobian() -> None:
-    """log(exp(w) exp(d)) = w + J d, against a finite difference."""
+    """log(exp(w) exp(d)) = w + J d, compared with a finite difference."""
     for angle in ANGLES[:-2]:
         w = torch.from_numpy(tangent(angle)[:3])
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever moment of a sweep the driver stamps: a frame is timed from the middle, and the way to the stamp is known."""
+"""Whatever time of a sweep the driver stamps: a frame is timed from the middle, and the motion to the stamp is
+known."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def test_a_frame_is_timed_from_the_middle_of_its_sweep(stamp_at: float) -> None:
 
 
 def test_each_cloud_has_a_middle_of_its_own() -> None:
-    """A driver begins in the midst of a sweep, and what it sends first was the measure of all that followed."""
+    """A driver begins in the middle of a sweep. Previously, its first cloud determined the middle of all that
+    followed."""
     sweep, whole = Sweep(), a_frame(START)
     late = whole.time_offset > 0.075
     assert sweep.centered(replace(whole, points=whole.points[late], time_offset=whole.time_offset[late])).stamp == (
@@ -47,7 +49,7 @@ def test_each_cloud_has_a_middle_of_its_own() -> None:
 
 
 def test_a_stamp_near_the_middle_is_left() -> None:
-    """Or each pose would be one that is interpolated, for nothing."""
+    """Otherwise, each pose would be interpolated for no benefit."""
     frame = a_frame(0.004)
     assert Sweep().centered(frame) is frame
 

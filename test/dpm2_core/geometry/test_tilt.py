@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way up is found from the ground at any tilt up to 35 degrees, and not from what is no ground."""
+"""The up direction is estimated from the ground at any tilt up to 35 degrees, and from nothing but the ground."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ...helpers.scenes import boxes
 def tilted(
     points: NDArray[np.floating], degrees: float, heading: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Points of a sensor that leans to that side, and where up is for it."""
+    """Points of a sensor that leans to this side, and its up direction."""
     lean = np.radians(degrees) * np.array([np.cos(heading), np.sin(heading), 0])
     R = se3.exp([*lean, 0, 0, 0])[:3, :3]
     return (points @ R.T).astype(np.float32), R[:, 2]
 
 
 def street(noise: np.random.Generator) -> NDArray[np.float32]:
-    """Level ground with boxes on it, with noise of 2 cm."""
+    """Level ground with boxes on it, with 2 cm of noise."""
     points = boxes(noise, 20_000)
     points = points[points[:, 2] >= -1.7]
     return (points + noise.normal(scale=0.02, size=points.shape)).astype(np.float32)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Angular rates make rotations: exact for a steady turn, to second order for any other, and none where they lack."""
+"""Angular rates are integrated to rotations: exact for a constant rate, to second order for others, none if samples are
+missing."""
 
 from __future__ import annotations
 
@@ -19,18 +20,18 @@ SECONDS = np.arange(-0.2, 0.3, 0.01)
 
 
 def axes(t: Array) -> Rotation:
-    """Of a robot that swings and shakes, up to 110 deg/s."""
+    """Axes of a robot that swings and shakes at up to 110 deg/s."""
     return Rotation.from_euler("ZYX", np.stack([0.6 * np.sin(3 * t), 0.1 * np.sin(5 * t), 0.05 * np.cos(4 * t)], -1))
 
 
 def rates(t: Array, h: float = 1e-5) -> Array:
     if not len(t):
-        return np.zeros((0, 3))  # scipy before 1.15 knows no empty rotations
+        return np.zeros((0, 3))  # scipy before 1.15 does not support empty rotations
     return np.asarray((axes(t - h).inv() * axes(t + h)).as_rotvec() / (2 * h))
 
 
 def worst(R: Array, expected: Rotation) -> float:
-    """Degrees."""
+    """Largest error, degrees."""
     return float(np.degrees((Rotation.from_matrix(R).inv() * expected).magnitude().max()))
 
 
@@ -66,14 +67,14 @@ def test_the_error_falls_with_the_square_of_the_rate_of_samples() -> None:
     [
         (SECONDS, True),
         (np.zeros(0), False),
-        (np.array([0.0]), False),  # the sweep begins 0.1 s before
-        (SECONDS[SECONDS > -0.06], True),  # 40 ms late: the first rate is taken
+        (np.array([0.0]), False),  # the sweep begins 0.1 s before it
+        (SECONDS[SECONDS > -0.06], True),  # 40 ms late: the first rate is used
         (SECONDS[SECONDS > -0.04], False),
         (SECONDS[SECONDS < 0.06], True),
         (SECONDS[SECONDS < 0.0], False),
         (SECONDS[(SECONDS < -0.035) | (SECONDS > 0.035)], True),
         (SECONDS[(SECONDS < -0.06) | (SECONDS > 0.06)], False),
-        (SECONDS[(SECONDS < -0.17) | (SECONDS > -0.06)], True),  # it was gone, and came back in time
+        (SECONDS[(SECONDS < -0.17) | (SECONDS > -0.06)], True),  # samples are missing for a while, and return in time
         (SECONDS[(SECONDS < 0.06) | (SECONDS > 0.17)], True),
     ],
     ids=[
@@ -100,7 +101,8 @@ def test_what_the_samples_do_not_tell_is_not_made_up(seconds: Array, known: bool
 @pytest.mark.parametrize("last", [0.4, 0.33], ids=["at the end", "most of a period before"])
 @pytest.mark.parametrize("period", [0.1, 0.1036])
 def test_ten_samples_a_second_are_enough_though_they_come_unevenly(period: float, last: float) -> None:
-    """As in bags of kitti2bag, 0.1036 s apart: they told nothing of any turn. Missing ones are still not made up."""
+    """As in bags of kitti2bag, 0.1036 s apart. Previously, they gave no rotation at all. Missing samples are still not
+    invented."""
     uneven = np.random.default_rng(0).uniform(-0.005, 0.005, 20)
     seconds, at = last + period * np.arange(-19, 1) + np.append(uneven[:-1], 0.0), np.array([0.0, 0.2, 0.4])
     R = turned(seconds, rates(seconds), at)
@@ -127,7 +129,7 @@ def test_a_sensor_that_hangs_upside_down_is_turned_round() -> None:
 
 @pytest.mark.parametrize("stamp", [0.0, 0.05, 0.1], ids=["at the end", "in the middle", "at the start"])
 def test_a_wall_seen_in_a_swing_is_straight_again(stamp: float) -> None:
-    """Each point in the frame of its own moment; with the samples of 100 Hz instead of a steady twist."""
+    """Each point is in the frame of its own time; corrected with 100 Hz samples instead of a constant twist."""
     rng, time = np.random.default_rng(0), np.linspace(stamp - 0.1, stamp, 2000)
     velocity, at_stamp = np.array([1.5, 0.2, 0.0]), rng.uniform(-20, 20, (2000, 3))
     fine = np.arange(-0.15, 0.15, 1e-4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds and files that several tests of the synthetic city share."""
+"""Worlds and files shared by several tests of the synthetic city."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def highway() -> World:
 
 @pytest.fixture(scope="session")
 def poses_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """KITTI poses (camera frame) of 1.4 laps round a block, the second 0.8 m beside the first, with a stop."""
+    """KITTI poses (camera frame) of 1.4 laps around a block, the second lap 0.8 m next to the first, with a stop."""
     s = np.concatenate([np.arange(0, 100, 1.0), np.full(15, 100.0), np.arange(100, 220, 1.0)])
     angle = s / 25.0
     radius = 25 + 0.8 * (angle > 2 * np.pi) + 4 * np.cos(2 * angle)

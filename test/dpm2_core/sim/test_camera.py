@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images: they fit the LiDAR, repeat exactly, and show in degenerate places what the LiDAR cannot."""
+"""Images: they agree with the LiDAR, are exactly repeatable, and show in degenerate places what the LiDAR cannot."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def test_a_image_is_exposed_varied_and_repeatable(city: World) -> None:
     assert 70 < one.mean() < 180
     assert one.std() > 25
     np.testing.assert_array_equal(one, same)
-    assert 1.0 < np.abs(one.astype(int) - other).mean() < 4.0  # two draws of a noise of 2
+    assert 1.0 < np.abs(one.astype(int) - other).mean() < 4.0  # two samples of a noise of 2
 
 
 @pytest.mark.slow
 def test_lidar_points_project_onto_the_pixels_that_show_them(city: World) -> None:
-    """The ray through a point's pixel ends on a thing of the class that the point is labelled with."""
+    """The ray through a point's pixel ends on an object of the point's class."""
     config = CameraConfig()
     camera = calibration(config)
     T_world_lidar = city.pose_at(40.0)
@@ -61,11 +61,11 @@ def test_lidar_points_project_onto_the_pixels_that_show_them(city: World) -> Non
     smooth = np.isin(label, [Label.ROAD, Label.SIDEWALK, Label.BUILDING])
     same = (city.static.label[hits.face] == label)[smooth]
     assert smooth.sum() > 3000
-    assert same.mean() > 0.95  # half a pixel and the camera's other viewpoint at edges cost the rest
+    assert same.mean() > 0.95  # the rest is due to half a pixel, and to the camera's other viewpoint at edges
 
 
 def test_white_paint_is_seen_where_the_road_has_it(highway: World) -> None:
-    """The edge line of the lane is brighter than the asphalt beside it: image and lane coordinates agree."""
+    """The edge line of the lane is brighter than the asphalt next to it: image and lane coordinates agree."""
     config = SMALL.model_copy(update={"width": 640, "height": 192, "focal": 380.0})
     camera = calibration(config)
     T_world_cam = highway.pose_at(150.0) @ camera.T_lidar_cam
@@ -93,7 +93,7 @@ def test_in_a_tunnel_only_the_image_tells_the_motion(tunnel: World) -> None:
 
 @pytest.mark.parametrize("material", [Material.TILE, Material.ASPHALT, Material.PLASTER])
 def test_textures_do_not_repeat(material: Material, highway: World) -> None:
-    """No shift of 1 to 150 m along a wall or road brings a look-alike strip about."""
+    """No shift of 1 to 150 m along a wall or road gives a similar strip."""
     along = np.arange(0, 400, 0.1, np.float32)
     n = len(along)
     street = highway.road.streets[0]
@@ -115,7 +115,7 @@ def test_textures_do_not_repeat(material: Material, highway: World) -> None:
 
 
 def test_images_without_sky_and_without_anything_else(city: World) -> None:
-    """Looking at the ground and into the sky."""
+    """A view of the ground, and one of the sky."""
     axes = np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]])
     x, y, z = city.pose_at(40.0)[:3, 3]
     down = render(city, SMALL, se3.make(axes, (x, y, z + 1)), 0.0, np.random.default_rng(0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Written drives: a plain KITTI data set, whole or absent, the same for any number of workers."""
+"""Written drives: a plain KITTI data set, complete or absent, the same for any number of workers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_any_kitti_reader_reads_it(recording: Path) -> None:
     source = KittiSource(recording)
     assert source.notes == []
-    assert source.vertical_angle_correction_deg == 0  # simulated beams are where they say
+    assert source.vertical_angle_correction_deg == 0  # simulated beams have exact angles
     frames = list(source.frames())
     assert [f.index for f in frames] == [0, 1, 2, 3]
     np.testing.assert_allclose(np.diff([f.stamp for f in frames]), 1e8, rtol=1e-6)
@@ -68,7 +68,7 @@ def test_poses_are_relative_to_the_first_camera_and_line_the_scans_up(recording:
         label = np.fromfile(recording / "sequences" / "00" / "labels" / f"{frame.index:06d}.label", np.uint32)
         points = se3.transform(T_grid_lidar0 @ T, frame.points[label == Label.ROAD, :3].astype(float))
         column, row = ((points[:, :2] - world["origin"]) / world["resolution"]).round().astype(int).T
-        assert np.median(np.abs(world["elevation"][row, column] - points[:, 2])) < 0.03  # kerbs and noise apart
+        assert np.median(np.abs(world["elevation"][row, column] - points[:, 2])) < 0.03  # except curbs and noise
 
 
 def test_the_number_of_workers_changes_nothing(recording: Path, tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_complete_drive_is_reused_and_another_one_rejected(recording: Path) ->
     before = _files(recording)
     assert not simulate(recording, DriveConfig(frames=4, seed=3, road="loop", lidar=LIDAR, camera=CAMERA))
     assert _files(recording) == before
-    with pytest.raises(UsageError, match="other seed, or of another version"):  # which may not have noted everything
+    with pytest.raises(UsageError, match="other seed, or of another version"):  # which may not have noted all settings
         simulate(recording, DriveConfig(frames=4, seed=4, road="loop", lidar=LIDAR, camera=CAMERA))
 
 
@@ -92,7 +92,7 @@ def test_another_folder_is_never_touched(tmp_path: Path) -> None:
 
 
 def test_without_images_there_are_none(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()  # an empty folder is as good as none
+    (tmp_path / "out").mkdir()  # an empty folder counts as none
     simulate(tmp_path / "out", DriveConfig(frames=1, preset="tunnel", images=False, lidar=LIDAR))
     assert not (tmp_path / "out" / "sequences" / "00" / "image_2").exists()
     assert len(KittiSource(tmp_path / "out")) == 1
@@ -150,7 +150,7 @@ def test_a_file_gives_its_own_frames_and_rejects_more(poses_file: Path, tmp_path
     steps = np.linalg.norm(np.diff(written, axis=0), axis=1)
     np.testing.assert_allclose(steps.sum(), np.linalg.norm(np.diff(file, axis=0), axis=1).sum(), rtol=0.05)
     note = json.loads((tmp_path / "out" / "sequences" / "00" / "dpm2_sim.json").read_text())
-    assert str(poses_file.parent) not in json.dumps(note)  # a name and a checksum, no path of this machine
+    assert str(poses_file.parent) not in json.dumps(note)  # a name and a checksum, but no path of this machine
 
 
 @pytest.mark.parametrize(

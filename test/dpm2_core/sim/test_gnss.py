@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated fixes: where the antenna is, with the errors that they state; beside a drive they change nothing else."""
+"""Simulated fixes: at the antenna's position, with the errors that they report. Nothing else in a drive changes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dpm2_core.sim.settings import GnssConfig
 
 
 def local(receiver: Receiver, places: np.ndarray) -> np.ndarray:
-    """(K, 3) east, north, up of the world's origin, m."""
+    """Positions (K, 3) east, north, up of the world's origin, m."""
     return np.asarray(se3.transform(se3.inverse(receiver.T_ecef_world), geodesy.ecef(places)))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a real LiDAR adds to exact ranges, and the sensors that worlds to train on have."""
+"""What a real LiDAR adds to exact ranges, and the sensors of the worlds for training."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def _scan(world: World, lidar: Lidar, seed: int = 0) -> Scan:
 
 
 def _road_error(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Height of what is road over the flat road, m, and its ring."""
+    """Height of road points above the flat road, m, and their ring."""
     road = np.isin(scan.label, [Label.ROAD, Label.MARKING])
     return scan.points[road, 2] + EXACT.height, scan.ring[road]
 
 
 def test_points_of_beams_with_other_origins_lie_on_the_same_road(highway: World) -> None:
-    """And look down the less the nearer they are: 0.2 m higher than their beam points to."""
+    """The nearer they are, the less they look down: 0.2 m higher than the direction of their beam."""
     plain, raised = (_scan(highway, lidar) for lidar in (_with(), _with(emitters=(0.2, 0.2))))
     assert np.abs(_road_error(plain)[0]).max() < 2e-3
     assert np.abs(_road_error(raised)[0]).max() < 2e-3
@@ -64,7 +64,7 @@ def test_beams_that_point_elsewhere_than_believed_bend_the_road(highway: World) 
 
 
 def test_noise_grows_with_range_and_grazing_incidence(highway: World) -> None:
-    """2 mm a meter: a road 30 m away is rougher than one 6 m away by as much, along the beam."""
+    """2 mm per meter: a road 30 m away is noisier than one 6 m away by this amount, along the beam."""
     exact, noisy = (_scan(highway, _with(growth=growth, weak=0.0)) for growth in (0.0, 0.002))
     first, second = (
         dict(
@@ -79,7 +79,7 @@ def test_noise_grows_with_range_and_grazing_incidence(highway: World) -> None:
 
 
 def test_drops_return_from_the_air_alike_in_scan_and_twin(highway: World) -> None:
-    """As many as their density says; they are labelled as outliers, and nothing of them moves."""
+    """There are as many as their density gives. They are labeled as outliers, and none of them is moving."""
     scan = _scan(highway, _with(drops=0.01))
     stray = scan.label == Label.OUTLIER
     distance = np.linalg.norm(scan.points[:, :3], axis=1)
@@ -92,7 +92,7 @@ def test_drops_return_from_the_air_alike_in_scan_and_twin(highway: World) -> Non
 
 
 def test_no_drop_is_behind_what_the_pulse_met() -> None:
-    """Whether that returns or not: windows and dark paint swallow many pulses."""
+    """Whether or not the surface returns the pulse: windows and dark paint absorb many pulses."""
     world = build_world("loop", "indoor", seed=3, length=60)
     T = world.pose_at(20.0, height=1.0)
     scan = _with(drops=0.05).scan(world, T, 0.0, np.random.default_rng(0))
@@ -127,11 +127,11 @@ def test_glare_is_beside_retro_reflectors_only(city: World) -> None:
     sign = np.concatenate([s.points[np.isin(s.label & 0xFFFF, bright)] for s in (exact, lit)])
     assert len(stray) > 0
     away = np.linalg.norm(stray[:, None, :3] - sign[None, :, :3], axis=2).min(1)
-    assert (away < 0.06 * np.linalg.norm(stray[:, :3], axis=1)).all()  # two beams and columns are 3 deg at most
+    assert (away < 0.06 * np.linalg.norm(stray[:, :3], axis=1)).all()  # two beams and columns are at most 3 deg
 
 
 def test_a_driver_that_knows_the_motion_undoes_it_and_another_leaves_its_share(tunnel: World) -> None:
-    """The walls of the tunnel are where they are with the right twist; with half of it they are bent."""
+    """With the right twist, the walls of the tunnel are at their positions; with half of it they are bent."""
     lidar, T = _with(), tunnel.pose_at(130.0)
     width = []
     for believed in (TWIST, 0.5 * TWIST):
@@ -155,7 +155,7 @@ def test_the_real_sensor_scans_deterministically_and_its_mount_does_not_move_the
     assert road.sum() > 500
     assert abs(np.median(level[road, 2]) + 1.73) < 0.08
     forward = first.points[road & (level[:, 0] > 5), 2]
-    assert np.median(forward) > -1.0  # in the sensor's own axes the road ahead rises: it looks down
+    assert np.median(forward) > -1.0  # in the sensor's own axes the road ahead rises, as it looks down
 
 
 def test_the_rosette_never_repeats_and_stays_in_its_cone() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated IMU measures the motion of the drive that it is on, with its errors, and is written beside the scans."""
+"""A simulated IMU measures the motion of its drive, with its errors, and is written next to the scans."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIDAR = LidarConfig(beams=16, columns=360)
 
 
 def resting(times: Array) -> Array:
-    """Tilted by 0.2 rad, nose up."""
+    """Poses at rest, pitched by 0.2 rad with the nose up."""
     return np.tile(se3.exp([0, -0.2, 0, 1, 2, 3]), (len(times), 1, 1))
 
 
@@ -53,12 +53,12 @@ def test_its_rates_lead_along_the_drive(city: World) -> None:
 
 
 def test_each_point_has_its_own_moment(city: World) -> None:
-    """Undone with the true poses, the scans of a swing lie on each other."""
+    """With the true pose at each point's time, the points of a swing lie on the surfaces of the world."""
     robot = TurningRobot(city, 36, Ride(2.0, turns=90.0), LIDAR.model_copy(update={"noise": 0.0, "dropout": 0.0}))
     frame = robot.frame(34)
     assert frame.imu is None
     assert np.ptp(frame.time_offset) == pytest.approx(0.1, rel=0.01)
-    still = city.scene  # rays from where the robot was end where the points are
+    still = city.scene  # rays from the robot's positions end at the points
     T = robot.pose(frame.stamp * 1e-9 + frame.time_offset.astype(float))
     static = frame.points[:, :3].astype(float)
     origins, ends = T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], static) + T[:, :3, 3]
@@ -66,7 +66,7 @@ def test_each_point_has_its_own_moment(city: World) -> None:
     reach = np.linalg.norm(rays, axis=1)
     hits = still.cast(origins.astype(np.float32), (rays / reach[:, None]).astype(np.float32), 100.0)
     assert np.median(np.abs(hits.distance - reach)) < 0.01
-    assert (np.abs(hits.distance - reach) < 0.1).mean() > 0.85  # traffic, grass and rough surfaces apart
+    assert (np.abs(hits.distance - reach) < 0.1).mean() > 0.85  # except traffic, grass and rough surfaces
 
 
 def test_it_lies_beside_the_scans_with_fixes_and_changes_nothing_else(tmp_path: Path) -> None:
@@ -80,22 +80,23 @@ def test_it_lies_beside_the_scans_with_fixes_and_changes_nothing_else(tmp_path: 
     for a, b in zip(without.frames(), frames, strict=True):
         np.testing.assert_array_equal(a.points, b.points)
         assert (a.imu, a.fix) == (None, None)
-        assert (b.fix is None) == (b.index == 0)  # the first one comes after the first scan
+        assert (b.fix is None) == (b.index == 0)  # the first fix comes after the first scan
     samples = [frame.imu for frame in frames if frame.imu is not None]
     assert [len(s) for s in samples] == [11, 10, 10]  # from a tenth of a second before the first
     assert all(s.stamps[-1] == f.stamp for s, f in zip(samples, frames, strict=True))
-    assert np.concatenate([s.forces for s in samples]).mean(0)[2] == pytest.approx(GRAVITY, abs=2.0)  # it drives
+    assert np.concatenate([s.forces for s in samples]).mean(0)[2] == pytest.approx(GRAVITY, abs=2.0)  # while driving
 
 
 @pytest.mark.parametrize(("preset", "road"), [("suburb", "loop"), ("highway", "straight")])
 def test_it_feels_a_comfortable_drive(tmp_path: Path, preset: PresetName, road: str) -> None:
-    """4 m/s2 sideways and 1.5 along, with a third more for its errors and for what is left of the corners of a road.
+    """4 m/s2 sideways and 1.5 along, plus a third for its errors and for the remaining corners of a road.
 
-    The loop was felt as blows of 42 m/s2 every 0.07 s and nothing in between, and the start of the other as one of
-    2500 m/s2 out of a standstill."""
+    Previously, the loop was measured as jolts of 42 m/s2 every 0.07 s and nothing in between, and the start of the
+    other road as one of 2500 m/s2 from standstill.
+    """
     config = DriveConfig(frames=6, seed=3, preset=preset, road=road, images=False, lidar=LIDAR, imu=ImuConfig())
     simulate(tmp_path / "drive", config)
     forces = np.concatenate([f.imu.forces for f in KittiSource(tmp_path / "drive").frames() if f.imu is not None])
     assert len(forces) > 50
     assert np.abs(forces[:, :2]).max() < 7.5
-    assert np.abs(forces[:, 2] - GRAVITY).max() < 3.0  # of the suspension
+    assert np.abs(forces[:, 2] - GRAVITY).max() < 3.0  # from the suspension

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Buildings: every room is reached through its doors, the way is free, and scans see walls on all sides."""
+"""Buildings: every room is reached through its doors, the path is free, and scans show walls on all sides."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_rooms_fill_the_floor_and_the_way_visits_each_through_doors_alone(seed: 
     plan = office(150.0, np.random.default_rng(seed))
     low = np.min([room.low for room in plan.rooms], axis=0)
     high = np.max([room.high for room in plan.rooms], axis=0)
-    assert sum(room.size.prod() for room in plan.rooms) == pytest.approx((high - low).prod())  # none overlaps another
+    assert sum(room.size.prod() for room in plan.rooms) == pytest.approx((high - low).prod())  # no two rooms overlap
     assert len(plan.doors) >= len(plan.rooms) - 1
     corners = np.concatenate([plan.way, plan.way[:1]])
     fine = np.concatenate([np.linspace(a, b, 60, endpoint=False) for a, b in pairwise(corners)])
@@ -57,7 +57,8 @@ def test_rooms_fill_the_floor_and_the_way_visits_each_through_doors_alone(seed: 
 
 
 def test_the_way_is_free_of_all_that_stands_in_it(inside: World) -> None:
-    """Nothing from 0.2 to 1.8 m high is nearer than a narrow robot is wide; cars have room for a car."""
+    """No object from 0.2 to 1.8 m high is nearer than the width of a narrow robot. Where cars drive, there is room for
+    a car."""
     mesh = inside.static
     height = mesh.vertices[mesh.faces][:, :, 2]
     low = (height.min(1) < 1.8) & (height.max(1) > 0.2)
@@ -76,7 +77,7 @@ def test_the_way_is_free_of_all_that_stands_in_it(inside: World) -> None:
 def test_a_scan_is_closed_in_by_walls_floor_and_ceiling(inside: World) -> None:
     lidar, T = Lidar(SMALL), inside.pose_at(20.0, height=1.0)
     scan = lidar.scan(inside, T, 0.0, np.random.default_rng(0))
-    assert len(scan.points) > 0.8 * 16 * 600  # what is lost, windows and the paint of cars swallow
+    assert len(scan.points) > 0.8 * 16 * 600  # the rest is lost, or absorbed by windows and the paint of cars
     z = (se3.transform(T, scan.points))[:, 2]
     assert abs(np.quantile(z, 0.005)) < 0.02
     assert z.max() < 12
@@ -122,7 +123,7 @@ def test_what_there_is_not_indoors_is_rejected() -> None:
 
 
 def test_the_way_is_free_below_the_headroom(inside: World) -> None:
-    """And a LiDAR that does not fit is an error: above a ceiling it sees nothing."""
+    """A LiDAR that does not fit is an error: above a ceiling it sees nothing."""
     headroom = _plan(inside).headroom
     up = np.array([[0, 0, 1]], np.float32)
     for s in np.arange(0, inside.road.drive.length, 0.1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans: beam pattern, noise, labels, twins, exact poses, motion during the turn."""
+"""Scans: beam pattern, noise, labels, twins, exact poses, motion during the rotation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_same_seed_gives_the_same_scan_from_any_thread(city: World) -> None:
 
 
 def test_ranges_have_the_noise_that_is_asked_for(city: World) -> None:
-    """On asphalt: zero mean and 2 cm; the scan before the noise is the same one with noise 0."""
+    """On asphalt: zero mean and 2 cm. Without the noise, the scan equals the one with noise 0."""
     exact, noisy = (_scan(city, noise=noise, dropout=0.0, beams=64) for noise in (0.0, 0.02))
     key = [np.round(np.arctan2(s.points[:, 1], s.points[:, 0]), 5) + 100.0 * s.ring for s in (exact, noisy)]
     _, a, b = np.intersect1d(*key, return_indices=True)
@@ -88,7 +88,7 @@ def test_the_twin_is_the_scan_without_what_moves(city: World) -> None:
     scan = _scan_at(city, *_busy(city))
     still = {row.tobytes() for row in scan.static}
     moving = np.array([row.tobytes() not in still for row in scan.points])
-    np.testing.assert_array_equal(moving, scan.moving)  # all others are there to the bit, no dynamic object is
+    np.testing.assert_array_equal(moving, scan.moving)  # all others are there to the bit, and no dynamic object is
     assert scan.moving.sum() > 200
 
 
@@ -99,7 +99,7 @@ def test_dynamic_objects_are_labelled_as_in_semantic_kitti_and_numbered(city: Wo
     assert set(np.unique(kind[scan.moving])) <= {252, 253, 254, 258}
     assert (number[scan.moving] > 0).all()
     assert (number[~scan.moving] == 0).all()
-    for k in np.unique(number[scan.moving]):  # one dynamic object is one thing, in one place
+    for k in np.unique(number[scan.moving]):  # one dynamic object is one compact object
         extent = np.ptp(scan.points[number == k, :2], axis=0)
         assert np.hypot(*extent) < 14
 
@@ -129,7 +129,7 @@ def test_one_place_seen_from_two_poses_agrees_within_the_noise(city: World) -> N
     assert miss(T_world_b) < 0.03  # 2 cm of range noise, at grazing incidence a little more
     shifted = scan.points[smooth, :3] + np.float32([0.3, 0.3, 0.1])
     seen = se3.transform(T_world_a, shifted.astype(float))
-    assert miss(T_world_b) > 0.06  # so the check does notice an error of the pose
+    assert miss(T_world_b) > 0.06  # so the check does detect an error of the pose
 
 
 @pytest.mark.slow
@@ -142,14 +142,14 @@ def test_a_turn_in_motion_is_undone_by_the_twist(tunnel: World) -> None:
     assert moved.time_offset.min() >= np.float32(-0.05)  # which numpy before 2 does not take for -0.05
     assert moved.time_offset.max() <= np.float32(0.05)
     ahead = np.abs(np.arctan2(moved.points[:, 1], moved.points[:, 0])) < 0.01
-    assert np.abs(moved.time_offset[ahead]).max() < 0.001  # the stamp is when it looks ahead
+    assert np.abs(moved.time_offset[ahead]).max() < 0.001  # the stamp is the time at which it looks ahead
     wall = moved.label == Label.BUILDING
     tree = cKDTree(still.points[still.label == Label.BUILDING, :3])
     points = moved.points[wall, :3].astype(float)
     T_stamp_point = se3.exp(twist * moved.time_offset[wall, None])
     undone = np.einsum("nij,nj->ni", T_stamp_point[:, :3, :3], points) + T_stamp_point[:, :3, 3]
     raw, corrected = (np.median(tree.query(p)[0]) for p in (points, undone))
-    assert corrected < 0.05  # what the sampling of the walls leaves
+    assert corrected < 0.05  # the error due to the sampling of the walls
     assert raw > 3 * corrected
 
 

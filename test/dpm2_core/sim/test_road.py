@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Roads: closed ones close, drives are comfortable, files of poses are followed, bad ones rejected."""
+"""Roads: closed roads are continuous, drives are comfortable, pose files are followed, bad files are rejected."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_drive_keeps_to_its_speed_and_slows_in_curves(kind: str) -> None:
 
 @pytest.mark.parametrize("preset", ["city", "suburb", "rural"])
 def test_the_lap_fits_the_number_of_frames(preset: str) -> None:
-    """150 frames end 10 m or more beyond their start, but not a lap."""
+    """150 frames end at least 10 m beyond their start, but by less than a lap."""
     for seed in range(4):
         length = fitting_length(DriveConfig(preset=preset, seed=seed))
         road = make_road("loop", own_preset(preset, seed), random_stream(seed, preset, 0), length)
@@ -63,7 +63,7 @@ def test_a_file_is_followed_and_its_second_lap_uses_the_first_one_s_street(poses
     position = read_drive(poses_file)
     driven = road.drive.at(road.travelled)[0]
     off = np.linalg.norm(driven - position[:, :2], axis=1)
-    assert np.median(off) < 0.15  # smoothing cuts the inside of bends a little
+    assert np.median(off) < 0.15  # smoothing cuts the inside of curves a little
     assert off.max() < 0.8
     assert np.ptp(road.travelled[100:115]) < 0.2  # the stop
     lap = 2 * np.pi * 25
@@ -72,7 +72,8 @@ def test_a_file_is_followed_and_its_second_lap_uses_the_first_one_s_street(poses
 
 
 def test_the_car_heads_where_the_file_says(poses_file: Path, tmp_path: Path) -> None:
-    """In bends a camera ahead of the rear axle does not look where it goes; the file knows."""
+    """In curves, a camera ahead of the rear axle does not look in the direction of travel; the file gives its
+    heading."""
     road = make_road(str(poses_file), PRESETS["city"], np.random.default_rng(0))
     assert np.degrees(np.median(np.abs(road.slip))) < 1  # this file's car heads along its path
     rows = np.loadtxt(poses_file).reshape(-1, 3, 4)

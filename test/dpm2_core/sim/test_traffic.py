@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Traffic as dense as asked: none at all, or columns on every lane with none inside another one."""
+"""Traffic as dense as requested: none at all, or columns on every lane without overlaps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def test_dense_traffic_takes_a_third_of_the_points(dense: World) -> None:
 
 @pytest.mark.slow
 def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: World) -> None:
-    """Vehicles as lines of points along their middles: apart, 3 m from the sensor, half a truck from what stands."""
+    """Vehicles are lines of points along their center lines: apart from each other, 3 m from the sensor, half a truck
+    from static objects."""
     traffic = dense.traffic
     vehicles = np.flatnonzero([np.ptp(model.vertices[:, 0]) > 3 for model in traffic.models])
     assert len(vehicles) > 40
@@ -60,7 +61,7 @@ def test_columns_keep_clear_of_each_other_of_the_car_and_of_what_stands(dense: W
         owner = np.repeat(np.arange(len(vehicles)), 9)
         pairs = cKDTree(lines).query_pairs(0.9, output_type="ndarray")
         touching = owner[pairs[:, 0]] != owner[pairs[:, 1]]
-        # at the ends of an open road the columns wrap round, out of sight
+        # at the ends of an open road the columns wrap around, out of sight
         ends = dense.road.drive.xy[[0, -1]]
         inside = (np.linalg.norm(xy[:, None] - ends, axis=-1) > 25).all(1)
         assert not (touching & inside[owner[pairs[:, 0]]] & inside[owner[pairs[:, 1]]]).any()

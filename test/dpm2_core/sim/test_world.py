@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds: equal for equal arguments, free roads, the ground where the map says, degenerate where they should be."""
+"""Worlds: equal for equal arguments, free roads, the ground as in the map, degenerate where they should be."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GROUND = [Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.T
 
 @cache
 def built(road: str | Path, preset: PresetName) -> World:
-    """150 m of a road, or along the poses of a file."""
+    """150 m of a road, or a road along the poses of a file."""
     return build_world(str(road), preset, seed=2, length=150)
 
 
@@ -36,7 +36,7 @@ def test_equal_arguments_give_equal_worlds_and_other_seeds_others() -> None:
 
 
 def _low_vertices(world: World, labels: list[Label] | None = None) -> np.ndarray:
-    """(N, 2) of what stands on the ground and reaches no higher than a car's sensor."""
+    """Positions (N, 2) of objects on the ground, up to the height of a car's sensor."""
     mesh = world.static
     requested = ~np.isin(mesh.label, GROUND) if labels is None else np.isin(mesh.label, labels)
     vertices = mesh.vertices[np.unique(mesh.faces[requested])]
@@ -52,8 +52,8 @@ def _low_vertices(world: World, labels: list[Label] | None = None) -> np.ndarray
 def test_nothing_stands_in_the_way(road: str, preset: PresetName, poses_file: Path) -> None:
     world = built(poses_file if road == "file" else road, preset)
     drive = world.road.drive.xy
-    assert cKDTree(drive).query(_low_vertices(world))[0].min() > 1.1  # half a car and a hand
-    assert world.terrain.edge_at(drive).max() < 0.3  # it keeps to the roads
+    assert cKDTree(drive).query(_low_vertices(world))[0].min() > 1.1  # half a car and a margin
+    assert world.terrain.edge_at(drive).max() < 0.3  # it stays on the roads
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_the_ground_is_where_the_map_says(city: World) -> None:
 
 
 def _information(world: World) -> tuple[float, float]:
-    """Mean squared components, along and across the road, of the normals of what a sensor sees of the static world."""
+    """Mean squared components, along and across the road, of the normals of the static surfaces that a sensor sees."""
     T = world.pose_at(150.0)
     lidar = Lidar()
     directions = (lidar.beams.directions(0.0) @ T[:3, :3].T).astype(np.float32)
@@ -109,7 +109,7 @@ def test_highway_and_tunnel_are_degenerate_along_the_road_and_a_city_is_not(tunn
 
 
 def test_a_degenerate_scan_does_not_change_along_the_road(tunnel: World) -> None:
-    """Two places 3 m apart: the same noise-free ranges, to the float's last digits."""
+    """Two positions 3 m apart: the same noise-free ranges, to the last digits of a float."""
     directions = Lidar().beams.directions(0.0)
     ranges = []
     for s in (120.0, 123.0):
