@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated drive with fixes through `dpm2 convert` and `dpm2 run` into a map, and onto other people's maps: near the
-truth, also where a receiver errs for a while."""
+"""A simulated drive with fixes through `dpm2 convert` and `dpm2 run` into a map, and onto external maps: close to the
+truth, also if the receiver has large errors for a while."""
 
 from __future__ import annotations
 
@@ -36,16 +36,17 @@ from ...helpers.maps import ring
 
 FRAMES, SIGMA = 40, 0.05
 ORIGIN = np.array([49.0, 8.4, 110.0])
-WRONG = slice(14, 24)  # of the fixes, a quarter
+WRONG = slice(14, 24)  # of the fixes: a quarter
 GNSS = GnssConfig(rate=10, noise=SIGMA, wander=0)
 OPTIONS = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.keyframes.distance=1.5")
 
 
 class Result(NamedTuple):
-    """Of a run.
+    """The result of a run.
 
     Attributes:
-        off: (K, 3) of the exported way from the truth, to the east, north and up, m. info: of `dpm2 map info`.
+        off: (K, 3) deviation of the exported trajectory from the truth, to the east, north and up, m. info: of `dpm2
+        map info`.
     """
 
     off: Array
@@ -62,7 +63,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def truth(drive: Path) -> tuple[list[int], Array]:
-    """Stamps, ns, and where the LiDAR was on Earth (N, 3)."""
+    """Stamps, ns, and the geodetic positions of the LiDAR (N, 3)."""
     source = KittiSource(drive)
     assert source.poses is not None
     assert source.T_cam_lidar is not None
@@ -109,7 +110,7 @@ def test_a_bag_with_fixes_makes_a_map_that_knows_its_place(drive: Path, tmp_path
 
 @pytest.mark.slow
 def test_a_lidar_that_hangs_has_a_level_map_with_its_place_on_earth(drive: Path) -> None:
-    """Where its mounting is known; upside down the fixes of a way with bends fit to no map."""
+    """Its mounting must be known; in an upside-down map, the fixes of a trajectory with bends do not match."""
     T_hanging = np.diag([1.0, -1.0, -1.0, 1.0])
     settings = {"registration": "geometric", "loops": {"descriptors": False}, "keyframes": {"distance": 1.5}}
     slam = make_slam(SlamSettings.model_validate(settings))
@@ -124,28 +125,29 @@ def test_a_lidar_that_hangs_has_a_level_map_with_its_place_on_earth(drive: Path)
 
 @pytest.mark.slow
 def test_fixes_that_are_50_m_off_for_a_while_bend_nothing(drive: Path, tmp_path: Path) -> None:
-    """As between high houses; of a folder, without a bag."""
+    """As between high houses; from a folder, without a bag."""
     copy = first_scans(drive, FRAMES, tmp_path / "copy")
     path = copy / "sequences" / "00" / "gnss.txt"
     rows = np.loadtxt(path)
-    rows[WRONG, 1:3] += np.array([30.0, 40.0]) / [111_200, 111_200 * np.cos(np.radians(49.0))]  # m a degree
+    rows[WRONG, 1:3] += np.array([30.0, 40.0]) / [111_200, 111_200 * np.cos(np.radians(49.0))]  # m per degree
     path.unlink()
     np.savetxt(path, rows, "%.12e")
     found = run(copy, drive, tmp_path)
     assert np.abs(found.off).max() < 3 * SIGMA
     wrong = found.info["fixes"] - found.info["fixes_used"]
-    assert wrong >= 5  # of those that came with a keyframe
+    assert wrong >= 5  # of those that are associated with a keyframe
 
 
-FAR = np.array([300.0, 40.0, 5.0])  # m, between the two drives
+FAR = np.array([300.0, 40.0, 5.0])  # m, from the first drive to the second
 
 
 def two_drives(wrong_first: bool = False, tied: bool = False, fixes: bool = True) -> MapData:
-    """A ring of 40 keyframes with a fix each, and another one that begins on top of it in the map.
+    """A ring of 40 keyframes with a fix each, and another one that begins at the same pose in the map.
 
     Args:
         wrong_first: the first loop between the two is one that the optimization rejected.
-        tied: the second is the first again, and 20 loops say so; else it was FAR away. fixes: of the second one.
+        tied: the second is the first again, with 20 loops between them; otherwise it is at FAR. fixes: of the second
+        one.
     """
     one = ring(40, points=10)
     two = merge_maps(one, one, np.eye(4))
@@ -189,7 +191,7 @@ def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> No
 
 
 def test_a_drive_of_which_all_is_pruned_is_written_and_where_nothing_places_it_named(tmp_path: Path) -> None:
-    """Drives were looked for among the keyframes that are left: GeoJSON left it out in silence, the page had it."""
+    """Drives were searched among the remaining keyframes only: GeoJSON silently omitted this one, the page had it."""
     data = two_drives(fixes=False)
     beside = se3.exp([0, 0, 0, 0, 2.0, 0])
     trail = [RemovedKeyframe(100 + node, "", 3, node * 10**9, node, beside) for node in range(20)]
@@ -215,7 +217,7 @@ def test_only_fixes_that_are_in_the_graph_count_as_used(tmp_path: Path) -> None:
 
 
 def test_info_says_what_is_not_tied_and_measures_the_rest(tmp_path: Path) -> None:
-    """The two drives are far apart, in frames of their own."""
+    """The two drives are far apart, each in a frame of its own."""
     save_as(two_drives(), tmp_path / "map")
     done = dpm2("map", "info", tmp_path / "map", "--json", tmp_path / "info.json")
     assert "40 of them not connected to the first keyframe" in " ".join(done.stdout.split())
@@ -242,7 +244,7 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
     lines = lines_of(tmp_path / "a.geojson")
     assert set(lines) == {2}
     np.testing.assert_allclose(lines[2], data.poses[40:, :3, 3] + FAR, atol=0.01)  # the file has mm
-    # Two of the first drive, and five of the second within 20 m that are 5 m off: neither tell where it is.
+    # Two fixes of the first drive, and five of the second within 20 m that are 5 m off: neither determine its pose.
     few = [replace(k, fix=k.fix if node in (0, 1, *range(40, 45)) else None) for node, k in enumerate(data.keyframes)]
     few = [replace(k, fix=k.fix and replace(k.fix, covariance=np.eye(3) * 25.0)) for k in few]
     save_as(replace(data, keyframes=few, georeference=None), tmp_path / "few")
@@ -259,7 +261,7 @@ def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
 
 
 def test_a_recovered_map_is_where_its_fixes_are(tmp_path: Path) -> None:
-    """The row that says so was damaged: the recovered map was nowhere, and "80 fixes do not determine it"."""
+    """The row with the georeference was damaged: the recovered map had none, and "80 fixes do not tell it"."""
     data = two_drives()
     save_as(data, tmp_path / "map")
     with closing(sqlite3.connect(tmp_path / "map")) as sql, sql:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 run --localise` as a user calls it: the drive is found in the map, and no byte of the map changes."""
+"""`dpm2 run --localise` as a user calls it: the drive is localized in the map, and no byte of the map changes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.weights]
 
 MAPPED = 20
 QUICK = ("--set", "slam.registration=geometric")
-"""For the odometry from scan to scan: places are found by the network all the same."""
+"""For the odometry from scan to scan: place recognition uses the network nevertheless."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,8 @@ def truth(recording: Path) -> np.ndarray:
 def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     recording: Path, made: Path, tmp_path: Path, hint: str | None, tiled: bool
 ) -> None:
-    """From scan 8 on, out to 4 m beyond the map, a file or tiles of 10 m; whatever heading is hinted."""
+    """It starts at scan 8 and continues to 4 m beyond the map, with a file or tiles of 10 m, for any heading of a
+    hint."""
     before, map_ = hashlib.sha256(made.read_bytes()).hexdigest(), made
     if tiled:
         map_ = tmp_path / "tiles"
@@ -72,8 +73,8 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
 
 
 def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tmp_path: Path) -> None:
-    """The drive ended where it was needed, with nothing in the folder. A script is told, as where the map file is not
-    complete."""
+    """The drive ended where the tile was needed, with nothing in the folder. The exit code reports it to scripts, as
+    for a map file that is incomplete."""
     assert dpm2("map", "export", made, tmp_path / "tiles", "--tiles", "100").returncode == 0
     missing = tmp_path / "tiles" / "0_0.dpm2map"
     missing.unlink()
@@ -85,7 +86,7 @@ def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tm
 
 
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
-    """Nothing is there; then it looks everywhere, after a second although it has hardly moved."""
+    """Nothing is there; it searches everywhere after a second, although the robot has hardly moved."""
     succeeded(
         "run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0", *QUICK
     )
@@ -96,7 +97,7 @@ def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Pat
 
 
 def test_kidnapping_is_noticed_and_answered(recording: Path, made: Path, tmp_path: Path) -> None:
-    """The scans jump from the end of the map back to its beginning: lost for a while, never sure of a wrong place."""
+    """The scans jump from the end of the map back to its start: lost for a while, never tracking at a wrong pose."""
     sequence = tmp_path / "sequence"
     (sequence / "velodyne").mkdir(parents=True)
     order = [*range(8, 19), *[1] * 24]

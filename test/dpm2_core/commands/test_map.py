@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 map` and `dpm2 run --map` on real files; what they write is read back by other means."""
+"""`dpm2 map` and `dpm2 run --map` on real files; their output is read back by other means."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_occupancy(tmp_path: Path, map_file: Path) -> None:
 
 
 def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Path, recording: Path) -> None:
-    """As of a LiDAR that is tilted in a drive without an IMU: the road is full of obstacles then."""
+    """As for a LiDAR that is tilted in a drive without an IMU: the road is then full of obstacles."""
     scene = next(iter(open_source(recording).frames())).points[::4]
     for name, degrees in (("level", 0), ("tilted", 25)):
         data, T_tilted_level = ring(6), se3.exp([0, np.radians(degrees), 0, 0, 0, 0])
@@ -102,7 +102,8 @@ def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Pat
 
 
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(tmp_path: Path) -> None:
-    """What stands on one is free where the other one is seen through: both are one grid. A steep hill is none."""
+    """Obstacles on one floor are free where the other is seen through: both share one grid. A steep hill is no
+    problem."""
     data = ring(40, 100)  # around 200 m
     for name, slope, laps, words in (("hill", 0.2, 1, ""), ("house", 0.0, 2, "up to 2.8 m above each other")):
         poses = np.repeat(data.poses[None], laps, 0)
@@ -126,7 +127,7 @@ def test_an_export_replaces_neither_the_map_nor_another_grid(tmp_path: Path, map
 
 
 def test_maps_of_different_weights_are_not_merged(tmp_path: Path, map_file: Path) -> None:
-    """No robot could find itself in the result."""
+    """No robot could localize in the result."""
     other = tmp_path / "other.dpm2map"
     other.write_bytes(map_file.read_bytes())
     with closing(sqlite3.connect(other)) as connection:
@@ -154,11 +155,11 @@ def test_an_empty_map_makes_no_tiles(tmp_path: Path) -> None:
 
 
 def test_the_graph_of_several_drives_lies_where_their_map_does(tmp_path: Path) -> None:
-    """Though the first loop between two of them is wrong, and the optimization has rejected it."""
+    """This holds although the first loop between two of them is wrong, and the optimization has rejected it."""
     import gtsam
 
     _, maps, joins = fleet_maps(2)
-    joins.insert(0, joins.pop())  # the wrong one
+    joins.insert(0, joins.pop())  # the wrong one first
     poses = solve(maps, joins, RobustSettings()).poses
     data = replace(side_by_side(maps, joins), poses=np.concatenate(list(poses.values())))
     save_as(data, tmp_path / "map")
@@ -169,7 +170,7 @@ def test_the_graph_of_several_drives_lies_where_their_map_does(tmp_path: Path) -
 
 
 def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
-    """Of two robots whose keyframes take turns, also when keyframes are pruned; the file may be a link."""
+    """Two robots have alternating keyframes; the length is the same if keyframes are pruned. The file may be a link."""
     steps = 10.0 * np.arange(12)
     made = ring(24, points=10)
     poses = np.array([se3.make(np.eye(3), [steps[node // 2], 100.0 * (node % 2), 0]) for node in range(24)])
@@ -185,7 +186,7 @@ def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
         (tmp_path / "link").unlink(missing_ok=True)
         (tmp_path / "link").symlink_to(tmp_path / name)
         with MapStore.open(tmp_path / name, read_only=False) as store:
-            store.begin_session()  # from now on there is a file beside it
+            store.begin_session()  # from now on there is a file next to it
             succeeded("map", "info", tmp_path / "link", "--json", tmp_path / f"{name}.json")
             size = sum(path.stat().st_size for path in (tmp_path / name, tmp_path / f"{name}-wal"))
         figures = json.loads((tmp_path / f"{name}.json").read_text())
@@ -194,8 +195,8 @@ def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
 
 
 def test_two_drives_of_a_session_are_two_ways(tmp_path: Path) -> None:
-    """The odometry began anew in it, as after a recording that was played again: 1 km from the end of the one to the
-    start of the other was length, and a line on the page and in GeoJSON."""
+    """The odometry started again in the session, as when a recording is played again. The 1 km from the end of one
+    drive to the start of the other counted as length, and was a line on the page and in GeoJSON."""
     both = side_by_side({"one": ring(12), "two": ring(12)}, [])
     poses = both.poses.copy()
     poses[12:, 0, 3] += 1000
@@ -220,7 +221,7 @@ def test_merge_by_transform(tmp_path: Path, map_file: Path) -> None:
 
 
 def test_a_drive_that_both_maps_hold_is_said_to_be_there_twice(tmp_path: Path) -> None:
-    """But not that drives begin at the same time and pose, as those of a simulator do."""
+    """Drives that only begin at the same time and pose, as those of a simulator do, are not reported."""
     one = ring(12)
     moved = [replace(k, T_odom_kf=k.T_odom_kf @ se3.exp([0, 0, 0, 0.1 * n, 0, 0])) for n, k in enumerate(one.keyframes)]
     save_as(one, tmp_path / "one")
@@ -264,7 +265,7 @@ def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Pat
 
 
 def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, map_file: Path) -> None:
-    """As of a wrong sign, or the two maps the other way round."""
+    """As for a wrong sign, or the two maps exchanged."""
     with MapStore.open(map_file, read_only=False) as store:
         store.write(Change(georeference=Georeference(np.array([49.0, 8.4, 110.0]), se3.exp([0, 0, 1.0, 2, 3, 4]))))
     for words, said in (("500 0 0 0", "500 m from its pose by the fixes of both maps"), ("1 0 0 0", "")):
@@ -274,14 +275,14 @@ def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, 
 
 
 def points_of(ply: Path) -> Array:
-    """(M, 3) m."""
+    """(M, 3) points, m."""
     return np.frombuffer(ply.read_bytes().partition(b"end_header\n")[2], "<f4").reshape(-1, 4)[:, :3]
 
 
 @pytest.mark.parametrize("robots", [("", ""), ("red", "blue")])
 def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path: Path, robots: tuple[str, str]) -> None:
-    """Neither a second drive nor a second robot is drawn into the place of the first; pruned keyframes stay beside
-    those that have their place."""
+    """Neither a second drive nor a second robot is drawn at the first one's poses; pruned keyframes remain with those
+    that have their place."""
     one = ring(12)
     two = merge_maps(one, one, np.eye(4))
     keyframes = [replace(k, robot=robots[node // 12]) for node, k in enumerate(two.keyframes)]
@@ -296,13 +297,13 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
         for path in ("apart", "alone"):
             done = succeeded("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
             assert (f"without 12 of the 12 keyframes of {drive}: no loop connects" in done.stderr) == (path == "apart")
-        if name != "a.html":  # it has a title
+        if name != "a.html":  # the page has a title
             assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
     assert len(read_trajectory(tmp_path / "apart.a.tum").keys) == 12
 
 
 def test_maps_that_are_joined_by_a_known_transform_stay_together(tmp_path: Path) -> None:
-    """Though no loop ties them: their clouds are both there, and the graph keeps the transform."""
+    """No loop ties them, but the clouds of both are present, and the graph keeps the transform."""
     save_as(ring(12), tmp_path / "one")
     succeeded("map", "merge", tmp_path / "one", tmp_path / "one", "--out", tmp_path / "both",
                 "--transform", "600 0 0 0")  # fmt: skip
@@ -364,15 +365,15 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     one, two = loaded(whole), loaded(parts)
     assert {k.session for k in two.keyframes} == {1, 2}
     assert two.keyframes[before].index == two.keyframes[before - 1].index  # it begins where the first part ended
-    assert two.clouds.loan(before) is not None  # and borrows that one's cloud
+    assert two.clouds.loan(before) is not None  # and it borrows that keyframe's cloud
     assert "registration: geometric" in one.sessions[0].config
     assert two.keyframes[-1].index >= 50
-    # As good as in one go: the ends of both lie within 5 cm, and so does each keyframe that both have.
+    # As good as one run: the ends of both are within 5 cm, and so is each keyframe that both have.
     a, b = aligned(one), aligned(two)
     common = sorted(a.keys() & b.keys())
     assert len(common) > before - 1
     assert max(np.linalg.norm(a[i][:3, 3] - b[i][:3, 3]) for i in common) < 0.05
-    # Only the new frames are in the trajectory of the second run, the map has all.
+    # The trajectory of the second run contains only the new frames; the map contains all.
     assert len(read_trajectory(tmp_path / "b" / "trajectory.tum")) == 60 - two.keyframes[before].index
     ended = dpm2("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", "--frames", "0:20", *RUN)
     assert f"--frames 0:20: the map goes on to frame {loaded(parts).keyframes[-1].index} already" in ended.stderr
@@ -380,7 +381,7 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
 
 @pytest.mark.slow
 def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Path) -> None:
-    """kill -9 of a real drive, after the network has tried loops and had them rejected."""
+    """kill -9 of a real drive, after the network has tried loops that were rejected."""
     path = tmp_path / "a.dpm2map"
     rejecting = ("--set", "slam.loops.gap=3", "--set", "slam.loops.min_overlap=1", "--set", "slam.loops.radius=0")
     run = ("run", recording, "--out", tmp_path / "out", "--map", path, *rejecting)
@@ -392,11 +393,11 @@ def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Pa
 
 
 def _rejected(path: Path) -> int:
-    """Loops that the network was asked about and that were rejected, so far."""
+    """Number of loops so far that the network has tried and that were rejected."""
     try:
         with MapStore.open(path) as store:
             return sum(ok == 0 for (ok,) in store.rows("edges", "ok"))
-    except Dpm2Error:  # it is just being made, or not there yet
+    except Dpm2Error:  # it does not exist yet, or is being made
         return 0
 
 

@@ -32,8 +32,8 @@ def test_wrong_loops_are_named_and_left_out(tmp_path: Path) -> None:
 
 
 def test_covariances_that_do_not_fit_are_said(tmp_path: Path) -> None:
-    """Information of identity, as many programs write: all 13 wrong loops of a graph were kept and the map was bent,
-    without a word."""
+    """The information is identity, as many programs write it: all 13 wrong loops of a graph were kept and the map was
+    bent, without a message."""
     _, graph = made_drive(15, count=1500, right=20)
     path, out, info = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
     write_g2o(path, G2o(scaled(graph, 1e4), np.arange(1500), planar=False))
@@ -57,7 +57,7 @@ def test_what_is_no_drive_is_said(tmp_path: Path) -> None:
 
 
 def test_a_few_vertices_that_are_not_tied_are_counted(tmp_path: Path) -> None:
-    """Three drives of which loops made one map."""
+    """Three drives that loops connected to one map."""
     path = tmp_path / "drives.g2o"
     edges = [(k, k + 1) for k in range(11) if k not in (3, 7)] + [(0, 4), (4, 8)]
     path.write_text("".join(f"EDGE_SE2 {a} {b} 1 0 0 1 0 0 1 0 1\n" for a, b in edges))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every argument and option that a command of `dpm2` accepts has an effect: its function makes use of it."""
+"""Every argument and option of a command of `dpm2` has an effect: its function uses it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMMANDS = sorted(Path(dpm2_core.commands.__path__[0]).glob("*.py"))
 
 @pytest.mark.parametrize("module", COMMANDS, ids=lambda path: path.stem)
 def test_no_parameter_of_a_command_is_ignored(module: Path) -> None:
-    """A parameter whose name the body never reads would be accepted and do nothing."""
+    """A parameter whose name the body never reads would be accepted but have no effect."""
     for function in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
         if isinstance(function, ast.FunctionDef):
             read = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
@@ -44,7 +44,7 @@ def test_figures_on_stdout_are_json_where_one_is_not_known(capsys: pytest.Captur
 def test_an_option_without_effect_is_rejected(
     command: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before any file is opened, and none is made."""
+    """The error comes before any file is opened, and no file is made."""
     monkeypatch.chdir(tmp_path)
     assert words in refused(*command)
     assert not list(tmp_path.iterdir())

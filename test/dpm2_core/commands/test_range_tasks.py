@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 train dslr|ae_lidar` and `dpm2 eval-task` on pairs in DSLR's layout: figures, image, and what cannot be."""
+"""`dpm2 train dslr|ae_lidar` and `dpm2 eval-task` on pairs in DSLR's layout: figures, image, and invalid requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SMALL = [SENSOR, "network.channels=4", "network.latent=8", "window=3", "every=1"
 
 @pytest.fixture
 def pairs(tmp_path: Path) -> Path:
-    """One pair of arrays of 6 scans: range images of a room, with something in the middle of the dynamic ones."""
+    """One pair of arrays of 6 scans: range images of a room, with an object in the middle of the dynamic ones."""
     rng = np.random.default_rng(0)
     d = np.broadcast_to(12 + 3 * np.sin(np.arange(64) / 5), (6, 16, 64)) + rng.normal(scale=0.02, size=(6, 16, 64))
     z = d * np.tan(np.radians(np.linspace(2, -14, 16)))[None, :, None]
@@ -40,7 +40,7 @@ def pairs(tmp_path: Path) -> Path:
     ],
 )
 def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[str], figures: set[str]) -> None:
-    """The SLAM loss in the last of three epochs; weights of one task are rejected by the other; SLAM needs poses."""
+    """The SLAM loss is on in the last of three epochs; one task rejects the other's weights; the SLAM needs poses."""
     out = tmp_path / "out"
     settings = [word for setting in [*SMALL, *stages, "epochs=3"] for word in ("--set", setting)]
     slam = ["--set", "slam.gamma=0.5", "--set", "slam.every=3"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 report` of experiments: their tables, with runs beside or without any, from above or from their own folder."""
+"""`dpm2 report` of experiments: their tables, with or without runs, from a parent folder or from their own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...helpers.command import Done, dpm2
 
 
 def experiment(folder: Path, name: str, value: float) -> Path:
-    """What one leaves: a table with that value, and its page."""
+    """The output of an experiment: a table with that value, and its page."""
     table = ResultTable(f"Table of <{name}>", ["06"], {"t": ".3f"})
     table.add("ours", {"06": {"t": value}})
     folder.mkdir(parents=True)
@@ -25,13 +25,13 @@ def experiment(folder: Path, name: str, value: float) -> Path:
 
 
 def report(out: Path, *folders: Path) -> tuple[Done, str]:
-    """What was said, and the page."""
+    """The finished command, and the page."""
     done = dpm2("report", *folders, "--out", out)
     return done, out.read_text() if done.returncode == 0 else ""
 
 
 def test_an_experiment_without_a_run_has_its_tables(tmp_path: Path) -> None:
-    """One with a task that leaves figures alone: it was refused, as a folder without a run."""
+    """An experiment with a task leaves only figures: it was rejected, as a folder without a run."""
     done, page = report(tmp_path / "r.html", experiment(tmp_path / "ground", "gndnet", 0.125))
     assert done.returncode == 0, done.stderr
     assert "<h2>Table of &lt;gndnet&gt;</h2>" in page
@@ -42,13 +42,13 @@ def test_an_experiment_without_a_run_has_its_tables(tmp_path: Path) -> None:
 
 
 def test_experiments_below_a_folder_have_their_tables_by_its_name(tmp_path: Path) -> None:
-    """Their runs were on the page, and their tables were not."""
+    """Their runs were on the page, but their tables were not."""
     for number, name in enumerate(("first", "second")):
         run = experiment(tmp_path / "out" / name, "kitti", number + 0.25) / "ours" / "06"
         run.mkdir(parents=True)
         write_tum(run / "trajectory.tum", [1, 2], np.stack([np.eye(4)] * 2))
     (tmp_path / "out" / "notes").mkdir()
-    (tmp_path / "out" / "notes" / "kitti.json").write_text("{}")  # of something else
+    (tmp_path / "out" / "notes" / "kitti.json").write_text("{}")  # of another program
     done, page = report(tmp_path / "r.html", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     for name, value in (("first", "0.250"), ("second", "1.250")):

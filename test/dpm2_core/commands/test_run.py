@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`dpm2 run` as a user calls it: every file is there, every error is one line and an exit code, nothing is lost."""
+"""`dpm2 run` as a user calls it: every file is written, every error is one line and an exit code, nothing is lost."""
 
 from __future__ import annotations
 
@@ -40,20 +40,21 @@ RESULTS = {
 
 @pytest.fixture(scope="module")
 def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first of its scans."""
+    """The first scans of the recording."""
     return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
 @pytest.fixture
 def sequence(recording: Path, tmp_path: Path) -> Path:
-    """A copy of its sequence folder, to be damaged."""
+    """A copy of its sequence folder, which a test may damage."""
     copy = tmp_path / "sequence"
     shutil.copytree(recording / "sequences" / "00", copy)
     return copy
 
 
 def test_the_imu_of_a_bag_is_used(sequence: Path, tmp_path: Path) -> None:
-    """Its samples stop 0.05 s before the ninth frame, which still has some; the drive goes on, and both are said."""
+    """Its samples stop 0.05 s before the ninth frame, which still has some; the drive continues, and both are
+    reported."""
     poses, imu = KittiSource(sequence).poses, Imu(ImuConfig(), np.random.default_rng(0))
     steps, times = se3.way(poses[:-1], poses[1:]), imu.times(0.0, 0.75)
 
@@ -155,7 +156,7 @@ def test_errors_of_use(recording: Path, tmp_path: Path, arguments: list[str], wo
 def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map_and_no_settings(
     recording: Path, tmp_path: Path, arguments: list[str]
 ) -> None:
-    """Or the same command, with its mistake corrected, would find a map there."""
+    """Otherwise the same command, once corrected, would find a map there."""
     (tmp_path / "file").write_text("mine")
     given = [text.replace("FILE", str(tmp_path / "file")) for text in arguments]
     out, path = ([] if "--out" in given else ["--out", tmp_path / "out"]), tmp_path / "drive.dpm2map"
@@ -166,11 +167,11 @@ def test_what_cannot_be_written_is_an_error_of_use_and_leaves_no_map_and_no_sett
 
 
 def test_a_run_leaves_nothing_of_the_one_before(sequence: Path, tmp_path: Path) -> None:
-    """Errors of another drive would be shown as its own."""
+    """Otherwise, errors of another drive would be shown as its own."""
     out = tmp_path / "out"
     run = ("run", sequence, "--out", out, "--frames", ":3", *QUICK)
     assert dpm2(*run).returncode == 0
-    (out / "localisation.json").write_text("{}")  # of a run in a map
+    (out / "localisation.json").write_text("{}")  # of a localization in a map
     assert (out / "metrics.json").exists()
     (sequence / "poses.txt").unlink()
     assert dpm2(*run).returncode == 0
@@ -178,7 +179,7 @@ def test_a_run_leaves_nothing_of_the_one_before(sequence: Path, tmp_path: Path) 
 
 
 def test_damaged_scans_fail_alone(sequence: Path, tmp_path: Path) -> None:
-    """A scan cut short, one of NaN and an empty one: each costs its own frame, and is named."""
+    """A truncated scan, one of NaN and an empty one: each affects only its own frame, and is named."""
     (sequence / "velodyne" / "000004.bin").write_bytes(b"\0" * 1003)
     np.full((500, 4), np.nan, np.float32).tofile(sequence / "velodyne" / "000006.bin")
     (sequence / "velodyne" / "000008.bin").write_bytes(b"")
@@ -221,7 +222,7 @@ def test_full_disk_keeps_the_old_map(recording: Path, tmp_path: Path) -> None:
     assert "map.ply" in done.stderr
     assert (out / "map.ply").read_bytes() == before
     assert not [path for path in out.iterdir() if path.suffix == ".part"]
-    # Beside the new trajectory, too, not those of the run before.
+    # Errors next to the new trajectory must not be those of the previous run, either.
     frames = len(read_trajectory(out / "trajectory_kitti.txt"))
     assert frames == json.loads((out / "timing.json").read_text())["frames"] == FRAMES
     assert json.loads((out / "metrics.json").read_text())["frames"] == FRAMES
@@ -240,7 +241,7 @@ def test_a_run_that_is_killed_leaves_results_and_settings_of_the_one_before(sequ
 
 
 def _stand_still(sequence: Path) -> None:
-    """At the end of the drive, for longer than a test."""
+    """The robot stands still at the end of the drive, for longer than a test."""
     for i in range(FRAMES, 2000):
         (sequence / "velodyne" / f"{i:06d}.bin").symlink_to(sequence / "velodyne" / f"{FRAMES - 1:06d}.bin")
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(2000)))
@@ -249,7 +250,7 @@ def _stand_still(sequence: Path) -> None:
 
 @pytest.mark.parametrize("another", [False, True])
 def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, another: bool) -> None:
-    """All, or all but the map file, which is said, where another program has begun to write to that meanwhile."""
+    """All is written; if another program writes to the map file, all except that file, and this is reported."""
     _stand_still(sequence)
     out, path = tmp_path / "out", tmp_path / "drive.dpm2map"
     run = ("run", sequence, "--out", out, "--map", path, *QUICK)
@@ -266,7 +267,7 @@ def test_interrupted_run_writes_what_there_is(sequence: Path, tmp_path: Path, an
 
 
 def test_an_interrupt_after_the_last_frame_costs_nothing(sequence: Path, tmp_path: Path) -> None:
-    """While the results are being written: the last of them into a pipe that nobody reads before."""
+    """The results are being written, the last of them into a pipe that nobody has read so far."""
     out, pipe = tmp_path / "out", tmp_path / "figures"
     os.mkfifo(pipe)
     with started("run", sequence, "--out", out, "--json", pipe, *QUICK) as process:
@@ -280,11 +281,11 @@ def test_an_interrupt_after_the_last_frame_costs_nothing(sequence: Path, tmp_pat
 
 
 def _keyframes(path: Path) -> int:
-    """In the map file so far."""
+    """Number of keyframes in the map file so far."""
     try:
         with MapStore.open(path) as store:
             return len(load_map(store))
-    except Dpm2Error:  # not there yet, or just being made
+    except Dpm2Error:  # it does not exist yet, or is being made
         return 0
 
 

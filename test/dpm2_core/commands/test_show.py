@@ -21,7 +21,7 @@ from ...helpers.scenes import boxes
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scans of a street, 1 m apart, and weights of a tiny untrained network beside them."""
+    """Two scans of a street, 1 m apart, and weights of a tiny untrained network next to them."""
     folder = tmp_path_factory.mktemp("show")
     (folder / "velodyne").mkdir()
     points = np.c_[boxes(np.random.default_rng(0)), np.full(4000, 0.5)].astype(np.float32)
@@ -41,7 +41,7 @@ def test_draws_an_image(sequence: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_draws_the_image_with_attention(sequence: Path, tmp_path: Path) -> None:
-    """With weights that have a camera and a drive with images, the drawing has a third part below."""
+    """With weights that use a camera and a drive with images, the drawing has a third part below."""
     folder = tmp_path / "drive"
     shutil.copytree(sequence, folder)
     (folder / "calib.txt").write_text("P2: 60 0 63.5 0 0 60 31.5 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3\n")
@@ -77,7 +77,7 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
 
 
 def test_one_of_several_sequences_is_shown(sequence: Path, tmp_path: Path) -> None:
-    """The error named a setting that the command did not take."""
+    """The error named a setting that the command did not accept."""
     for name in ("00", "01"):
         shutil.copytree(sequence / "velodyne", tmp_path / "sequences" / name / "velodyne")
     call = ("show", tmp_path, "0", "1", "--out", tmp_path / "m.png", "--weights", sequence / "tiny.safetensors")

@@ -40,7 +40,7 @@ def train(recording: Path, out: Path, *more: object) -> Done:
 
 @pytest.mark.slow
 def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
-    """With the SLAM loss in the third epoch; a second training does not overwrite; figures, table and image."""
+    """The SLAM loss is on in the third epoch; a second training does not overwrite; figures, table and image."""
     out, third = tmp_path / "out", ("--set", "slam.every=3")
     first = train(recording, out, *SLAM, *third, "--val", recording)
     assert first.returncode == 0
@@ -66,14 +66,14 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     assert "precision" in dpm2("eval-task", "gndnet", weights, recording).stdout
 
     scan = recording / "sequences" / "00" / "velodyne" / "000000.bin"
-    scan.write_bytes(scan.read_bytes()[::-1])  # another drive of as many scans
+    scan.write_bytes(scan.read_bytes()[::-1])  # another drive with the same number of scans
     replaced = train(recording, out, "--resume", *SLAM, *third)
     assert (replaced.returncode, replaced.stderr.count("\n")) == (2, 1)
     assert "began with content " in replaced.stderr
 
 
 def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
-    """Exit code 2 and one line that names what is wrong."""
+    """Exit code 2 and one line that names the error."""
     out = tmp_path / "out"
     assert "nowhere: no such folder" in refused("train", "gndnet", tmp_path / "nowhere", "--out", out)
     unknown = ("--set", "network.cellz=3")
@@ -93,7 +93,7 @@ def test_errors_of_use(recording: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_data_of_the_tasks(tmp_path: Path) -> None:
-    """`dpm2 train tasks-data` fills train/ and val/, and takes the settings of the sensor."""
+    """`dpm2 train tasks-data` fills train/ and val/, and accepts the settings of the sensor."""
     settings = ["train=1", "val=1", "train_frames=2", "val_frames=2", "lidar.columns=48", "lidar.beams=16"]
     words = [word for setting in settings for word in ("--set", setting)]
     assert dpm2("train", "tasks-data", tmp_path / "data", *words, "--workers", "1").returncode == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `dpm2 train` says of scans that are both learned from and measured on."""
+"""Notes of `dpm2 train` about scans that are used for both training and evaluation."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ RANGE = (
 
 
 def sets(*settings: str) -> list[str]:
-    """`--set` before each."""
+    """`--set` before each setting."""
     return [word for setting in settings for word in ("--set", setting)]
 
 
 def notes(done: str) -> list[str]:
-    """What was said of scans that are learned from."""
+    """The notes about scans that are used for training."""
     return [line for line in done.splitlines() if line.startswith("note: ")]
 
 
 @pytest.mark.slow
 def test_sequences_that_a_task_is_measured_on_and_learns_from_are_named(tmp_path: Path) -> None:
-    """With `--val-sequences 02`, and `--sequences` forgotten, the task learned from 02 too: only where all that was
-    measured on was all that was learned from was it said."""
+    """With `--val-sequences 02`, and `--sequences` forgotten, the task also learned from 02. It was reported only if
+    all the evaluation data was all the training data."""
     data = tmp_path / "data"
     for name in ("00", "01", "02"):
         labelled_drive(data / "sequences" / name, range(2), points=300, seed=int(name))
@@ -72,8 +72,8 @@ def test_pairs_that_are_measured_on_and_learned_from_are_named(tmp_path: Path) -
 def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
     packed: Path, samples: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not those of no weight; but a part that was packed anew: the same scans, whose figures said nothing. Of the
-    processes that torchrun starts the first says so."""
+    """Drives of weight zero are not named; a part that was packed again is, since figures on the same scans show
+    nothing. Of the processes of torchrun, only the first reports it."""
     elsewhere, again = tmp_path / "elsewhere", tmp_path / "again"
     north = se3.exp([0, 0, 0, 0, 100, 0])
     write_packed(elsewhere / "world", [s._replace(pose=north @ s.pose) for s in samples], {"source": "boxes"})
@@ -95,9 +95,9 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
 @pytest.mark.weights
 @pytest.mark.slow
 def test_weights_to_start_from_have_a_name_as_everywhere(tmp_path: Path) -> None:
-    """Of those that come with dpm2 the path was wanted, in trainings alone."""
+    """For weights that come with dpm2, trainings required the path, unlike other commands."""
     done = dpm2("train", "phase1", "--out", tmp_path / "a", "--set", "start=small")
-    assert "data.packed: want packed drives" in done.stderr  # the weights were there
+    assert "data.packed: want packed drives" in done.stderr  # the weights were found
     (content,) = [
         key for key in json.loads((tmp_path / "a" / "begun.json").read_text()) if key.startswith("content of")
     ]

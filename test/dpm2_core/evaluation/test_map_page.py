@@ -72,7 +72,7 @@ def test_images_that_are_none_are_left_out() -> None:
 
 @pytest.mark.slow
 def test_in_a_browser(tmp_path: Path) -> None:
-    """A click shows keyframe, image and verdicts; two clicks measure; nothing is fetched, and no error is said."""
+    """A click shows keyframe, image and verdicts; two clicks measure; nothing is fetched, and no error is reported."""
     data = ring(24, image=(64, 48))
     write_map_page(tmp_path / "<i>ring.html", data, 0.3)
     with opened(tmp_path / "<i>ring.html") as (page, said):
