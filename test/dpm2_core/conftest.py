@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small map; scans of one place; packed drives to learn from."""
+"""A small map; scans of one place; packed drives to train on."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def keyframes(noise: np.random.Generator) -> list[Keyframe]:
 
 @pytest.fixture
 def map_file(tmp_path: Path, keyframes: list[Keyframe]) -> Path:
-    """A closed map file of those keyframes, with a loop that was accepted and one that was rejected."""
+    """A closed map file of those keyframes, with one accepted and one rejected loop."""
     path = tmp_path / "drive.dpm2map"
     with MapStore.create(path) as store:
         store.begin_session("slam: {}", "small 0123456789abcdef")
@@ -53,7 +53,7 @@ def map_file(tmp_path: Path, keyframes: list[Keyframe]) -> Path:
 
 
 MOTION = se3.exp(np.array([0.002, -0.003, np.deg2rad(1.2), 0.8, 0.1, 0.02]))
-"""From a scan to the next: 0.8 m, 1.2 deg."""
+"""From one scan to the next: 0.8 m, 1.2 deg."""
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def scans(noise: np.random.Generator) -> list[Tensor]:
 
 @pytest.fixture
 def samples() -> list[Sample]:
-    """Six scans, 1 m apart, of one place, each of other points of the same surfaces."""
+    """Six scans of one place, 1 m apart, each with other points of the same surfaces."""
     out = []
     for i in range(6):
         cloud = boxes(np.random.default_rng(1), 6000)
@@ -87,14 +87,15 @@ def samples() -> list[Sample]:
 
 @pytest.fixture
 def packed(samples: list[Sample], tmp_path: Path) -> Path:
-    """Root of a folder with that drive, `world`."""
+    """Parent folder of that drive, `world`."""
     write_packed(tmp_path / "data" / "world", samples, {"source": "boxes"})
     return tmp_path / "data"
 
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """torch's networks are small here: several threads take longer, and sum gradients in any order, not bit for bit."""
+    """torch's networks are small here: several threads take longer, and the order of sums then changes the last
+    bits."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

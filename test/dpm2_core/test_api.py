@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The public names: all of them are there, documented and typed, and importing the package imports none of them."""
+"""The public names: all exist, are documented and typed, and importing the package imports none of their modules."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_public_name_is_what_its_module_has_and_is_documented(name: str) -> No
 
 
 def test_type_checkers_see_the_same_names() -> None:
-    """Under TYPE_CHECKING, from the same modules; the package says that it is typed, and is installed so."""
+    """They are under TYPE_CHECKING, from the same modules; the package has a py.typed, which is installed."""
     tree = ast.parse(Path(dpm2_core.__file__).read_text(encoding="utf-8"))
     checked = next(node for node in tree.body if isinstance(node, ast.If))
     typed = {

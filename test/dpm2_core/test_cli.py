@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Manners in a terminal: help, widths, --quiet, --json, NO_COLOR, completion, Ctrl-C."""
+"""Behavior in a terminal: help, widths, --quiet, --json, NO_COLOR, completion, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def straight(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("name", "command"), [*all_commands()], ids=[name for name, _ in all_commands()])
 def test_no_word_of_a_help_is_taken_for_markup(name: str, command: TyperCommand) -> None:
-    """`--workers` of `dpm2 fleet` had lost its default, which stood in square brackets."""
+    """`--workers` of `dpm2 fleet` had lost its default, which was in square brackets."""
     texts = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
     assert [text for text in texts if text and Text.from_markup(text).plain != text] == []
 
@@ -89,8 +89,8 @@ def test_every_command_takes_quiet() -> None:
 
 
 def test_every_command_that_prints_a_table_takes_json() -> None:
-    """The figures are written beside the table by `show`; `bench` and `train ablation` write theirs always. What
-    `map` shows is made in `map_figures`."""
+    """`show` writes the figures next to the table; `bench` and `train ablation` always write theirs. The table of `map`
+    is made in `map_figures`."""
     modules = {path.stem: path.read_text() for path in (ROOT / "dpm2_core" / "commands").glob("*.py")}
     tables = {name for name, text in modules.items() if "_table(" in text or "FigureTable(" in text}
     assert tables - {"train", "map_figures"} == {
@@ -137,7 +137,7 @@ def test_progress_survives_a_pipe() -> None:
 def test_what_is_tracked_comes_as_it_is_and_is_counted_unless_all_is_to_be_quiet(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The last line is there at the end, however fast it goes."""
+    """The last line is shown at the end, however fast the iteration is."""
     for quiet in (False, True):
         before = QUIET.set(quiet)
         assert list(tracked(iter("abcd"), "scans", 4)) == ["a", "b", "c", "d"]
@@ -147,7 +147,7 @@ def test_what_is_tracked_comes_as_it_is_and_is_counted_unless_all_is_to_be_quiet
 
 
 def test_no_color_means_none(straight: Path) -> None:
-    """Whatever the terminal can do."""
+    """This is independent of the terminal's capabilities."""
     environment = {**os.environ, "FORCE_COLOR": "1", "NO_COLOR": "1"}
     done = dpm2_process("eval", "--gt", straight, "--est", straight, "--lengths", "100", env=environment)
     assert "APE" in done.stdout
@@ -199,7 +199,8 @@ def test_a_reader_that_stops_early_is_no_error() -> None:
 
 
 def test_a_path_that_may_not_be_entered_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As the folder of another user, and a name that no file can have: asked whether it is there, Python raises."""
+    """Examples are the folder of another user and a name that no file can have: Python raises when checking if it
+    exists."""
     name = tmp_path / ("n" * 300)
     for arguments in (["info", name], ["prune", tmp_path / "a", "--out", name], ["export", name, tmp_path / "a.ply"]):
         done = dpm2("map", *arguments)

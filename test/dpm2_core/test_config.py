@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration: what is dumped loads back, later settings win, and every mistake names where it was made."""
+"""Configuration: dumped settings can be loaded, later settings take precedence, every error names its origin."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_later_settings_override_earlier_ones_key_by_key(tmp_path: Path) -> None
 def test_a_mapping_replaces_one_whose_keys_are_free(
     tmp_path: Path, overrides: list[str], free: dict[str, float]
 ) -> None:
-    """A dotted key adds one; without a file a mapping means the same."""
+    """A dotted key adds a key; without a file a mapping has the same meaning."""
     assert load_settings(Outer, _file(tmp_path, "free: {b: 2}"), overrides).free == free
     assert load_settings(Outer, None, ["free={c: 3}"]).free == {"c": 3}
 
@@ -122,7 +122,7 @@ def test_a_mapping_changes_the_keys_of_a_part_that_it_has(tmp_path: Path) -> Non
 
 
 def test_what_is_not_said_of_a_part_is_as_in_the_default_of_its_field() -> None:
-    """Not as in the defaults of its type: two parts of a type may differ."""
+    """Not the defaults of the part's type: two parts of one type may differ."""
     assert load_settings(Outer, None, ["second.color=blue"]).second == Inner(voxel=1.0, color=Color.BLUE)
 
 
@@ -237,7 +237,7 @@ def test_a_number_with_leading_zeros_stays_what_was_typed() -> None:
 
 
 def test_a_number_is_a_text_where_one_is_wanted(tmp_path: Path) -> None:
-    """KITTI's sequences from 10 on had to be given in quotes that the shell leaves; true and lists are no text."""
+    """KITTI's sequences from 10 on needed quotes that the shell keeps; true and lists are not strings."""
     (tmp_path / "a.yaml").write_text("sequence: 10")
     assert load_settings(InputSettings, tmp_path / "a.yaml").sequence == "10"
     assert load_settings(InputSettings, None, ["sequence=10"]).sequence == "10"

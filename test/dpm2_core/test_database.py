@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A database of unknown origin is left after a bounded time, and an honest large one is read whole."""
+"""A database of unknown origin is closed after a bounded time, and a valid large one is read completely."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ TABLE = "CREATE TABLE t (x INTEGER PRIMARY KEY, y TEXT NOT NULL)"
 @pytest.mark.slow
 def test_a_query_without_end_is_ended(tmp_path: Path) -> None:
     with closing(connect(tmp_path / "a", "rwc")) as sql:
-        for _ in range(2):  # the next statement starts from nothing
+        for _ in range(2):  # the next statement starts with a new count
             began = time.process_time()
             with pytest.raises(sqlite3.OperationalError, match="interrupted"):
                 sql.execute("WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT max(x) FROM n")
-            assert time.process_time() - began < 10  # half a second, on a slow and busy machine some
+            assert time.process_time() - began < 10  # half a second; some seconds on a slow and busy machine
         assert sql.execute("SELECT 1").fetchone() == (1,)
 
 
 def test_a_large_table_is_read_whole(tmp_path: Path) -> None:
-    """Far more rows, in one statement and in many, than the steps that are counted at a time."""
+    """It has far more rows, in one statement and in many, than the number of steps between two checks."""
     with closing(connect(tmp_path / "a", "rwc")) as sql:
         sql.execute("CREATE TABLE t (x INTEGER PRIMARY KEY, y)")
         sql.execute("BEGIN")
@@ -42,7 +42,7 @@ def test_a_large_table_is_read_whole(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a name has to be text")
 @pytest.mark.parametrize("name", [b"st\xe4dt.dpm2map", b"a?b#c%20 d.dpm2map"])
 def test_a_file_of_any_name_is_opened(tmp_path: Path, name: bytes) -> None:
-    """Also of bytes that are not UTF-8, as of an archive from elsewhere."""
+    """This includes names with bytes that are not UTF-8, as from an archive of another system."""
     path = tmp_path / os.fsdecode(name)
     with closing(connect(path, "rwc")) as sql:
         sql.execute(TABLE)
@@ -69,7 +69,7 @@ def test_a_value_beyond_bounds_is_not_made(tmp_path: Path) -> None:
     ],
 )
 def test_only_the_very_tables_pass(tmp_path: Path, made: str, fits: bool) -> None:
-    """Comments and line breaks may differ, as between versions; columns, types and constraints may not."""
+    """Comments and line breaks may differ between versions; columns, types and constraints may not."""
     with closing(connect(tmp_path / "a", "rwc")) as sql:
         sql.execute(made)
         if fits:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors of a tilted sensor keep their place, and their level axes, wherever they are moved."""
+"""Descriptors of a tilted sensor keep their positions and level axes under any motion."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ LEAN = se3.exp([0.1, 0.5, 0, 0, 0, 0])  # 29 degrees
 
 
 def level(noise: np.random.Generator) -> Descriptors:
-    """As a level sensor sees them."""
+    """Descriptors as a level sensor has them."""
     return Descriptors.of(noise.normal(size=(30, 3)).astype("f4") * 20, noise.normal(size=(30, 8)))
 
 
 def leaning(d: Descriptors, R: Array) -> Descriptors:
-    """The same as a sensor sees them in whose frame R (3, 3) turns level axes."""
+    """The same descriptors from a sensor in whose frame the level axes are rotated by R (3, 3)."""
     return replace(d, xyz=(d.xyz @ R.T).astype("f4"), up=R[:, 2].astype("f4"))
 
 
@@ -40,7 +40,7 @@ def test_levelling_is_the_smallest_turn_that_brings_up_to_z(up: list[float]) -> 
 
 @pytest.mark.parametrize("up", [[0, 0, -1], [3e-8, -1e-8, -1], [0.6, 0, -0.8]])
 def test_what_points_down_is_turned_over_about_x_first(up: list[float]) -> None:
-    """Straight down a heading must not depend on rounding."""
+    """For a sensor that points straight down, the heading must not depend on rounding."""
     R = levelling(np.array(up)).astype(float)
     np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(R, levelling(np.array(up) * [1, -1, -1]) @ np.diag([1, -1, -1]), atol=1e-6)
@@ -58,18 +58,18 @@ def test_axes_point_to_the_descriptors_after_any_move(noise: np.random.Generator
     plain = level(noise)
     moved = leaning(plain, LEAN[:3, :3]).moved(LEAN @ T @ se3.inverse(LEAN))
     at = moved.R_level_set.astype(float)
-    origin = at @ LEAN[:3, :3] @ T[:3, 3]  # where the sensor was that saw them
+    origin = at @ LEAN[:3, :3] @ T[:3, 3]  # position of the sensor that saw them
     seen = moved.as_encoded().xyz[:, :2] - origin[:2]
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     np.testing.assert_allclose(np.linalg.norm(moved.axes, axis=1), 1, atol=1e-5)
-    # T leans by 4 degrees itself: what is high up is seen beside where it stands.
+    # T itself leans by 4 degrees: points high up appear next to their vertical projection.
     low = np.abs(plain.xyz[:, 2]) < np.linalg.norm(plain.xyz[:, :2], axis=1)
     assert (np.einsum("ij,ij->i", seen, moved.axes)[low] > 0.98).all()
 
 
 @pytest.mark.parametrize("lean", [LEAN, se3.exp([np.pi, 0, 0, 0, 0, 0]), se3.exp([3.0, 0.2, 0.5, 0, 0, 0])])
 def test_in_a_level_base_they_are_those_of_a_level_sensor(noise: np.random.Generator, lean: Array) -> None:
-    """Also of one that hangs."""
+    """This includes a sensor that is mounted upside down."""
     plain = level(noise)
     base = leaning(plain, lean[:3, :3]).moved(se3.inverse(lean))
     assert base.up is None
@@ -78,7 +78,7 @@ def test_in_a_level_base_they_are_those_of_a_level_sensor(noise: np.random.Gener
 
 
 def test_merged_sets_have_one_way_up(noise: np.random.Generator) -> None:
-    """Though each has estimated its own."""
+    """Each set has estimated its own up direction."""
     plain = level(noise)
     one = leaning(plain, LEAN[:3, :3])
     wobble = se3.exp([0.01, -0.02, 0, 0, 0, 0])[:3, :3].astype("f4")
@@ -93,7 +93,7 @@ def test_merged_sets_have_one_way_up(noise: np.random.Generator) -> None:
 
 @given(arrays(np.float32, (3, 5), elements=st.floats(-1e4, 1e4, width=32)))
 def test_features_are_rounded_to_a_254th_of_the_largest(values: NDArray[np.float32]) -> None:
-    """Of each descriptor by itself, and once: rounding what is rounded changes nothing."""
+    """The rounding is per descriptor, and applying it again changes nothing."""
     d = Descriptors.of(np.zeros((3, 3), np.float32), values)
     largest = np.abs(values).max(1, keepdims=True)
     assert (np.abs(d.values - values) <= largest / 254 * 1.001 + 1e-30).all()
@@ -128,7 +128,7 @@ def test_lazy_descriptors_are_made_once_and_say_why_there_are_none(noise: np.ran
 
 
 def test_a_room_is_enlarged_for_the_network_alone(noise: np.random.Generator) -> None:
-    """Where the descriptors lie is always in meters; the scale goes with them wherever they are moved."""
+    """The positions of descriptors are always in meters; the scale is kept under any motion."""
     room = replace(level(noise), scale=5.0)
     np.testing.assert_allclose(room.as_encoded().xyz, 5 * room.xyz, rtol=1e-6)
     np.testing.assert_allclose(room.axes, replace(room, scale=1.0).axes, atol=1e-6)

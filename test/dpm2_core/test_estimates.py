@@ -19,7 +19,7 @@ def test_a_rejected_edge_keeps_what_was_measured() -> None:
 
 
 def test_the_open_direction_is_that_of_the_largest_uncertainty_of_the_scene() -> None:
-    """The uncertainty that grew with the motion, equal in all directions, says nothing of the scene."""
+    """The part of the uncertainty that grew with the motion is equal in all directions and independent of the scene."""
     axis = np.array([0.6, 0.8, 0.0])
     scene = np.diag(np.full(6, 1e-4))
     scene[3:, 3:] += 0.25 * np.outer(axis, axis)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The base install does without the extras: what needs one of them says which in one line."""
+"""The base install works without the extras: commands that need one name it in one line."""
 
 from __future__ import annotations
 

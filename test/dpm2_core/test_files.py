@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results are whole or absent, and what was there before survives every failure."""
+"""Results are complete or absent, and the previous files survive every failure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..helpers.full_disk import largest_file
 
 
 def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
-    """NaN and Infinity are no JSON: jq and browsers refuse the whole file."""
+    """NaN and Infinity are not valid JSON: jq and browsers reject the whole file."""
     write_json(tmp_path / "a.json", {"a": [float("nan"), (1.5, float("-inf"))], "b": {"c": float("inf"), "d": "NaN"}})
     assert json.loads((tmp_path / "a.json").read_text(), parse_constant=pytest.fail) == {
         "a": [None, [1.5, None]], "b": {"c": None, "d": "NaN"},
@@ -55,7 +55,7 @@ def test_an_interrupted_writer_leaves_the_old_file_and_nothing_else(
 
 
 def test_what_killed_writers_have_left_goes_with_the_next_file_of_the_name(tmp_path: Path) -> None:
-    """Else every kill costs the disk once more what was being written: of a checkpoint or a map.ply its size."""
+    """Otherwise every kill would leave a partial file: for a checkpoint or a map.ply as large as the file itself."""
     path, others = tmp_path / "result.txt", [".other.txt.{}.part", "result.txt.{}.part"]
     with subprocess.Popen([sys.executable, "-c", ""]) as killed:
         pass

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A noun with fields that do not fit together cannot be made, and the message says what does not fit."""
+"""An object with inconsistent fields cannot be made, and the message names the inconsistency."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_point_is_seen_where_it_was_in_an_image_of_another_size() -> None:
 
 
 def test_what_would_be_read_as_something_else_is_refused() -> None:
-    """Transposed matrices made a camera useless and a drive wrong by its length; seconds passed as nanoseconds."""
+    """Transposed matrices made a camera unusable and a drive wrong by its length; seconds were read as nanoseconds."""
     moved = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
     with pytest.raises(ValueError, match=r"left: T_lidar_cam is no rigid transform"):
         replace(CAMERA, T_lidar_cam=moved.T)
@@ -76,7 +76,7 @@ def test_what_would_be_read_as_something_else_is_refused() -> None:
 
 @pytest.mark.parametrize("kind", [np.int32, np.int64, np.uint64])
 def test_stamps_and_indices_of_numpy_become_plain_integers(kind: type) -> None:
-    """SQLite keeps those of NumPy as bytes, and unsigned ones have no negative differences."""
+    """SQLite stores NumPy's integers as bytes, and unsigned ones have no negative differences."""
     frame = Frame(kind(3), np.zeros((0, 4), np.float32), index=kind(2))
     fix = Fix(kind(3), np.array([49.0, 8.4, 110.0]), np.eye(3), np.zeros(3))
     assert [type(number) for number in (frame.stamp, frame.index, fix.stamp)] == [int, int, int]

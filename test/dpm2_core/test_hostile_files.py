@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that attack: each is rejected with one line that names it, within 2 s, and without much memory."""
+"""Hostile files: each is rejected with one line that names it, within 2 s, and with little memory."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def computed_column(path: Path) -> None:
 
 
 def tree_in_a_circle(path: Path) -> None:
-    """The pages below the root of `edges` are all the same one, many times over."""
+    """The pages below the root of `edges` are all the same page, many times."""
     T, C = I4, array_bytes(np.eye(6))
     rows = [with_crc(i, "loop", 0, 1, T, C, 1, 1.0, 0.1, "", "") for i in range(20, 400)]
     with closing(sqlite3.connect(path)) as connection, connection:
@@ -131,14 +131,14 @@ MAPS: dict[str, Callable[[Path], None]] = {
 
 @pytest.fixture(scope="module")
 def imported() -> None:
-    """Before anything is measured: what the commands import takes longer than a file may."""
+    """Import the commands' modules before any measurement: this takes longer than a file may."""
     for command in (["export", "none.dpm2map", "none.ply"], ["check", "none.dpm2map"]):
         with suppress(SystemExit):
             main(["map", *command])
 
 
 def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What `dpm2` says of a file that it does not take; CPU time, since the machine may be busy."""
+    """The error message of `dpm2` for a file that it rejects; CPU time is measured, since the machine may be busy."""
     tracemalloc.start()
     began = time.process_time()
     with pytest.raises(SystemExit) as ended:
@@ -148,7 +148,7 @@ def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert ended.value.code in (1, 2)
     info = capsys.readouterr().err
     assert info.count("\n") == 1, info
-    assert seconds < 2 * 3  # tracemalloc takes two thirds of it
+    assert seconds < 2 * 3  # tracemalloc takes two thirds of the time
     assert memory < 64e6
     return info
 
@@ -157,9 +157,9 @@ def rejected(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 @pytest.mark.usefixtures("imported")
 @pytest.mark.parametrize("attack", MAPS)
 def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Writing its cloud needs everything but descriptors, pruning those too; both leave nothing behind."""
+    """Exporting its cloud reads all but descriptors, checking reads them, too; neither leaves a file behind."""
     MAPS[attack](map_file)
-    # Of descriptors and of rows that nothing asks for only the check can know.
+    # Only the check reads descriptors, and rows that nothing refers to.
     only_checked = attack in ("descriptors of 1.8e19 values", "a row that is numbered 2^62")
     if not only_checked:
         info = rejected(["map", "export", str(map_file), str(tmp_path / "out.ply")], capsys)
@@ -171,7 +171,7 @@ def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pyte
 
 @pytest.mark.parametrize("attack", MAPS)
 def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file: Path, attack: str) -> None:
-    """Eleven of its twelve keyframes at least, in a sound map; of one that was cut off what there is."""
+    """At least eleven of its twelve keyframes are in a sound map; of a truncated file, those that are left."""
     MAPS[attack](map_file)
     result = check_map(map_file, tmp_path / "good.dpm2map")
     assert result.problems
@@ -180,7 +180,7 @@ def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file
 
 
 def changed(**sections: object) -> Callable[[DeepPointMap2], dict[str, str]]:
-    """A description of the network with other values; the tensors stay."""
+    """A description of the network with other values; the tensors are unchanged."""
 
     def make(model: DeepPointMap2) -> dict[str, str]:
         tree = model.settings.model_dump(mode="json")
@@ -209,7 +209,7 @@ WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
 
 @pytest.mark.parametrize("attack", WEIGHTS)
 def test_hostile_weights(tmp_path: Path, model: DeepPointMap2, attack: str) -> None:
-    """Before any memory is taken for what they describe, and without a word to the network."""
+    """They are rejected before memory is allocated for the described network, and without a network connection."""
     path = tmp_path / "a.safetensors"
     describe, words = WEIGHTS[attack]
     save_file({name: value.contiguous() for name, value in model.state_dict().items()}, path, describe(model))
@@ -241,7 +241,7 @@ def test_weights_that_are_cut_off_or_not_finite(tmp_path: Path, model: DeepPoint
 def test_names_in_a_map_are_printed_and_not_interpreted(
     tmp_path: Path, map_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither rich's markup nor what a terminal obeys."""
+    """Neither rich's markup nor control sequences of a terminal take effect."""
     evil = "[red]x[/nope] :boom: \x1b]0;title\x07\x1b[2J\u202e\r"
     for node in range(12):
         put_keyframe(node, robot=evil)(map_file)

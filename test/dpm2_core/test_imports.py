@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for garbage is off while much is imported, and afterwards as it was."""
+"""Garbage collection is off during large imports, and afterwards as it was."""
 
 from __future__ import annotations
 

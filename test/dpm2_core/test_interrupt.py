@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first Ctrl-C waits for the end of a step, the second does not; whoever handles it otherwise keeps doing so."""
+"""The first Ctrl-C waits for the end of a step, the second does not; other handlers of a program are kept."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dpm2_core.interrupt import interrupt_deferred, terminate_as_interrupt
 
 @pytest.fixture(autouse=True)
 def python_handles_it() -> Iterator[None]:
-    """A test in the background may have it ignored."""
+    """In a test run in the background, the signal may be ignored."""
     before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -40,7 +40,7 @@ def test_the_first_waits_and_the_second_raises() -> None:
 
 
 def test_within_another_one_each_takes_its_own() -> None:
-    """The one that ends the drive does not count for what is written then."""
+    """The Ctrl-C that ends the drive does not count while its results are written."""
     with interrupt_deferred() as written:
         with interrupt_deferred() as driven:
             signal.raise_signal(signal.SIGINT)
@@ -84,8 +84,8 @@ with interrupt_deferred() as interrupted:
 
 
 def test_a_terminal_that_is_closed_is_as_one_ctrl_c(tmp_path: Path) -> None:
-    """By itself it ends a drive and leaves nothing of it, and what is written there is an error from then on. The shell
-    sends the signal once more, which is no second Ctrl-C."""
+    """Unhandled, it ends a drive without results, and every later write to the terminal is an error. The shell sends
+    the signal a second time, which does not count as a second Ctrl-C."""
     screen, terminal = os.openpty()
     attach = partial(fcntl.ioctl, terminal, termios.TIOCSCTTY, 0)
     with subprocess.Popen(
@@ -119,8 +119,8 @@ Path("results").touch()
 
 
 def test_a_program_that_is_not_told_goes_on_without_its_terminal(tmp_path: Path) -> None:
-    """As one in the background whose shell was left by `exit`: each write there is an error, by which a drive ended
-    with code 1 and without results."""
+    """As for a background program whose shell was left by `exit`: each write to the terminal is an error, which ended a
+    drive with code 1 and without results."""
     screen, terminal = os.openpty()
     with subprocess.Popen(
         [sys.executable, "-c", OUTLIVES], cwd=tmp_path, stdin=terminal, stdout=terminal, stderr=terminal,

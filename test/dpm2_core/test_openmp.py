@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""torch is never told of more threads than OpenMP gives it."""
+"""torch is never set to more threads than OpenMP allows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dpm2_core.openmp import allowed
     ("limit", "threads"), [(None, 4), ("", 4), ("2", 2), ("8", 4), ("0", 4), ("-1", 4), ("many", 4)]
 )
 def test_the_limit_of_openmp_holds(monkeypatch: pytest.MonkeyPatch, limit: str | None, threads: int) -> None:
-    """What is no number of threads is ignored, as OpenMP does."""
+    """An invalid number of threads is ignored, as OpenMP does."""
     monkeypatch.delenv("OMP_THREAD_LIMIT", raising=False)
     if limit is not None:
         monkeypatch.setenv("OMP_THREAD_LIMIT", limit)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run from Python: what it gives, the files it saves, and that nothing is lost when it ends early."""
+"""A run from Python: its result, the files it saves, and that nothing is lost if it ends early."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from ..helpers.trajectories import write_indexed
 FRAMES = 8
 SET = ["slam.loops.enabled=false", "slam.threads=1"]
 CONFIG = load_settings(Config, None, SET)
-"""Without loops, which so short a drive has none of: no network is loaded."""
+"""Without loops, which so short a drive does not have: no network is loaded."""
 FILES = {
     "trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "timing.json", "metrics.json",
     "trajectory.png", "config.yaml", "frames.csv", "loops.csv", "ground_truth.tum",
@@ -43,19 +43,19 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first of its scans."""
+    """The first scans of the recording."""
     return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
 @pytest.fixture(scope="module")
 def result(recording: Path) -> Result:
-    """Of the whole drive."""
+    """The result of the whole drive."""
     return OfflineRun(recording, CONFIG).run()
 
 
 @pytest.mark.slow
 def test_a_path_may_be_a_text(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a notebook: `save` ended with an AttributeError, when the drive was over."""
+    """As in a notebook: `save` ended with an AttributeError after the drive."""
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(dump_settings(CONFIG))
     config = load_settings(Config, "mine.yaml")
@@ -69,7 +69,7 @@ def test_a_path_may_be_a_text(recording: Path, tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
-    """Reading ahead and recording change no bit of a pose."""
+    """Reading ahead and recording do not change a bit of a pose."""
     slam = make_slam(CONFIG.slam)
     recorder = TrajectoryRecorder()
     for frame in open_source(recording).frames():
@@ -86,8 +86,8 @@ def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
 def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As those of bags and KITTI are: 1 s ahead, in a loader of one's own, it cost 9 m without a word. Also where the
-    drive begins, or is gone on with."""
+    """Stamps of bags and KITTI are corrected. In a user's own loader, a stamp 1 s ahead caused an error of 9 m without
+    a message. This includes the frames where a drive begins or is resumed."""
     source = open_source(recording)
     scans = list(source.frames())
     wrong = scans[4].stamp + 10**9
@@ -98,7 +98,7 @@ def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
     what = "stamps that are not between their neighbors are interpolated"
     assert source.notes == [f"{what} (the first at frame 4: {wrong * 1e-9:.3f} s)"]
     config, path = load_settings(Config, None, [*SET, "slam.keyframes.distance=0"]), tmp_path / "drive.dpm2map"
-    for span in ((0, 5), (0, 6)):  # the map ends with that frame, and goes on with it
+    for span in ((0, 5), (0, 6)):  # the map ends with that frame, and resumes with it
         with OfflineRun(source, config, span, map_file=path, map_mode="resume") as drive:
             drive.run()
             assert drive.slam.mapper.keyframes[-1].index == span[1] - 1
@@ -160,11 +160,12 @@ def test_interrupted_before_the_first_frame(recording: Path, tmp_path: Path, mon
 
 @pytest.mark.slow
 def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path) -> None:
-    """The same truth in either form gives nearly the same error: of the LiDAR by a TUM file, else of the camera."""
+    """The same truth in either form gives nearly the same error: a TUM file is of the LiDAR, the other of the
+    camera."""
     source = open_source(recording)
     assert source.poses is not None
     write_tum(tmp_path / "truth.tum", [frame.stamp for frame in source.frames()], source.poses)
-    source.poses = None  # type: ignore[misc]  # a recording without any of its own
+    source.poses = None  # a recording without poses of its own
     alone = OfflineRun(source, CONFIG, (2, 7)).run()
     assert alone.metrics is None
     stamped = OfflineRun(source, CONFIG, (2, 7), tmp_path / "truth.tum").run()
@@ -173,14 +174,14 @@ def test_ground_truth_as_poses_and_as_a_tum_file(recording: Path, tmp_path: Path
     assert given.metrics.frames == stamped.metrics.frames == 5  # of the drive, not of the whole truth
     assert stamped.metrics.path_length_m == pytest.approx(given.metrics.path_length_m, abs=0.1)
     assert (stamped.sensor, given.sensor) == ("LiDAR", "left camera")
-    # They differ by the distance between the sensors times the error of the rotation.
+    # They differ by the distance between the sensors times the rotation error.
     assert stamped.metrics.ape_rmse_m == pytest.approx(given.metrics.ape_rmse_m, abs=5e-3)
     stamped.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 
 
 def test_truth_that_turns_out_not_to_fit_costs_nothing_else(recording: Path, result: Result, tmp_path: Path) -> None:
-    """The results are whole, and those of a run before are not taken for its own."""
+    """The results are complete, and results of a previous run do not remain."""
     stamps = result.recorder.stamps
     apart = Trajectory(np.tile(np.eye(4), (2, 1, 1)), np.array([stamps[0] - 10**9, stamps[-1] + 10**9]), "tum")
     result.save(tmp_path, cloud=False)
@@ -192,7 +193,8 @@ def test_truth_that_turns_out_not_to_fit_costs_nothing_else(recording: Path, res
 
 
 def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
-    """It ended with a trajectory of identities and exit code 0. A new map file goes: the next run may have it."""
+    """It ended with a trajectory of identities and exit code 0. A new map file is removed, so the next run can make
+    it."""
     (tmp_path / "scans").mkdir()
     for n in range(3):
         (tmp_path / "scans" / f"{n}.ply").write_bytes(b"hello")
@@ -209,30 +211,31 @@ def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: Path, tmp_path: Path) -> None:
-    """Of 25 Hz, 12 ms late and longer than the drive: the nearest pose was 0.1 m off, and most frames were left out."""
+    """It has 25 Hz, 12 ms late and longer than the drive: the nearest pose was 0.1 m off, and most frames were left
+    out."""
     source = open_source(recording)
     assert source.poses is not None
     stamps = np.array([frame.stamp for frame in source.frames()])
     at = np.arange(stamps[0] + 12_000_000, stamps[-1], 40_000_000)
     write_tum(tmp_path / "truth.tum", at.tolist(), interpolate(stamps, source.poses, at))
-    source.T_cam_lidar = None  # type: ignore[misc]  # the poses of the LiDAR in either case
+    source.T_cam_lidar = None  # the poses of the LiDAR in either case
     given = OfflineRun(source, CONFIG, (1, 6)).run().metrics
     stamped = OfflineRun(source, CONFIG, (1, 6), tmp_path / "truth.tum").run().metrics
     assert (stamped.frames, stamped.failed_frames) == (given.frames, 0)
-    # Of the truth between two frames that lie on a bend a part of a millimeter is missing.
+    # Between two frames in a bend, the interpolated truth is off by a fraction of a millimeter.
     assert stamped.ape_rmse_m == pytest.approx(given.ape_rmse_m, abs=1e-3)
     assert stamped.rpe_trans_m == pytest.approx(given.rpe_trans_m, abs=2e-3)
 
 
 def test_the_frames_of_a_drive_are_counted_whatever_its_truth_is_sampled_at(result: Result) -> None:
-    """Failed frames are of all frames; beside a truth of 2 Hz there were more of them than frames."""
+    """Failed frames are counted among all frames; with ground truth at 2 Hz there were more of them than frames."""
     stamps = np.array(result.recorder.stamps)
     slower = replace(result, ground_truth=Trajectory(result.poses[::5], stamps[::5], "tum"))
     assert (slower.metrics.frames, slower.metrics.failed_frames) == (len(result), result.methods["failed"])
 
 
 def test_of_how_many_poses_the_errors_are_is_said_where_not_of_all(result: Result) -> None:
-    """A truth of the first five frames, as of cameras that see a part of a hall, says nothing of the rest."""
+    """Ground truth for the first five frames, as of cameras that see part of a hall, shows nothing about the rest."""
     stamps = np.array(result.recorder.stamps)
     part = replace(result, ground_truth=Trajectory(result.poses[:5], stamps[:5], "tum")).metrics
     whole = replace(result, ground_truth=Trajectory(result.poses, stamps, "tum")).metrics
@@ -269,7 +272,7 @@ def test_the_frame_where_a_drive_goes_on_is_in_the_trajectory_of_its_map_once(re
 
 
 def test_a_run_is_over_once(recording: Path) -> None:
-    """A second one put the drive into the same map again; then the result of the first could not be saved either."""
+    """A second run added the drive to the same map again; then the first result could not be saved, either."""
     drive = OfflineRun(recording, CONFIG, (0, 3))
     result = drive.run()
     with pytest.raises(UsageError, match="00: it was run already; a second run needs another OfflineRun"):
@@ -278,7 +281,7 @@ def test_a_run_is_over_once(recording: Path) -> None:
 
 
 def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> None:
-    """Every second scan: the frame where the map ends is found by its number, not by its position."""
+    """Every second scan is missing: the frame where the map ends is found by its number, not by its position."""
     drive, path = tmp_path / "drive", tmp_path / "drive.dpm2map"
     first_scans(recording, FRAMES, drive)
     for scan in [*drive.rglob("velodyne/*.bin")]:
@@ -291,7 +294,7 @@ def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> 
 
 
 def test_another_drive_of_the_same_stamps_is_not_gone_on_with(recording: Path, tmp_path: Path) -> None:
-    """As all synthetic ones have them: it was tied to the end of the map, to the millimeter."""
+    """All synthetic drives have the same stamps: another one was tied to the end of the map, to the millimeter."""
     path, other = tmp_path / "drive.dpm2map", tmp_path / "other"
     with OfflineRun(recording, CONFIG, (0, 4), map_file=path) as begun:
         begun.run()

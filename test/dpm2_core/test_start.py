@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What starts, starts light: imports change no environment, and a command loads what it needs alone."""
+"""Programs start fast: imports do not change the environment, and a command loads only what it needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dpm2_core.cli import COMMANDS, load_command
 
 
 def python(program: str) -> str:
-    """Its output, in a process without the settings of OpenMP."""
+    """Output of a program in a process without the settings of OpenMP."""
     program = f"import os; [os.environ.pop(n, 0) for n in ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')]\n{program}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
@@ -21,7 +21,7 @@ def python(program: str) -> str:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_lists_every_command_with_its_own_first_paragraph(name: str) -> None:
-    """It is written in cli.py too, so that `dpm2 --help` need not import the command."""
+    """The paragraph is repeated in cli.py, so that `dpm2 --help` need not import the command."""
     assert COMMANDS[name][1] == (load_command(name).help or "").split("\n\n")[0]
 
 
@@ -39,7 +39,7 @@ def test_the_help_imports_no_command_and_no_array() -> None:
 
 @pytest.mark.slow
 def test_an_import_sets_no_environment_variable() -> None:
-    """Beyond those that cv2 sets for itself."""
+    """Variables that cv2 sets itself are excluded."""
     python(
         "import os, cv2; before = dict(os.environ)\n"
         "import dpm2_core, dpm2_core.cli, dpm2_core.slam.system, dpm2_ros.executables\n"
@@ -53,7 +53,7 @@ def test_an_import_sets_no_environment_variable() -> None:
     "from dpm2_ros.executables import bag_player as entry; arguments = ['nowhere']",
 ])  # fmt: skip
 def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(entry: str) -> None:
-    """OpenMP reads the environment once; see `dpm2_core.openmp`."""
+    """OpenMP reads the environment only once; see `dpm2_core.openmp`."""
     output = python(
         f"import os, sys; {entry}\n"
         "assert 'numpy' not in sys.modules\n"
@@ -66,7 +66,7 @@ def test_the_entry_of_a_program_lets_idle_threads_sleep_before_numpy_is_there(en
 
 @pytest.mark.parametrize("name", ["run", "eval", "map", "show", "convert"])
 def test_the_help_of_what_is_called_most_imports_no_slam(name: str) -> None:
-    """Nor does the shell's completion of its options: they took a second and a half."""
+    """The shell's completion of its options imports none, either: the imports took 1.5 s."""
     output = python(
         "import sys; from dpm2_core.cli import main\n"
         f"try: main(['{name}', '--help'])\n"
@@ -77,7 +77,7 @@ def test_the_help_of_what_is_called_most_imports_no_slam(name: str) -> None:
 
 
 def test_a_player_of_bags_starts_without_what_reads_their_messages() -> None:
-    """Nor what registers them: it took two thirds of its start."""
+    """Modules that read and register messages are not imported: they took two thirds of the start."""
     output = python(
         "import sys; from dpm2_ros.executables import bag_player\n"
         "assert bag_player(['nowhere']) == 2\n"
@@ -87,7 +87,7 @@ def test_a_player_of_bags_starts_without_what_reads_their_messages() -> None:
 
 
 def test_a_simulator_starts_without_the_filter_of_an_imu() -> None:
-    """It took half of its start."""
+    """Its import took half of the start."""
     assert python("import sys, dpm2_core.sim.drive; print('scipy.signal' in sys.modules)") == "False\n"
 
 
@@ -102,7 +102,7 @@ def test_what_the_user_chose_stays() -> None:
 
 @pytest.mark.slow
 def test_the_compiled_loops_need_no_folder_to_write_to() -> None:
-    """They are compiled anew then, and give the same."""
+    """They are then compiled again, with the same result."""
     output = python(
         "import numba.core.caching as caching; caching.CacheImpl._locator_classes = []\n"
         "import numpy as np; from dpm2_core.geometry.voxel import voxel_first\n"

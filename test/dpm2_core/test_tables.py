@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables fit the terminal and lose nothing, however narrow it is."""
+"""Tables fit the terminal and show everything, however narrow it is."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ word = st.text("abcdefg0123456789.%[]", min_size=1, max_size=18)
 
 
 def lines(shown: RenderableType, width: int) -> list[str]:
-    """What a terminal of that width shows."""
+    """The lines that a terminal of that width shows."""
     console = Console(width=width, color_system=None, force_terminal=True)
     with console.capture() as capture:
         console.print(shown)
@@ -30,7 +30,7 @@ def lines(shown: RenderableType, width: int) -> list[str]:
 
 
 def table(**columns: Any) -> FigureTable:
-    """Two drives with figures, and text to the right where there is some."""
+    """Two drives with figures, and text on the right if there are such columns."""
     out = FigureTable("two drives", names=["drive", "method"], **columns)
     text = "as the development kit does it, over segments of 100 to 800 m from each tenth frame on"
     for drive in ("00", "04"):
@@ -75,7 +75,7 @@ def test_text_is_wrapped_between_words(width: int) -> None:
 @given(st.data(), st.sampled_from(WIDTHS))
 @settings(max_examples=60)
 def test_nothing_is_cut_or_interpreted(data: st.DataObject, width: int) -> None:
-    """Whatever the cells: all characters arrive, brackets too."""
+    """For any cells, all characters are printed, including brackets."""
     count = data.draw(st.integers(1, 8))
     rows = data.draw(st.lists(st.lists(word, min_size=count + 1, max_size=count + 1), min_size=1, max_size=6))
     shown = FigureTable("t", names=["name"], figures=[f"f{n}" for n in range(count)])
@@ -126,12 +126,12 @@ def test_all_tables_are_of_this_kind() -> None:
         for path in (ROOT / folder).rglob("*.py")
         if re.search(r"\brich\.table\b", path.read_text())
     ]
-    # the fleet's view shows drives while they run: bars, no figures
+    # the fleet's view shows the progress of drives: bars, no figures
     assert sorted(others) == ["dpm2_core/fleet/view.py", "dpm2_core/tables.py"]
 
 
 def test_a_figure_that_is_not_there_is_a_dash() -> None:
-    """Also below what is not there; zero and text are figures."""
+    """This includes a field of a missing object; zero and text are figures."""
     record = {"loops": {"tried": 0, "of two rooms": "no"}, "ape_m": None, "metrics": None}
     columns = ("{loops[tried]} of {loops[of two rooms]}", "{ape_m:.3f}", "{metrics[rpe_m]:.1f}", "{seconds:.0f} s")
     assert cells_of(record, columns) == ["0 of no", "-", "-", "- s"]
