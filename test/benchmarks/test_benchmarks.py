@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark harness runs each method on the same drive, and its record says how it was made."""
+"""The benchmark harness runs each method on the same drive, and its record states how it was made."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_poses_that_err_are_fitted_to_the_scans_and_those_that_are_far_off_stay(sequence: Path) -> None:
-    """1.5 degrees and 0.1 m, as KITTI's are over a corner, back to what 1 cm of noise leaves; 20 m off stays so."""
+    """1.5 degrees and 0.1 m, as KITTI's over a corner, are corrected to the effect of 1 cm noise; 20 m off is kept."""
     source = open_source(sequence)
     frames, poses = list(source.frames()), np.array(source.poses)
     wrong = poses.copy()
@@ -101,7 +101,7 @@ def test_the_geometric_benchmark_records_errors_speed_and_origin(sequence: Path,
     assert set(record["drives"]) == {sequence.name, f"{sequence.name} (2)"}
     ours = record["drives"][sequence.name]["dpm2"]
     assert (ours["frames"], ours["failed_frames"]) == (FRAMES, 0)
-    assert ours["rpe_trans_m"] < 0.02  # noise of 1 cm a point, thousands of points
+    assert ours["rpe_trans_m"] < 0.02  # noise of 1 cm per point, thousands of points
     assert len(ours["fps_of_repetitions"]) == 2
     assert ours["frame_ms"]["p95"] >= ours["frame_ms"]["median"] > 0
     assert set(ours["stages_ms"]) == {"preprocess", "register", "update", "map"}
@@ -121,13 +121,14 @@ def test_kiss_icp_runs_beside_it_on_the_same_scans(sequence: Path, tmp_path: Pat
 
 
 def test_kiss_icp_deskews_scans_whose_points_have_times_as_ours_does() -> None:
-    """As its pipeline does; its poses are then compared at the stamps. Else a bag's raw sweeps are a handicap to it."""
+    """Its pipeline does so; its poses are then compared at the stamps. Otherwise raw sweeps of a bag are a
+    disadvantage."""
     pytest.importorskip("kiss_icp")
     world = np.random.default_rng(0).uniform(-30, 30, (4000, 3))
     offset = np.linspace(-0.05, 0.05, len(world))
 
     def swept(t: float) -> Frame:
-        T = se3.exp(np.outer(t + offset, [0, 0, -0.3, -8, 0, 0]))  # T_lidar_world as each point is measured
+        T = se3.exp(np.outer(t + offset, [0, 0, -0.3, -8, 0, 0]))  # T_lidar_world when each point is measured
         points = (T[:, :3, :3] @ world[..., None])[..., 0] + T[:, :3, 3]
         cloud = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
         return Frame(round(t * 1e9), cloud, offset.astype(np.float32))
@@ -166,7 +167,7 @@ def test_the_covariance_benchmark_has_a_ratio_for_each_method_and_kind_of_pair(s
     assert set(kinds) == {"consecutive", "8 apart", "10-20 m", "20-30 m", "30-40 m", "40-50 m"}
     near = kinds["consecutive"]
     assert near["geometric"]["registered"] == near["geometric"]["pairs"] == FRAMES - 1
-    assert 0 < near["geometric"]["chi2_ratio"]["pose"] < 4  # noise without any error of calibration
+    assert 0 < near["geometric"]["chi2_ratio"]["pose"] < 4  # noise without calibration errors
     assert kinds["8 apart"]["neural"] == {
         "pairs": 0,
         **dict.fromkeys(("median_m", "median_deg", "chi2_ratio")),
@@ -181,7 +182,7 @@ def test_the_tilt_benchmark_compares_level_axes_with_those_of_the_sensor(sequenc
     tilts = json.loads((tmp_path / "tilt.json").read_text())["drives"][sequence.name]
     assert set(tilts) == {"0", "15", "30", "random"}
     level, sensor = (tilts["0"]["opposite"][axes] for axes in ("level", "sensor"))
-    assert level == sensor  # of a level sensor both are the same
+    assert level == sensor  # for a level sensor both are the same
     assert level["1 apart"]["pairs"] == 1
     assert level["8 apart"]["pairs"] == 0  # the drive is shorter
 
@@ -207,7 +208,7 @@ def test_memory_that_grows_and_memory_that_levels_off_are_told_apart() -> None:
 
 @pytest.mark.slow
 def test_the_resident_set_follows_what_is_allocated() -> None:
-    """In a process of its own: what other tests have left is freed at any time, by a collection or by a thread."""
+    """In a separate process: memory of other tests is freed at any time, by garbage collection or a thread."""
     program = (
         "import numpy as np\n"
         "from benchmarks.resident import resident_mb\n"
@@ -282,7 +283,7 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     model: DeepPointMap2,
     noise: np.random.Generator,
 ) -> None:
-    """With random weights: the classical methods beside it are right, and refined falls back on points."""
+    """With random weights: the classical methods for comparison are correct, and refined falls back on points."""
     save_weights(model, tmp_path / "tiny.safetensors", {"steps": "0", "images": "true", "phase": "2"})
     settings = [f"slam.neural.weights={tmp_path}/tiny.safetensors"]
     poses = se3.exp(np.outer(np.arange(4.0), [0, 0, 0.1, 3, 0, 0]))
@@ -303,19 +304,19 @@ def test_the_neural_benchmark_measures_pairs_odometry_and_stages(
     ours = parts["real"]["drives"][sequence.name]
     assert list(ours["consecutive"]) == ["neural", "refined", FITTED]
     assert set(ours["10-20 m"]) >= {"neural", "refined", "geometric"}
-    assert ("small_gicp" in ours["10-20 m"]) == (find_spec("small_gicp") is not None)  # of the extra bench
+    assert ("small_gicp" in ours["10-20 m"]) == (find_spec("small_gicp") is not None)  # from the extra bench
     assert ours["8 apart"]["neural"]["pairs"] == 0  # six frames
     assert parts["odometry"]["drives"][sequence.name]["geometric"]["ape_rmse_m"] < 0.02
     assert set(parts["corruption"]["error_ratio"]) == {"LiDAR obstruction 100 %", "camera failure 100 %"}
     assert {"neural with camera", "neural without camera"} <= set(parts["image"]["pairs"]["tunnel, up to 5 m"])
     assert (tmp_path / "neural_image.png").read_bytes().startswith(b"\x89PNG")
     assert parts["sensors"]["pairs"]["16 beams, up to 12 m"]["neural"]["pairs"] > 0
-    assert "rosette, up to 12 m, any yaw" not in parts["sensors"]["pairs"]  # it looks ahead alone
+    assert "rosette, up to 12 m, any yaw" not in parts["sensors"]["pairs"]  # it only looks ahead
     assert 0 <= parts["overlap"]["average_precision"] <= 1
     speed = parts["speed"]["drives"][sequence.name]
     assert speed["stages_ms"]["total"]["median"] > 0
     assert 0 < speed["descriptor_bytes"] < 70_000
-    # What is there stays, what is missing is measured, and a part that is asked for is measured again.
+    # Existing parts are kept, missing ones are measured, and a requested part is measured again.
     del record["parts"]["overlap"]
     record["parts"]["real"]["seconds"] = record["parts"]["speed"]["seconds"] = -1
     path.write_text(json.dumps(record))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark tells a covariance that is right from one that is too small or too large."""
+"""The benchmark distinguishes a correct covariance from one that is too small or too large."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_errors_drawn_from_a_covariance_have_a_ratio_of_one(claimed: float) -> N
         T = se3.exp(rng.normal(size=6))
         rows.append((T @ se3.exp(xi), Registration(T, claimed * S)))
     ratios = calibration(rows)["chi2_ratio"]
-    # The median of 4000 varies by 2 to 3 %.
+    # The median of 4000 samples varies by 2 to 3 %.
     assert [ratios[name] for name in ("pose", "rotation", "translation")] == pytest.approx([1 / claimed] * 3, rel=0.1)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of the benchmarks show what they are given."""
+"""The plots of the benchmarks show their data."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.figures import verdicts_png
 
 
 def test_verdicts_have_the_colors_of_their_meaning(tmp_path: Path) -> None:
-    """One cell each of right, said and silent: the red of `silent` is in the picture where that verdict is given."""
+    """One cell each of right, said and silent: the red of `silent` is in the image only if that verdict is present."""
 
     def reds(verdict: str) -> int:
         panels = {"00": {"gap": {"ours": ("right", 0.1), "theirs": (verdict, 12.0)}}, "04": {"blind": {}}}

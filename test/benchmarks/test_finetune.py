@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fine-tuning benchmark: which trainings it wants, what it makes of their figures, what it takes from a file."""
+"""The fine-tuning benchmark: which trainings it starts, how it evaluates them, and what it reuses from a file."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_p
 def test_a_training_of_other_settings_or_pairs_is_not_taken_for_this_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The checkpoint that a training leaves was gone on with, whatever its settings: with none of its steps left the
-    weights of before were measured again, and stood there as those of the new settings."""
+    """The checkpoint of a previous training was resumed, whatever its settings: with no steps left, the old weights
+    were evaluated again, and recorded as those of the new settings."""
     resumed: list[bool] = []
 
     def train(settings: FinetuneSettings, out: Path, data: Path) -> Path:
@@ -70,7 +70,7 @@ def test_a_training_of_other_settings_or_pairs_is_not_taken_for_this_one(
     finetune.bench_finetune(options)  # all is in the file
     assert resumed == [False]
     found = finetune.bench_finetune(replace(options, pairs=6)).results
-    assert resumed == [False, True]  # the same training, measured on other pairs
+    assert resumed == [False, True]  # the same training, evaluated on other pairs
     assert found["before"]["new"]["pairs"] == found["runs"]["pairs"]["0"]["after"]["new"]["pairs"] == 12
     found = finetune.bench_finetune(replace(options, overrides=("radius=3",))).results
     assert resumed == [False, True, False]

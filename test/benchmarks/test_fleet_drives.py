@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fleet's benchmark: its parts are known, and one that is not is an error of use."""
+"""The fleet's benchmark: its parts are known, and an unknown one is an error of use."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hardships made of a drive: what the methods are given, and how their answer is judged."""
+"""Hardships made from a drive: the input of the methods, and the verdict on their result."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def test_a_gap_is_empty_and_a_blind_sensor_sees_its_window(hard: dict[str, Case]
     dirty = [frame for frame in blind.frames if np.abs(frame.points[:, :3]).max() <= 0.5]
     assert len(dirty) == 20
     assert dirty[-1] is blind.frames[blind.event - 1]
-    assert dirty[0] is blind.frames[blind.base + 1]  # what is coasted while nothing is seen is no base to judge from
+    assert dirty[0] is blind.frames[blind.base + 1]  # frames coasted without visible points are no base for the verdict
     assert gap.base == gap.event - 1
 
 
 def test_in_fog_one_sees_the_fog() -> None:
-    """Of points 30 m away the fog of 20 m sight returns 6 in 10, and the rest is lost."""
+    """Of points 30 m away, fog with 20 m sight returns 6 in 10 from the fog itself; the rest is lost."""
     frames = [Frame(i * 10**8, np.full((200, 4), 30 / np.sqrt(3), np.float32), index=i) for i in range(60)]
     case = next(case for case in cases(frames, np.tile(np.eye(4), (60, 1, 1))) if case.name == "fog 20 m")
     away = np.concatenate([np.linalg.norm(frame.points[:, :3], axis=1) for frame in case.frames])
@@ -94,7 +94,7 @@ def test_standing_still_is_wrong(states: list[State | None], verdict: str) -> No
 
 
 def test_what_was_wrong_before_the_event_does_not_count() -> None:
-    """The whole trajectory moved and turned is the same one."""
+    """The whole trajectory, moved and rotated, counts as the same one."""
     frames, truth = drive(40)
     moved = se3.exp([0, 0, 1.0, 5.0, 3.0, 0]) @ truth
     moved[:9] = np.eye(4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of the IMU on a few scans of a robot that turns fast: each way has its row, and what it was given."""
+"""The IMU benchmark on a few scans of a robot with fast rotation: each method has its row, and its own samples."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkey
     results = imu.bench_imu(Options(threads=1, out=tmp_path)).results
     row = results["worlds"]["suburb"]
     assert row["frames"] == 44
-    assert row["fastest_turn_deg_s"] > 80  # it stands for 1.5 s, and turns a second later
+    assert row["fastest_turn_deg_s"] > 80  # it stands for 1.5 s, and rotates a second later
     assert row["frames_above_50_deg_s"] >= 5
     given = [row[way]["frames_with_imu"] for way in ("without", "stops", "with")]
     assert given[0] == 0
     assert 0 < given[1] < 30 < given[2]  # it stops at the 22nd scan
-    assert row["with"]["ape_rmse_m"] < 0.1  # m, of a way of 5 m
+    assert row["with"]["ape_rmse_m"] < 0.1  # m, over a distance of 5 m
     assert row["ratio"] == row["with"]["ape_rmse_m"] / row["without"]["ape_rmse_m"]
     assert row["with"]["worst_tilt_deg"] < 3
     without, with_it = (results["pauses"][way] for way in ("without", "with"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of buildings on a few scans: errors of odometry and SLAM, and loops, by the drive's own truth."""
+"""The benchmark of buildings on a few scans: errors of odometry and SLAM, and loops, by the drive's ground truth."""
 
 from __future__ import annotations
 

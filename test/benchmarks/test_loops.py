@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Revisits are counted by their heading, wrong loops are found out, and a short road is driven to the end."""
+"""Revisits are counted by their heading, wrong loops are detected, and a short road is driven to the end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dpm2_core.geometry import se3
 
 
 def there_and_back(lateral: float = 4.0) -> Array:
-    """100 m straight on in steps of 5 m, and back beside it."""
+    """100 m straight ahead in steps of 5 m, and back at a lateral distance."""
     there = [se3.make(np.eye(3), np.array([x, 0, 0])) for x in np.arange(0, 101, 5.0)]
     turned = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))[:3, :3]
     back = [se3.make(turned, np.array([x, lateral, 0])) for x in np.arange(100, -1, -5.0)]
@@ -34,7 +34,7 @@ def test_revisits_by_heading() -> None:
     truth = there_and_back()
     kinds = revisits(truth)
     assert kinds["same"] == kinds["cross"] == set()
-    # 21 back; the first of them are nearer than 50 m along the path to all that is within 10 m
+    # 21 back; for the first of them, all poses within 10 m are less than 50 m away along the path
     assert kinds["reverse"] == set(range(26, 42))
     assert revisits(there_and_back(lateral=12.0))["reverse"] == set()
     twice = np.concatenate([truth[:21], truth[:21]])
@@ -55,7 +55,7 @@ def test_wrong_loops_and_found_revisits_are_told_apart() -> None:
     ]  # fmt: skip
     result = check_loops(loops, truth)
     assert (result["tried"], result["accepted"], result["wrong"]) == (5, 3, 2)
-    assert result["reverse"] == {"revisits": 16, "found": 1}  # what was rejected, or was wrong, found nothing
+    assert result["reverse"] == {"revisits": 16, "found": 1}  # rejected or wrong loops find nothing
     assert result["refusals"] == {"only fit": 2}
 
 

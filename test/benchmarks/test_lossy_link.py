@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bad network of `make bench-robots`: it says what it lacks, and its link really goes away and loses packets."""
+"""The bad network of `make bench-robots`: it reports what is missing, and its link really fails and loses packets."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(not all(map(shutil.which, ("unshare", "ip", "nft"))) or not _can(), reason="needs root, ip and nft")
 def test_the_link_goes_away_comes_back_and_loses_packets(tmp_path) -> None:
     """A fifth is lost each way: 38 of 60 replies are expected; 20 and 55 are beyond four sigma."""
-    node = tmp_path / "dpm2_ros" / "executables.py"  # what starts at the far end: an echo in place of mapper_node
+    node = tmp_path / "dpm2_ros" / "executables.py"  # the program at the far end: an echo in place of mapper_node
     node.parent.mkdir()
     node.write_text(ECHO)
     script = LINK.replace("from pathlib", f"import os; os.chdir({str(tmp_path)!r})\nfrom pathlib", 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the benchmark of the network takes from the file of a run before."""
+"""What the network's benchmark reuses from the file of a previous run."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from ..helpers.networks import tiny
 def test_parts_of_other_options_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: dict[str, Any]
 ) -> None:
-    """They were kept, and the record said that they were measured with the options of this call: another solver made
-    no difference, as nothing was measured."""
+    """They were kept, although the record stated the options of the new call: another solver seemed to make no
+    difference, since nothing was measured."""
     measured: list[str] = []
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
@@ -54,7 +54,7 @@ def test_parts_of_other_options_are_measured_again(
     neural.bench_neural(replace(options, only="second", **other))
     assert len(measured) == 3
     record = json.loads((tmp_path / "neural.json").read_text())
-    assert list(record["parts"]) == ["second"]  # the other one is of other options
+    assert list(record["parts"]) == ["second"]  # the other one has other options
     neural.bench_neural(replace(options, **other))
     assert len(measured) == 4
     record = json.loads((tmp_path / "neural.json").read_text())
@@ -78,7 +78,7 @@ def _worlds(folder: Path, points: int) -> Path:
 def test_parts_of_other_drives_and_worlds_of_the_same_name_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An excerpt of 00 and the whole sequence: the table was that of the first, whatever the second call was given."""
+    """With an excerpt of 00 and then the whole sequence, the table was that of the first in both calls."""
     measured: list[Path] = []
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:

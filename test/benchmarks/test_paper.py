@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's ways put into ours: every one changes the settings, and together they are the preset."""
+"""The paper's methods in our configuration: each one changes the settings, and together they are the preset."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def test_each_way_is_a_part_of_the_preset() -> None:
 
 @pytest.mark.slow
 def test_the_simulated_drive_is_of_every_second_scan_of_a_good_lap() -> None:
-    """It was as long as the whole drive, of whose second half no scan is there."""
+    """It had the length of the whole drive, although no scan of the second half exists."""
     drive = lap()
     assert len(drive) == len(drive.poses)
     (last,) = drive.frames(len(drive) - 1)
     assert last.index == len(drive) - 1
     back = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
     assert back.max() > 50
-    assert back[len(back) // 2 :].min() < 10  # m: it comes back to where it began
+    assert back[len(back) // 2 :].min() < 10  # m: it returns to its start
 
 
 @pytest.mark.slow
@@ -59,4 +59,4 @@ def test_an_excerpt_keeps_the_numbers_of_its_scans(recording: Path, tmp_path: Pa
     bench(["paper"], source=[excerpt], out=tmp_path, only="ours", threads=1)
     (row,) = json.loads((tmp_path / "paper.json").read_text())["drives"]["00"].values()
     assert (row["frames"], row["failed_frames"]) == (4, 0)
-    assert row["rpe_trans_m"] < 0.05  # a street without a moving thing
+    assert row["rpe_trans_m"] < 0.05  # a street without moving objects

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of relocalization on a short road: one scan, at any heading, finds itself in the map of that road."""
+"""The relocalization benchmark on a short road: one scan, at any heading, is localized in the map of that road."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_scan_finds_itself_on_a_short_road(tmp_path: Path) -> None:
 def test_where_every_place_looks_alike_there_is_no_answer_rather_than_a_wrong_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A highway and a tunnel: what the geometry leaves open is not answered, with images or without."""
+    """On a highway and in a tunnel, an ambiguous pose is not accepted, with images or without."""
     monkeypatch.setattr(relocalise_open, "LENGTH", 250.0)
     with Progress(disable=True) as progress:
         found = open_roads(SlamSettings(), load_network("small", 1), progress, spacing=50, visits=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurement of a second camera on a few scans: true poses are those of the scans, and each way has its images."""
+"""The evaluation of a second camera on a few scans: true poses are the scans', and each method uses its images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from dpm2_core.network.model import DeepPointMap2
 def test_each_pair_is_registered_with_the_images_of_each_way(
     model: DeepPointMap2, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A network that says 1.25 m straight on is right about neighbors in a straight tunnel, and 1.25 m off beyond."""
+    """A network that always predicts 1.25 m ahead is right for neighbors in a straight tunnel, and 1.25 m off
+    beyond."""
     seen: list[tuple[str, ...]] = []
     describe = model.describe
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of scans: what is put into a simulated sensor is what they find; and reference points that meet again."""
+"""Figures of scans recover the parameters of a simulated sensor; and reference points that are found again."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_figures_find_what_a_sensor_was_given(street: World) -> None:
     rough = statistics(_scans(street, noise=0.03, dropout=0.1))
     near = slice(0, 3)
     assert exact["ring_range_noise_m"][0] < 1e-3
-    assert rough["ring_range_noise_m"][0] == pytest.approx(0.03, rel=0.2)  # what leaves and grass add is in it
+    assert rough["ring_range_noise_m"][0] == pytest.approx(0.03, rel=0.2)  # with the contribution of leaves and grass
     assert np.median(np.subtract(rough["lost"][near], exact["lost"][near])) == pytest.approx(0.1, abs=0.03)
     assert abs(exact["upper_origin_m"]) < 1e-3
     shifted = statistics(_scans(street, noise=0.0, real={"emitters": (0.2, 0.1), "uneven": 0.04}))
@@ -53,7 +53,7 @@ def test_rings_are_told_apart_where_azimuth_starts_again() -> None:
 
 @pytest.mark.slow
 def test_reference_points_of_the_same_scan_meet_and_of_another_place_do_not(street: World) -> None:
-    """Twice the same cloud: all; 20 m apart with a wrong motion: hardly any."""
+    """The same cloud twice: all; 20 m apart with a wrong motion: hardly any."""
     frame = Frame(0, _scans(street)[0])
     poses = np.stack([np.eye(4)] * 10)
     same = shares([frame] * 10, poses, tiny(), 5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tunnels whose way no scan tells: with an IMU and without."""
+"""Tunnels whose scans do not determine the motion along them: with an IMU and without."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks import smooth_tunnels
 
 @pytest.mark.slow
 def test_an_imu_is_worth_most_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Until the last frame that another odometry knows there is none."""
+    """There is no error until the last frame with another odometry."""
     monkeypatch.setattr(smooth_tunnels, "AFTER", (0, 20))
     frames, truth = smooth_tunnels.drive(7)
     told = [frame.guess is not None for frame in frames]

@@ -36,7 +36,7 @@ def test_a_short_drive_is_evaluated_once(tmp_path: Path, monkeypatch: pytest.Mon
         traffic.bench_traffic(options).results["drives"]
         == json.loads((tmp_path / "traffic.json").read_text())["drives"]
     )
-    for name, other in (("FRAMES", 7), ("PRETRAINED_DIR", tmp_path)):  # another recipe, other weights: begun anew
+    for name, other in (("FRAMES", 7), ("PRETRAINED_DIR", tmp_path)):  # another recipe or other weights: started anew
         with monkeypatch.context() as changed:
             changed.setattr(traffic, name, other)
             with pytest.raises(TypeError):
@@ -62,8 +62,8 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
 def test_other_weights_of_the_network_or_threads_are_another_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Figures of other weights were shown as theirs, and the times of two threads beside one."""
-    monkeypatch.setattr(traffic, "PLACES", {})  # no drive: the recipe alone
+    """Figures of other weights were shown as theirs, and times with two threads next to those with one."""
+    monkeypatch.setattr(traffic, "PLACES", {})  # no drive, only the recipe
     options = Options(threads=1, out=tmp_path)
     trained = tmp_path / "mine.safetensors"
     recipes = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds seen by other LiDARs: each sees the same places."""
+"""Worlds seen by other LiDARs: all see the same places."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ def test_every_sensor_sees_the_same_places(tmp_path: Path) -> None:
         drive(tmp_path / name, "suburb", 5, SENSORS[name], preset("small"), scans=2)
     rosette, beams = sorted(open_packed(tmp_path), key=lambda packed: packed[0].cloud[:, 0].min())[::-1]
     np.testing.assert_allclose(rosette.poses, beams.poses)
-    assert (rosette[0].cloud[:, 0] > 0).all()  # ahead alone
+    assert (rosette[0].cloud[:, 0] > 0).all()  # only ahead
     assert beams[0].cloud[:, 0].min() < -5

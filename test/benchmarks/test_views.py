@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The view beside a run, and the map's page in a real browser, of a drive of a few frames."""
+"""The live view of a run, and the map's page in a real browser, for a drive of a few frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tools.browser import chromium
 
 @pytest.mark.slow
 def test_both_are_measured(recording: Path) -> None:
-    """Every figure of the table is of something that happened: a recording, a page that was drawn and turned."""
+    """Every figure of the table is from a real event: a recording, a page that was drawn and rotated."""
     pytest.importorskip("rerun")
     pytest.importorskip("playwright")
     if chromium() is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every block of code in the documentation runs, or says why not; every call of `dpm2` in it is one that dpm2 accepts.
+"""Every code block in the documentation runs or states why not; every call of `dpm2` in it is accepted by dpm2.
 
 A block that is not run has a comment on the line before: `<!-- not run: why -->`.
 """
@@ -23,12 +23,12 @@ from ..helpers.drives import first_scans
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(ROOT.glob("docs/*.md")) + [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
 SHOWN = ("mermaid", "text")
-"""Languages that nothing can run; mermaid is compared with the imports in test/tools."""
+"""Languages that cannot be run; mermaid is compared with the imports in test/tools."""
 _FENCE = re.compile(r"(?:<!-- not run: (?P<why>[^\n]+) -->\n)?^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M | re.S)
 
 
 class Block(NamedTuple):
-    """One block of a page; `why` it is not run, or an empty text."""
+    """One block of a page; `why` it is not run, or an empty string."""
 
     page: Path
     line: int
@@ -38,7 +38,7 @@ class Block(NamedTuple):
 
     @property
     def commands(self) -> list[str]:
-        """Lines of a shell block without comments, continued ones in one."""
+        """Lines of a shell block without comments; continued lines are joined."""
         joined = self.code.replace("\\\n", " ")
         return [line for line in (re.sub(r"(^|\s)#.*", "", line).strip() for line in joined.splitlines()) if line]
 
@@ -64,7 +64,7 @@ def test_blocks_are_found_and_have_a_language() -> None:
 
 @pytest.mark.parametrize(("block", "command"), CALLS, ids=[f"{b.page.stem}:{b.line}" for b, _ in CALLS])
 def test_a_call_of_dpm2_is_one_that_it_accepts(block: Block, command: str) -> None:
-    """Also where the block is not run: the command is there, and so are its options."""
+    """This includes blocks that are not run: the command exists, and so do its options."""
     words = [word.rstrip("].") if word.startswith("[") else word for word in shlex.split(command)[1:]]
     name, *rest = (word for word in words if word not in ("[DRIVE...",))
     if name == "version":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and figures outside docs/measured.md, and what its first tables say of weights and truth, are the records'."""
+"""Tables and figures outside docs/measured.md, and its first tables on weights and truth, equal the records."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def test_the_shares_of_reference_points_that_meet_again_are_those_of_the_record(
 
 @cache
 def blob(commit: str) -> str:
-    """Name in git of the weights at a commit; empty where this checkout does not have the commit."""
+    """Git's hash of the weights at a commit; empty if this checkout does not have the commit."""
     command = ["git", "rev-parse", "--verify", "--quiet", f"{commit.rstrip('+')}:{WEIGHTS}"]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
 
 
 def test_the_weights_of_each_record_are_those_at_its_commit(tmp_path: Path) -> None:
-    """Those that are shipped, or others with the same encoder: as far as this checkout has the history."""
+    """They are the shipped ones, or others with the same encoder, as far as this checkout has the history."""
     listed = [re.findall(r"`([\w-]+)`", cells[0]) for cells in rows(MEASURED, "| records | weights at their commit |")]
     at = {path.stem: blob(record(path.name)["commit"]) for path in sorted((ROOT / "benchmarks").glob("*.json"))}
     at = {name: of for name, of in at.items() if of}
@@ -113,13 +113,13 @@ def test_the_weights_of_each_record_are_those_at_its_commit(tmp_path: Path) -> N
 
 
 def test_records_of_the_shipped_weights_are_measured_again_by_make_measure() -> None:
-    """So that new weights leave none of them behind."""
+    """Thus no record of older weights remains after new weights."""
     first = next(rows(MEASURED, "| records | weights at their commit |"))
     assert set(re.findall(r"`([\w-]+)`", first[0])) <= {*measure.COMMANDS, *measure.TARGETS}
 
 
 def test_the_share_of_far_pairs_that_are_found_is_that_of_the_record() -> None:
-    """Each row says against which poses."""
+    """Each row states the poses that it is compared with."""
     drives = record("neural.json")["parts"]["real"]["drives"]
     heading = "| no prior, error below 0.6 m and 1.5 deg | neural | refined | KISS-ICP, small_gicp |"
     found = {cells[0]: cells[1:] for cells in rows(MEASURED, heading)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site is built without a warning, and offers nothing that it would have to fetch."""
+"""The site is built without a warning, and loads nothing from other sites."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pages, built strictly: a dead link, a missing anchor or a page that is left out fails."""
+    """The pages, built strictly: a dead link, a missing anchor or a page that is left out is an error."""
     pytest.importorskip("mkdocs", reason="no mkdocs: pip install '.[docs]'")
     pytest.importorskip("material", reason="no mkdocs-material: pip install '.[docs]'")
     out = tmp_path_factory.mktemp("site")
@@ -42,7 +42,7 @@ def test_every_page_and_every_public_name_is_there(site: Path) -> None:
 
 @pytest.mark.long
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
-    """Links lead elsewhere only where a reader follows them."""
+    """Other sites are reached only through links that a reader follows."""
     for page in site.rglob("*.html"):
         loaded = re.findall(r"<(?:script|img|iframe|link)[^>]*?(?:src|href)=[\"']?(https?:[^\"' >]+)", page.read_text())
         assert loaded == [], page

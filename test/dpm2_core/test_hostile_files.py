@@ -171,7 +171,7 @@ def test_a_hostile_map(tmp_path: Path, map_file: Path, attack: str, capsys: pyte
 
 @pytest.mark.parametrize("attack", MAPS)
 def test_what_is_good_of_a_hostile_map_can_be_recovered(tmp_path: Path, map_file: Path, attack: str) -> None:
-    """At least eleven of its twelve keyframes are in a sound map; of a truncated file, those that are left."""
+    """At least ten of its twelve keyframes are in a sound map; of a truncated file, those that are left."""
     MAPS[attack](map_file)
     result = check_map(map_file, tmp_path / "good.dpm2map")
     assert result.problems

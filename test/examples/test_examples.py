@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The examples with a reader's arguments, on a small simulated drive: what they print and write is right."""
+"""The examples with a reader's arguments, on a small simulated drive: their output is correct."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FRAMES = 14
 
 @pytest.fixture(scope="module")
 def recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """13 m of it."""
+    """The first 13 m of the recording."""
     return first_scans(recording, FRAMES, tmp_path_factory.mktemp("first"))
 
 
@@ -42,7 +42,7 @@ def truth(recording: Path) -> np.ndarray:
 
 
 def example(name: str, *arguments: object) -> Done:
-    """An example in this process: the seconds of its imports are spent once."""
+    """Run an example in this process, so that imports take time only once."""
     path, out, err, code = EXAMPLES / f"{name}.py", StringIO(), StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         patch.setattr(sys, "argv", [str(path), *map(str, arguments)])
@@ -69,7 +69,7 @@ def test_odometry_of_a_folder_in_ten_lines(recording: Path, truth: np.ndarray, t
 
 @pytest.mark.slow
 def test_register_two_scans_and_draw_them(recording: Path, truth: np.ndarray, tmp_path: Path) -> None:
-    """Some 5 m apart; the network alone is right to a few decimeters."""
+    """They are about 5 m apart; the network alone is accurate to a few decimeters."""
     done = example("register_two_scans", recording, 0, 5, tmp_path / "matches.png")
     assert done.returncode == 0, done.stderr
     found = [float(word) for word in done.stdout.split(" m in ")[0].split()[-3:]]
@@ -82,7 +82,7 @@ def test_map_then_localize(recording: Path, truth: np.ndarray, tmp_path: Path) -
     done = example("map_then_localize", recording, recording, tmp_path / "street.dpm2map")
     assert done.returncode == 0, done.stderr
     rows = np.array([line.split() for line in done.stdout.splitlines()], float)
-    assert len(rows) == FRAMES  # found at once
+    assert len(rows) == FRAMES  # localized at once
     assert np.linalg.norm(rows[:, 1:] - truth[:, :3, 3], axis=1).max() < 0.1  # as in test_localise.py
 
 
@@ -97,7 +97,7 @@ def test_a_recording_that_is_not_there_is_one_clear_error(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_a_loader_of_ones_own(recording: Path, tmp_path: Path) -> None:
-    """With ground truth for all scans but one, a scan that is no array, and one of another shape."""
+    """With ground truth for all scans but one, a scan that is not an array, and one of another shape."""
     folder = tmp_path / "clouds"
     folder.mkdir()
     source = open_source(recording, InputSettings(images=False))
@@ -132,7 +132,7 @@ def test_wheel_odometry_carries_over_what_the_points_cannot(recording: Path) -> 
 
 @pytest.mark.slow
 def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
-    """Both losses fall."""
+    """Both losses decrease."""
     done = example("slam_loss", recording, 8)
     assert done.returncode == 0, done.stderr
     before, after = ([float(line.split()[3]), float(line.split()[5])] for line in done.stdout.splitlines())
@@ -142,7 +142,7 @@ def test_the_slam_loss_on_a_model_of_ones_own(recording: Path) -> None:
 
 @pytest.mark.slow
 def test_the_slam_loss_falls_on_real_scans_too(kitti_root: Path) -> None:
-    """As far as the example says."""
+    """They decrease as far as the example states."""
     done = example("slam_loss", kitti_root / "sequences" / "04", 20)
     assert done.returncode == 0, done.stderr
     before, after = ([float(line.split()[3]), float(line.split()[5])] for line in done.stdout.splitlines())
@@ -153,7 +153,7 @@ def test_the_slam_loss_falls_on_real_scans_too(kitti_root: Path) -> None:
 @pytest.mark.long
 @pytest.mark.weights
 def test_the_notebook(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of its cells run, and it is kept without what they print."""
+    """All of its cells run, and it is stored without their output."""
     nbclient = pytest.importorskip("nbclient", reason="no nbclient: pip install '.[test]'")
     nbformat = pytest.importorskip("nbformat")
     notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)

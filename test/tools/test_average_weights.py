@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of several weights: of what fits in all; the rest is the last one's, the settings are the preset's."""
+"""The mean of several weights: tensors that fit in all files; others are the last file's; settings are the preset's."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_what_cannot_be_averaged_is_named(tmp_path: Path) -> None:
 
 
 def test_what_is_averaged_must_be_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """As a program: exit code 2, and what is missing."""
+    """As a program, it ends with exit code 2 and names what is missing."""
     for arguments, missing in (([], "out"), (["mean.safetensors"], "IN")):
         monkeypatch.setattr("sys.argv", ["average_weights", *arguments])
         assert run_command(average_weights) == 2
-        assert missing.lower() in capsys.readouterr().err.lower()  # releases of typer differ in the case
+        assert missing.lower() in capsys.readouterr().err.lower()  # versions of typer differ in the case

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The diagrams of docs/architecture.md are those of the imports, and leave out only what other arrows imply."""
+"""The diagrams of docs/architecture.md show the imports, and leave out only those that other arrows imply."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_the_document_shows_the_imports_as_they_are() -> None:
 
 
 def test_every_import_between_packages_can_be_followed_in_the_diagram() -> None:
-    """And nothing else: what is drawn reaches exactly what is imported."""
+    """There is nothing else: along the arrows, exactly the imported packages can be reached."""
     graph = grimp.build_graph("dpm2_core", "dpm2_ros", cache_dir=None)
     for arrows in (packages(graph), children(graph, "dpm2_core.slam")):
         drawn = reduced(arrows)

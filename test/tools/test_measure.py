@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured again: records of other code, and those that are not there or cannot be read."""
+"""Records that must be measured again: those of other code, and those that are missing or unreadable."""
 
 from __future__ import annotations
 
