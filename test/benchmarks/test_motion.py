@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of sweeps in motion on a few scans: every ride is compared, one of them with every kind of shaking."""
+"""The benchmark of sweeps in motion on a few scans: a ride is compared from scan to scan, and shakes as specified."""
 
 from __future__ import annotations
 
