@@ -83,8 +83,8 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The drive starts a new map, as after a crash of mapper_node. Drives without a named file do so without a warning;
-    so does a reset."""
+    """If a named map file exists and the drive cannot continue it, the new map's name is reported, as after a crash of
+    mapper_node. Drives without a named file, and resets, start a new map without a warning."""
     caplog.set_level(logging.WARNING)
     town = tmp_path / "town.dpm2map"
     for file in ("auto", "auto", str(town)):
@@ -102,7 +102,8 @@ def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
 def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The new map would contain keyframes of the removed one or be malformed: the next number is taken."""
+    """If only the log of a removed map is left, the next number is taken: a new map next to that log would contain its
+    keyframes or be malformed."""
     log = tmp_path / "drive.dpm2map-wal"
     log.write_bytes(b"log")
     drive(tmp_path)
@@ -113,7 +114,8 @@ def test_a_map_does_not_begin_beside_the_log_of_one_that_was_removed(
 
 
 def test_a_copy_of_the_map_leaves_the_log_of_one_that_was_moved(tmp_path: Path) -> None:
-    """The map that was moved lacks its last keyframes until its log is next to it again."""
+    """The moved map lacks its last keyframes until the log is next to it again, so saving a copy must not replace the
+    log."""
     log = tmp_path / "town.dpm2map-wal"
     log.write_bytes(b"log")
     active = driven(1, map_directory=str(tmp_path))
@@ -123,7 +125,7 @@ def test_a_copy_of_the_map_leaves_the_log_of_one_that_was_moved(tmp_path: Path) 
 
 
 def test_a_folder_without_its_map_file_keeps_its_name(tmp_path: Path) -> None:
-    """Such a folder is left by `ros.map_file:=''` or by dpm2 0.1."""
+    """A folder without a map file, as from `ros.map_file:=''` or dpm2 0.1, is not overwritten by a later drive."""
     drive(tmp_path, map_file="")
     assert sorted(contents(tmp_path)) == ["drive/map.ply", "drive/pose_graph.g2o", "drive/trajectory.tum"]
     drive(tmp_path)
@@ -164,7 +166,8 @@ def test_a_map_is_saved_under_a_name_as_well(tmp_path: Path) -> None:
 
 
 def test_a_name_that_leads_to_the_file_of_the_drive_itself_is_no_copy(tmp_path: Path) -> None:
-    """A copy replaced the file that the node was writing to, and no later keyframe was kept."""
+    """If the name is a link to the drive's own file, no copy is made. Previously, a copy replaced the file that the
+    node was writing to, and no later keyframe was kept."""
     active, town = driven(2, map_directory=str(tmp_path)), tmp_path / "town.dpm2map"
     active.save("town")
     town.unlink()
@@ -186,7 +189,8 @@ def test_a_name_stays_within_the_folder(name: str) -> None:
 
 
 def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither folder nor file is made for an empty setting, even if the other is given, nor for an empty drive."""
+    """No folder and no file is made for an empty setting, even if the other one is given; an empty drive makes
+    neither."""
     monkeypatch.chdir(tmp_path)
     for ros in ({"map_directory": ""}, {"map_directory": "", "map_file": ""}):
         active = driven(1, **ros)
@@ -203,7 +207,7 @@ def test_an_empty_value_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) -> None:
-    """The map grows in memory without a file; the problem is reported until a file can be made."""
+    """The map grows in memory without a file, and the problem is reported until a file can be made."""
     directory = tmp_path / "maps"
     directory.write_text("no folder")
     active = ActiveMap(config(map_directory=str(directory)), "", LOG)
@@ -217,7 +221,8 @@ def test_a_file_that_cannot_be_made_is_known_until_there_is_one(tmp_path: Path) 
 
 
 def test_a_map_whose_file_could_not_be_made_is_not_said_to_be_saved(tmp_path: Path) -> None:
-    """The disk was full when the drive began: `town` was reported as saved, but there was no map to localize in."""
+    """If the map file could not be made because the disk was full, saving fails. Previously, `town` was reported as
+    saved, but there was no map to localize in."""
     (tmp_path / "full").write_text("no folder")
     active = driven(2, map_directory=str(tmp_path / "maps"), map_file=str(tmp_path / "full" / "a.dpm2map"))
     with pytest.raises(Dpm2Error, match=r"map of 2 keyframes saved in .*town, but there is no map file: .*full"):
@@ -256,7 +261,8 @@ def test_a_map_that_cannot_be_kept_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another program locks the file, like a full disk: the folder is saved, but no copy. Later all is saved."""
+    """While another program locks the file, which acts as a full disk, the folder is saved but no copy. Later all is
+    saved."""
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     active = driven(1, map_directory=str(tmp_path))
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
@@ -273,7 +279,7 @@ def test_a_map_whose_file_is_incomplete_is_not_saved(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("name", ["", "town"])
 def test_a_map_whose_file_was_moved_since_the_last_keyframe_is_not_saved(tmp_path: Path, name: str) -> None:
-    """The node reported a map as saved in a file that did not exist. Once the file is back, the map is saved."""
+    """Saving fails until the file is back. Previously, the map was reported as saved in a file that did not exist."""
     active = driven(1, map_directory=str(tmp_path))
     path, elsewhere = tmp_path / "drive.dpm2map", tmp_path / "elsewhere"
     path.rename(elsewhere)
@@ -309,7 +315,8 @@ def street(n: int) -> Keyframe:
 
 @pytest.mark.weights
 def test_a_drive_that_nothing_ties_to_the_map_is_no_place_in_it(tmp_path: Path) -> None:
-    """A robot was `tracking` there, at the pose that its drive's frame happened to have in the map: 120 m off."""
+    """The map has a drive that no edge connects to the rest. A robot must not be localized in that drive: it was
+    `tracking` at an arbitrary pose in the map, 120 m off."""
     made = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
     made.add(keyframes(1)[0])
     made.close()
@@ -331,7 +338,8 @@ def test_a_drive_that_nothing_ties_to_the_map_is_no_place_in_it(tmp_path: Path) 
 @pytest.mark.weights
 @pytest.mark.parametrize("descriptors", [True, False])
 def test_a_growing_map_that_does_not_serve_goes_on(tmp_path: Path, descriptors: bool) -> None:
-    """A map without keyframes or without descriptors is unusable for localization: the drive continues in one piece."""
+    """A map without keyframes or without descriptors is rejected for localization, and the drive continues in one
+    piece."""
     active = ActiveMap((described if descriptors else config)(map_directory=str(tmp_path)), "", LOG)
     before, reason = (0, "no keyframe yet") if descriptors else (3, "no keyframe has descriptors")
     for keyframe in keyframes(before):
@@ -355,7 +363,7 @@ def another_map(folder: Path) -> None:
 
 @pytest.mark.weights
 def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: Path) -> None:
-    """It would be lost otherwise. A name without a map leaves the drive in one piece."""
+    """Without a file, the map would be lost. If the requested name has no map, the drive continues in one piece."""
     another_map(tmp_path)
     active = driven(3, map_directory=str(tmp_path), map_file="")
     with pytest.raises(UsageError, match="no such map file"):
@@ -369,7 +377,7 @@ def test_a_map_without_a_file_is_saved_before_another_takes_its_place(tmp_path: 
 
 @pytest.mark.weights
 def test_what_was_saved_last_under_a_name_is_what_is_loaded_by_it(tmp_path: Path) -> None:
-    """It is not the map of another drive that has the plain name, because of which the copy was numbered."""
+    """If another drive has the plain name, the copy is numbered; loading by that name then loads the numbered copy."""
     another_map(tmp_path)
     active = ActiveMap(described(map_directory=str(tmp_path)), "", LOG)
     for n in (0, 5):
@@ -381,7 +389,8 @@ def test_what_was_saved_last_under_a_name_is_what_is_loaded_by_it(tmp_path: Path
 
 
 def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -> None:
-    """After a looped bag or a clock that was set back, a separate segment begins; the keyframe ids continue."""
+    """After a looped bag or a clock that was set back, a separate segment begins in the same map; the keyframe ids
+    continue."""
     active = ActiveMap(config(map_directory=str(tmp_path)), "", LOG)
     for keyframe in [*keyframes(3), *keyframes(2)]:
         active.add(keyframe)
@@ -392,7 +401,8 @@ def test_an_odometry_that_starts_again_goes_on_in_the_same_map(tmp_path: Path) -
 
 
 def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`dpm2 map check`, `export` for Nav2, and the hint if localization is requested without naming a map."""
+    """`dpm2 map check` and `export` accept it, and it is suggested if localization is requested without naming a
+    map."""
     drive(tmp_path)
     for arguments in (["check"], ["export", str(tmp_path / "grid.yaml")], ["info"]):
         with pytest.raises(SystemExit) as ended:
@@ -405,7 +415,7 @@ def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_two_nodes_that_start_together_do_not_share_a_file(tmp_path: Path) -> None:
-    """Eight start at the same time, in one folder and with the same name."""
+    """Eight start at the same time in one folder, with the same name, and each has its own file."""
     made: list[ActiveMap] = []
 
     def start() -> None:

@@ -112,7 +112,8 @@ class VirtualTime:
 def test_each_message_goes_out_when_it_is_due(
     listener: Listener, bag: Path, drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At double speed, and in virtual time: delays of a busy machine are not tested."""
+    """Messages are published at the right time at double speed; the test uses virtual time, without delays of a busy
+    machine."""
     virtual = VirtualTime()
     for name in ("time", "STOP"):
         monkeypatch.setattr(f"dpm2_ros.bag_player.{name}", virtual)
@@ -175,7 +176,8 @@ def test_it_loops_until_it_is_stopped(listener: Listener, bag: Path, drive: Any)
 
 
 def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listener, bag: Path) -> None:
-    """It was repeated thousands of times per second, each time with a line in the log."""
+    """If only latched messages are played in a loop, they are published once. Previously, they were repeated thousands
+    of times per second, each time with a line in the log."""
     player = listener.play(str(bag), "--wait", "90", "--loop", "--topics", naming.TF_STATIC)
     listener.harness.wait(lambda: listener.static, "the transforms")
     time.sleep(0.5)
@@ -185,7 +187,8 @@ def test_what_is_latched_alone_stays_there_until_it_is_stopped(listener: Listene
 
 
 def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(listener: Listener, tmp_path: Path) -> None:
-    """As of a robot whose camera repeats its own transform; also if a message is damaged or a transform is invalid."""
+    """As from a robot whose camera repeats its transform. The last valid transform counts: one message is damaged, and
+    one transform is invalid."""
     types = get_typestore(Stores.ROS2_JAZZY)
     kind = "tf2_msgs/msg/TFMessage"
     links = [("lidar", 1.5), *(("camera", 0.1 * n) for n in range(150)), ("lidar", math.nan)]
@@ -209,7 +212,7 @@ def test_of_many_static_transforms_a_subscriber_gets_the_last_of_each_frame(list
 def test_a_recorded_clock_is_the_only_one(
     listener: Listener, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Such a clock comes from a simulation, whose time differs from that of the recording."""
+    """If the bag contains /clock, as from a simulation, the player publishes no other clock."""
     types = get_typestore(Stores.ROS2_JAZZY)
     Time, RecordedClock = types.types["builtin_interfaces/msg/Time"], types.types["rosgraph_msgs/msg/Clock"]
     kind, out = RecordedClock.__msgtype__, list[tuple[int, str, bytes]]()
@@ -304,7 +307,8 @@ def test_a_truncated_bag_plays_what_is_left(
 def test_a_type_is_imported_from_the_packages_of_ros_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The bag names a module in the working directory: its topic is left out, and that is reported."""
+    """A bag that names a module in the working directory does not import it: its topic is left out, and that is
+    reported."""
     package = tmp_path / "evil" / "msg"
     package.mkdir(parents=True)
     (package.parent / "__init__.py").write_text("")
@@ -327,7 +331,7 @@ def test_a_type_is_imported_from_the_packages_of_ros_alone(
 def test_messages_of_ros1_that_ros2_defines_differently_are_left_out(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """They were sent empty. In ROS 2, a Range also has a variance."""
+    """Previously, such messages were sent empty. An example is Range, which has a variance in ROS 2."""
     from rosbags.rosbag1 import Writer as Ros1Writer
 
     noetic = get_typestore(Stores.ROS1_NOETIC)

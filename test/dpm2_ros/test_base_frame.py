@@ -60,7 +60,8 @@ def test_without_one_it_never_has_a_parent_and_its_pose_is_consistent(order: tup
 
 @pytest.mark.parametrize("wanted", ["base", ""])
 def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted: str) -> None:
-    """As when a calibration is corrected while the node runs: one drive uses one pose, and the mismatch is reported."""
+    """If a calibration is corrected while the node runs, the drive keeps its extrinsics and the mismatch is reported;
+    the next drive uses the new ones."""
     base, moved = BaseFrame(wanted, ("odom",)), "/tf_static has moved the LiDAR in base: ~/reset applies its new pose"
     for x in (1.0, 1.8):
         tree = TransformTree()
@@ -74,7 +75,7 @@ def test_a_lidar_that_is_moved_in_its_base_counts_from_the_next_drive_on(wanted:
 
 
 def test_the_place_of_another_lidar_is_not_that_of_the_first() -> None:
-    """As long as /tf_static does not contain the other LiDAR, there is no base."""
+    """For another LiDAR there is no base until /tf_static contains that LiDAR."""
     base, tree = BaseFrame("base", ("odom",)), TransformTree()
     tree.set("base", "lidar", se3.make(np.eye(3), [1.0, 0, 0]))
     assert base.look(tree, "lidar")
@@ -88,7 +89,8 @@ def test_the_place_of_another_lidar_is_not_that_of_the_first() -> None:
 
 
 def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
-    """Two parents would break /tf; this also holds if the first parent arrives late. The pose is known nevertheless."""
+    """If `ros.base_frame` has a parent, the frame to use instead is named, since two parents would break /tf, also if
+    the parent arrives late. The pose is known nevertheless."""
     early, late = BaseFrame("base", ("odom",)), BaseFrame("base", ("odom",))
     *_, three, whole = trees(tuple(LINKS)[:3])
     assert early.look(whole, "lidar")
@@ -101,7 +103,7 @@ def test_a_base_below_another_frame_names_the_one_that_may_be_moved() -> None:
 
 
 def test_a_frame_that_this_node_moves_is_no_base() -> None:
-    """map -> odom -> base is published as static: odom -> map would be a cycle."""
+    """If map -> odom -> base is published as static, odom is not the base: odom -> map would be a cycle."""
     tree = TransformTree()
     for parent, child in (("map", "odom"), ("odom", "base"), ("base", "lidar")):
         tree.set(parent, child, np.eye(4))

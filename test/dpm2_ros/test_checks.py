@@ -58,7 +58,7 @@ def test_what_two_publishers_say_otherwise_of_a_frame(later: TransformStamped, s
 
 
 def test_the_number_of_frames_is_bounded() -> None:
-    """Frames that are known already can still be moved."""
+    """More frames are rejected; frames that are known already can still be moved."""
     tree, _ = extended(TransformTree(), message(transform("base", "lidar")))
     for k in range(50):
         tree, _ = extended(tree, message(*(transform(f"p{k}", f"c{k}_{n}") for n in range(200))))

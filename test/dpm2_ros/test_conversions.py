@@ -51,7 +51,7 @@ def test_nan_points_survive() -> None:
 
 
 def test_a_large_cloud_is_converted_without_a_loop_over_its_bytes() -> None:
-    """120,000 points take 1 ms; the obvious way in rclpy takes over 60 ms."""
+    """120,000 points take 1 ms; the obvious implementation with rclpy takes over 60 ms."""
     points = np.zeros((120_000, 4), np.float32)
     best = np.inf
     for _ in range(5):
@@ -132,7 +132,8 @@ def test_other_frames_are_no_keyframes(name: str) -> None:
 
 
 def test_a_picture_shows_the_points_where_it_did_also_seen_from_the_base() -> None:
-    """A camera's pose in a map is relative to the keyframe's frame: place recognition in tunnels uses it."""
+    """If a keyframe is transformed to the base, points project to the same pixels, since the camera's pose is
+    transformed, too. Place recognition in tunnels uses this."""
     T_base_lidar = se3.exp([np.pi, 0, 0, -0.6, 0.1, 1.7])  # a LiDAR that is mounted upside down
     seen = frame(0.0, random_paint())
     keyframe = Keyframe(0, 0, 0, np.eye(4), seen.points, thumbnail=thumbnail(seen.images[0], 320))

@@ -37,7 +37,7 @@ def test_a_keyframe_that_had_to_wait_for_an_earlier_drive_is_due_at_once() -> No
 
 
 def test_an_earlier_drive_is_announced_before_it_is_sent() -> None:
-    """Most of it may have arrived: the first acknowledgment shows it, before anything is sent twice."""
+    """Most of the drive may have arrived already: the first acknowledgment shows it, before anything is sent twice."""
     drive = delivery(20, earlier=True, now=100.0)
     assert drive.announces(100.1)
     assert not drive.announces(100.2)
@@ -60,7 +60,7 @@ def test_one_acknowledgment_does_not_end_a_drive() -> None:
 
 
 def test_what_the_mapper_has_in_memory_alone_does_not_end_a_drive() -> None:
-    """It is not sent again, either."""
+    """Keyframes that are only in the mapper's memory are not sent again, but the drive is not complete, either."""
     drive = delivery(3)
     for n in range(20):
         drive.acknowledge(1, {1, 2}, 0.5 * n)

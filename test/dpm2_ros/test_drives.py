@@ -53,7 +53,8 @@ def test_two_drives_in_one_namespace_are_kept_apart(mapper: Any) -> None:
 
 
 def test_what_is_left_of_an_earlier_drive_comes_before_the_next_one(mapper: Any) -> None:
-    """The robot was killed: until that drive is complete, the pose of its current odometry in the map is unknown."""
+    """After a robot was killed, its remaining keyframes are added first. Until that drive is complete, its current
+    odometry has no pose in the map."""
     move, heard = placed(mapper)
     send_all(mapper, 0, 1)
     mapper.wait(lambda: keyframes(mapper) == 2, "the drive")
@@ -92,7 +93,8 @@ def test_a_robot_that_starts_again_is_not_put_where_its_drive_before_was(mapper:
 
 @pytest.mark.usefixtures("quick")
 def test_a_drive_that_another_one_has_replaced_comes_back(mapper: Any) -> None:
-    """The robot was out of reach, and meanwhile a session in its name began: nothing that it sends is lost."""
+    """A robot was out of reach, and a session in its name began meanwhile. When it returns, nothing that it sends is
+    lost."""
     for session, ids in ((S, (0, 1)), (OTHER, (0,)), (S, (2, 3))):
         time.sleep(1.2)
         expected = keyframes(mapper) + len(ids)

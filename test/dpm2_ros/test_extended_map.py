@@ -42,7 +42,8 @@ def found(tmp_path: Path) -> Iterator[ActiveMap]:
 def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
     found: ActiveMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another program locks the file; once it has released it, the map grows from the robot's pose."""
+    """While another program locks the map file, the robot is still localized; later, the map grows from the robot's
+    pose."""
     monkeypatch.setattr("dpm2_core.slam.store.map_connection.BUSY", 0.1)
     with closing(sqlite3.connect(tmp_path / "drive.dpm2map", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
@@ -66,7 +67,8 @@ def test_where_its_map_cannot_grow_a_robot_is_found_as_before(
 
 @pytest.mark.weights
 def test_an_odometry_that_starts_again_before_the_first_keyframe_of_a_session_is_not_placed(found: ActiveMap) -> None:
-    """It was tied rigidly to the last pose of the previous odometry; only a loop can determine where it is."""
+    """The new odometry has no pose until a loop is found. Previously, it was tied rigidly to the last pose of the
+    previous odometry."""
     found.extend()
     assert found.T_map_odom("") is not None
     found.restart("")
@@ -80,9 +82,10 @@ def test_an_odometry_that_starts_again_before_the_first_keyframe_of_a_session_is
 def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
     found: ActiveMap, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its clouds are damaged while the robot is localized: degraded, then lost, as if nothing matched.
+    """If the map's clouds are damaged, the state becomes degraded, then lost, as if nothing matched.
 
-    The log had the reason only when the state changed: never, if the robot had not been localized yet.
+    The reason is logged once. Previously, it was logged only when the state changed: never, if the robot had not been
+    localized yet.
     """
     execute(tmp_path / "drive.dpm2map", "UPDATE payloads SET cloud = x'00'")
     states = []
@@ -99,7 +102,8 @@ def test_a_map_that_cannot_be_read_does_not_confirm_a_place(
 
 @pytest.mark.weights
 def test_the_own_map_is_known_by_any_spelling_of_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With two spellings, the file was open twice, and FILE-wal was left next to it."""
+    """Two spellings of the path are the same map. Previously, the file was open twice, and FILE-wal was left next to
+    it."""
     monkeypatch.chdir(tmp_path)
     active = ActiveMap(described(map_directory=".", map_file=str(tmp_path / "town.dpm2map")), "", LOG)
     active.add(street(0))

@@ -108,7 +108,8 @@ def robot(ros: Callable[..., Any], tmp_path: Path) -> Robot:
 
 
 def test_what_has_arrived_reaches_the_map(robot: Robot) -> None:
-    """Also if the feed is closed while keyframes arrive faster than they are mapped: their robot may be gone."""
+    """Keyframes reach the map even if the feed is closed while they arrive faster than they are mapped: their robot may
+    be gone."""
     robot.node.mapper.add(robot.node.wait)
     robot.send(COUNT, DRIVE)
     robot.wait(DRIVE, COUNT)
@@ -135,7 +136,8 @@ def test_what_is_acknowledged_for_good_is_in_the_map_file(robot: Robot) -> None:
 def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    """It was acknowledged as stored, so its robot deleted it, and /diagnostics reported OK."""
+    """If adding a keyframe fails, it is not acknowledged as stored. Previously it was, so its robot deleted it, and
+    /diagnostics reported OK."""
     mapper = robot.node.mapper.active.mapper
     add, errors = mapper.add, [error]
 
@@ -161,7 +163,8 @@ def test_a_keyframe_that_could_not_be_taken_in_stays_with_its_robot(
 
 
 def test_a_drive_whose_place_is_not_decided_stays_with_its_robot(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not in the map when the mapper ends, even if it began directly after the previous drive."""
+    """Keyframes of a drive without a decided pose are not acknowledged as stored, and not in the map when the mapper
+    ends, even if the drive began directly after the previous one."""
     monkeypatch.setattr("dpm2_ros.feed.SILENT", 300.0)  # s without a message, after which its pose would be decided
     robot.node.busy.set()
     robot.send(1, DRIVE)

@@ -63,7 +63,8 @@ def robot(ros: Callable[..., Any], drive: Any, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callable[..., Robot]) -> None:
-    """The pose of the base has the pitch of the slope; hostile samples are counted and change nothing."""
+    """On a slope, the base's pose has the pitch of the slope. Hostile samples are counted and change nothing; missing
+    samples are reported."""
     r = robot()
     r.stand(0, 1, 2)
     assert r.status("imu", lambda s: s.message == "in use").level == DiagnosticStatus.OK
@@ -91,7 +92,7 @@ def test_a_start_on_a_slope_is_level_and_one_that_stops_is_missed(robot: Callabl
 def test_one_that_stops_together_with_the_clouds_is_missed(
     robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without clouds nothing reported it: the status stayed "in use"."""
+    """Previously, nothing reported this without clouds: the status stayed "in use"."""
     r = robot()
     r.stand(0, 1)
     assert r.status("imu", saying("in use"))
@@ -133,7 +134,7 @@ def test_forces_of_the_other_sign_are_said_at_the_start(
 
 
 def test_one_that_is_named_and_never_comes_is_said(robot: Callable[..., Robot]) -> None:
-    """As when its topic is misspelled; an IMU whose topic is not set may be absent."""
+    """A warning is given if the IMU's topic is misspelled; an IMU whose topic is not set may be absent."""
     r = robot("input.imu_topic:=/imu/dta", topic="/imu/data")
     r.stand(0, 1)
     said = r.status("imu", saying("no usable message on /imu/dta yet; going on without"))

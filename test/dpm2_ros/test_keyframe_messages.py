@@ -39,7 +39,7 @@ def keyframe(noise: np.random.Generator, fix: Fix | None, picture: bytes | None,
 def test_fix_thumbnail_and_origin_travel_with_the_cloud(
     noise: np.random.Generator, fixed: bool, pictured: bool
 ) -> None:
-    """Within the budget, for any combination of them: the cloud is reduced."""
+    """All of them are sent within the budget, in any combination: only the cloud is reduced."""
     picture = thumbnail(make_image(noise), 200) if pictured else None
     sent = replace(keyframe(noise, FIX if fixed else None, picture, 100_000), origin=np.array([1.0, 0, 1.75]))
     payload = payload_from_msg(payload_to_msgs(sent, "a/3")[1])
@@ -58,7 +58,8 @@ def test_fix_thumbnail_and_origin_travel_with_the_cloud(
 def test_a_picture_that_would_cost_the_cloud_its_points_comes_smaller(
     noise: np.random.Generator, size: tuple[int, int], width: int
 ) -> None:
-    """It has the largest width of `slam.map.thumbnail`, or, from a square camera, that for place recognition."""
+    """A thumbnail of the largest width of `slam.map.thumbnail`, or a square one of the width for place recognition, is
+    sent smaller, so that it does not displace the cloud's points."""
     picture = thumbnail(make_image(noise, size), width)
     assert len(picture) > 20_000
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture), "a/3")[1])
@@ -72,7 +73,7 @@ def test_a_picture_that_would_cost_the_cloud_its_points_comes_smaller(
 
 
 def test_a_large_picture_without_a_camera_stays_at_home(noise: np.random.Generator) -> None:
-    """Such an image could not be used; no node makes one."""
+    """A large image without a camera is left out: it could not be used, and no node makes one."""
     picture = thumbnail(make_image(noise, (1024, 768)), 1024)
     payload = payload_from_msg(payload_to_msgs(keyframe(noise, FIX, picture.replace(b'"size"', b'"seize"')), "a/3")[1])
     assert payload.thumbnail is None

@@ -73,7 +73,7 @@ def write(parameters: dict[str, Any], path: Path, node: str = "/**") -> Path:
 def test_a_node_starts_from_a_file_of_defaults_and_empty_texts(
     launch_file: ModuleType, domain: int, tmp_path: Path, kind: type[SlamNode] | type[MapperNode]
 ) -> None:
-    """All parameters that a launch argument may leave empty, including `config_file`."""
+    """Empty texts are accepted for all parameters that a launch argument may leave empty, including `config_file`."""
     empty = {
         parameter: ""
         for parameter in launch_file.PARAMETERS.values()
@@ -150,7 +150,8 @@ def test_an_argument_overrides_the_parameter_file_whatever_sections_that_has(
 
 
 def test_launch_waits_until_a_map_is_saved(launch_file: ModuleType, tmp_path: Path) -> None:
-    """From Ctrl-C to SIGTERM; SIGKILL follows 5 s later, as in launch: 10 s were not enough on a busy machine."""
+    """Launch waits at least 60 s from SIGINT to SIGTERM, so that a map can be saved; SIGKILL follows 5 s later. 10 s
+    were not enough on a busy machine."""
     commands(launch_file, defaults(launch_file) | {"embed_mapper": "false", "rviz": "false"}, tmp_path)
     given = {call.kwargs["executable"]: call.kwargs for call in launch_file.Node.call_args_list}
     assert set(given) == {"slam_node", "mapper_node"}
@@ -159,7 +160,7 @@ def test_launch_waits_until_a_map_is_saved(launch_file: ModuleType, tmp_path: Pa
 
 @pytest.mark.parametrize(("names", "count"), [("", "1"), ("red,blue", "2")])
 def test_the_bag_waits_for_each_slam_node(launch_file: ModuleType, tmp_path: Path, names: str, count: str) -> None:
-    """RViz receives the clouds before any of them."""
+    """The player waits for subscribers named slam_node only, since RViz receives the clouds before any of them."""
     value = defaults(launch_file) | {"bag": "drive.mcap", "robots": names, "rviz": "false"}
     words = dict(commands(launch_file, value, tmp_path))["bag_player"]
     assert words[words.index("--for") + 1] == "slam_node"
@@ -279,7 +280,7 @@ def commands(launch_file: ModuleType, value: dict[str, str], folder: Path) -> li
 
 
 def test_paths_may_begin_at_home(launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No shell expands text after `:=`: the files of `params_file:=~/mine.yaml` and of `bag:=~/...` were not found."""
+    """`~` is expanded in `params_file:=~/mine.yaml` and in the bag's path: no shell expands text after `:=`."""
     monkeypatch.setenv("HOME", str(tmp_path))
     file = write({}, tmp_path / "mine.yaml")
     value = defaults(launch_file) | {"bag": "~/drive.mcap", "params_file": "~/mine.yaml", "rviz": "false"}

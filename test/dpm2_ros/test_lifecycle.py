@@ -137,7 +137,7 @@ def test_rounds_keep_every_map_and_leave_nothing(
 
 @pytest.mark.slow
 def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
-    """After activation, it continues where it was."""
+    """While inactive, the node accepts no cloud and keeps the map; after activation, it continues where it was."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
     lidar = Lidar(m.harness, drive)
     assert m.state == "unconfigured"
@@ -165,7 +165,7 @@ def test_inactive_it_takes_no_cloud_and_keeps_the_map(ros: Callable[..., Any], d
 def test_time_that_goes_back_while_it_is_inactive_is_noticed(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """As when a simulation or a bag starts again: the odometry starts again, too."""
+    """If a simulation or a bag starts again while the node is inactive, the odometry starts again, too."""
     m = Managed(ros(*FAST, f"ros.map_directory:={tmp_path}"), SlamNode)
     lidar = Lidar(m.harness, drive)
     assert m.change(CONFIGURE, ACTIVATE)
@@ -178,8 +178,8 @@ def test_time_that_goes_back_while_it_is_inactive_is_noticed(
 
 
 def test_a_clock_that_is_asked_for_while_it_is_active_goes_on(ros: Callable[..., Any]) -> None:
-    """`ros2 param set use_sim_time true`: the clock stopped at the next deactivation. Clouds without a stamp, which
-    are stamped with its time, were then rejected as repeated."""
+    """After `ros2 param set use_sim_time true`, the clock follows /clock after a deactivation, too. Previously it
+    stopped, and clouds without a stamp, which are stamped with its time, were rejected as repeated."""
     managed = Managed(ros(*FAST), SlamNode)
     harness, clock = managed.harness, managed.harness.publisher(Clock, "/clock")
     value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
@@ -202,7 +202,8 @@ def test_a_clock_that_is_asked_for_while_it_is_active_goes_on(ros: Callable[...,
 def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """Its keyframes are in the same map once the mapper is active again, each once; a new map gets the whole drive."""
+    """Keyframes made meanwhile are in the same map once the mapper is active again, each once; a new map gets the whole
+    drive."""
     apart = ("ros.embed_mapper:=false", "slam.keyframes.distance:=1.0", f"ros.map_directory:={tmp_path}")
     harness = ros(*FAST, *apart)
     m, lidar = Managed(harness, MapperNode), Lidar(harness, drive)
@@ -239,7 +240,7 @@ def test_a_robot_keeps_what_it_makes_while_its_mapper_is_inactive(
 def test_what_cannot_be_configured_stays_unconfigured(
     ros: Callable[..., Any], tmp_path: Path, kind: type[SlamNode] | type[MapperNode], wrong: str
 ) -> None:
-    """It leaves no thread, no topic and no empty map."""
+    """A failed configuration leaves no thread, no topic and no empty map."""
     given = (wrong, "slam.loops.descriptors:=true", "input.images:=false")
     m = Managed(ros(*given, f"ros.map_directory:={tmp_path / 'maps'}"), kind)
     before, entities = held()[0], m.entities
@@ -291,7 +292,7 @@ def test_who_has_asked_before_the_cleanup_is_answered(
 
 @pytest.mark.slow
 def test_the_executable_waits_and_a_signal_ends_it(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """It leaves no map, since none was begun. For both executables, from nothing to a map and back: test_launch.py."""
+    """A node that is stopped while unconfigured leaves no map. test_launch.py covers both executables with a map."""
     harness = ros()
     options = ["--lifecycle", "--ros-args", "-p", f"ros.map_directory:={tmp_path / 'maps'}"]
     process = harness.start("slam_node", options, tmp_path / "log")

@@ -56,7 +56,7 @@ def running(harness: Harness, lidar: Any, folder: Path, *parameters: str) -> Ite
 
 
 def test_slam_node_saves_its_map_when_stopped(ros: Callable[..., Any], drive: Any, tmp_path: Path) -> None:
-    """Two SIGINT are sent, as by `ros2 launch`."""
+    """`ros2 launch` sends two SIGINT: the map is saved nevertheless."""
     harness = ros()
     odometry = harness.hear(Odometry, "/dpm2/odom")
     lidar = harness.publisher(PointCloud2, naming.POINTS)
@@ -74,7 +74,7 @@ def test_slam_node_saves_its_map_when_stopped(ros: Callable[..., Any], drive: An
 
 
 def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
-    """This holds from the moment Python runs the entry point; no map is begun."""
+    """A signal ends the process cleanly from the moment Python runs the entry point; no map is begun."""
     saving = ["--ros-args", "-p", f"ros.map_directory:={tmp_path / 'map'}"]
     process = start("slam_node", saving, ros_environment(domain), tmp_path / "log")
     while not _handles_sigint(process) and process.poll() is None:
@@ -86,7 +86,7 @@ def test_stopped_while_it_imports(tmp_path: Path, domain: int) -> None:
 
 
 def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """Its node exists, but does not subscribe yet."""
+    """A signal ends the process cleanly when its node exists, but does not subscribe yet."""
     harness = ros()
     process = harness.start("slam_node", [], tmp_path / "log")
     harness.wait(lambda: "slam_node" in harness.node.get_node_names(), "the node")
@@ -96,7 +96,7 @@ def test_stopped_while_it_loads_the_network(ros: Callable[..., Any], tmp_path: P
 
 
 def test_a_second_signal_that_comes_while_python_ends(bag: Path, tmp_path: Path, domain: int) -> None:
-    """The process ends within hundreds of ms; signals every 5 ms arrive in each phase of it."""
+    """The exit takes hundreds of ms; signals every 5 ms arrive in each phase of it, and the exit code stays 0."""
     log = tmp_path / "log"
     process = start("bag_player", [str(bag), "--wait", "90"], ros_environment(domain), log)
     try:
@@ -124,8 +124,8 @@ for _ in range(2000):
 
 
 def test_a_signal_may_meet_each_moment_of_a_wait() -> None:
-    """With `threading.Event` one wait of some hundred did not return, with `queue.SimpleQueue` one of some thousand:
-    `bag_player` waits a hundred times per second."""
+    """`Stop.wait` returns whenever a signal arrives. With `threading.Event` one wait of some hundred did not return,
+    with `queue.SimpleQueue` one of some thousand; `bag_player` waits a hundred times per second."""
     subprocess.run([sys.executable, "-c", STOPPED], check=True, timeout=120)
 
 
@@ -145,8 +145,8 @@ def test_who_waits_is_woken_and_later_waits_end_at_once() -> None:
 
 @pytest.mark.parametrize("given", [{}, {"ROS_LOG_DIR": "/proc"}])
 def test_without_a_folder_for_logs_it_says_what_to_set(domain: int, given: dict[str, str]) -> None:
-    """As in a systemd unit, which has no HOME; or with a folder that cannot be written, as after a start as root. /proc
-    is a folder that nobody can write."""
+    """The error names ROS_LOG_DIR and HOME if there is no HOME, as in a systemd unit, or if the folder cannot be
+    written, as after a start as root. /proc is a folder that nobody can write."""
     environment = {name: text for name, text in ros_environment(domain).items() if name not in ("HOME", "ROS_LOG_DIR")}
     environment |= given
     command = [sys.executable, "-m", "dpm2_ros.executables", "bag_player"]
@@ -158,7 +158,8 @@ def test_without_a_folder_for_logs_it_says_what_to_set(domain: int, given: dict[
 def test_arguments_that_a_node_does_not_know_are_errors(
     run: Callable[..., subprocess.CompletedProcess[str]],
 ) -> None:
-    """Without `--ros-args` every parameter was silently ignored. Both nodes parse their arguments in the same way."""
+    """Previously, every parameter without `--ros-args` was silently ignored. Both nodes parse their arguments in the
+    same way."""
     done = run("slam_node", "-p", "slam.registration:=geometric")
     assert (done.returncode, done.stdout) == (2, "")
     assert "error: unknown argument -p; those of ROS, such as -p, come after --ros-args" in done.stderr
@@ -174,7 +175,7 @@ def _handles_sigint(process: subprocess.Popen[bytes]) -> bool:
 
 
 def test_what_cannot_listen_leaves_no_map(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """Its map had been opened before."""
+    """If subscribing fails, the map file that was opened before is removed."""
     ros(f"ros.map_directory:={tmp_path / 'map'}", f"input.second_points_topic:={naming.POINTS}")
     with pytest.raises(UsageError, match="is that of the first LiDAR"):
         SlamNode()
@@ -194,7 +195,8 @@ def test_a_map_that_cannot_be_saved_at_the_end_is_an_error(rig: Callable[..., Ri
 def test_a_map_file_that_is_incomplete_at_the_end_is_exit_code_1(
     ros: Callable[..., Any], drive: Any, tmp_path: Path
 ) -> None:
-    """Another program locks it, with the effect of a full disk; only the folder that cannot be made was reported."""
+    """Another program locks the map file, which acts as a full disk. Previously, only the folder that cannot be made
+    was reported."""
     harness, path = ros(), tmp_path / "town.dpm2map"
     (tmp_path / "map").write_text("in the way")
     keyframes = harness.hear(Odometry, "/dpm2/keyframe_odom", KEEP_ALL)
@@ -251,7 +253,8 @@ def test_a_drive_through_player_slam_node_and_mapper_node(
 def test_replay_is_checked_by_what_arrived(
     bag: Path, drive: Any, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As `make demo` does it: all checks pass; if a pose is missing or events are in a wrong order, they fail."""
+    """This is what `make demo` does. All checks pass; if a pose is missing or events are in a wrong order, they
+    fail."""
     parameters = {"ros.map_period": 0.5, "slam.keyframes.distance": 2.0, **QUICK}
     source = BagSource(bag, InputSettings(images=False))
     for name, value in ros_environment(domain).items():  # replay would draw a domain, which another test may use
@@ -281,7 +284,8 @@ def test_replay_is_checked_by_what_arrived(
 
 
 def test_ros_ends_in_time_or_the_process_does(domain: int) -> None:
-    """Also if the code that hangs holds Python's lock, so that neither signals nor other threads are handled."""
+    """The process ends even if the code that hangs holds Python's lock, so that neither signals nor other threads
+    run."""
     stuck = "ctypes.PyDLL(None).sleep(120)"
     code = f"""
 import ctypes

@@ -45,7 +45,7 @@ def offering(node: Node, kind: str) -> Node:  # noqa: F811
 
 
 def test_a_missing_package_is_named(node: Callable[..., Node]) -> None:  # noqa: F811
-    """A driver that sends the type cannot run without the package, so the graph's answer is made up here."""
+    """The driver cannot run without the package either, so the graph's answer is made up here."""
     if message_type(CUSTOM) is not None:
         pytest.skip("the package is installed")
     made = MatchedSubscription(offering(node(), CUSTOM), PointCloud2, "/livox/lidar", print, RosSettings())
@@ -59,7 +59,8 @@ def test_other_types_are_left_alone(node: Callable[..., Node]) -> None:  # noqa:
 
 
 def test_points_of_a_custom_message_arrive(node: Callable[..., Node]) -> None:  # noqa: F811
-    """From the driver's type, over DDS, into a frame with the time of each point; a PointCloud2 follows it."""
+    """The driver's message is received over DDS and becomes a frame with the time of each point; a PointCloud2 may
+    follow."""
     kind: Any = message_type(CUSTOM)
     if kind is None:
         pytest.skip("livox_ros_driver2 is not installed")
@@ -93,8 +94,8 @@ def recorded(folder: Path) -> Path:
 def test_a_recording_is_played_in_lockstep(
     ros: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was rejected, because no node made an odometry of its clouds. If the package is not installed, the bytes
-    are sent under another type."""
+    """A recording of CustomMsg can be played in lockstep; previously it was rejected. If the package is not installed,
+    the bytes are sent under another type."""
     monkeypatch.setattr(bag_player, "message_type", lambda kind: message_type(kind) or PointCloud2)
     kind, n, seen = message_type(CUSTOM) or PointCloud2, ros().node, list[int]()
     odometry = n.create_publisher(Odometry, "dpm2/odom", 10)

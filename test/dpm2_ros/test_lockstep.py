@@ -131,7 +131,8 @@ def test_lockstep_builds_the_frames_of_dpm2_run(ros: Callable[..., Any], bag: Pa
 def test_a_gap_is_no_clock_that_was_set(
     ros: Callable[..., Any], bag: Path, tmp_path: Path, ahead: int, gap: int
 ) -> None:
-    """In lockstep, time passes in a gap only by /clock. If only the stamps jump by so many ms, a clock was set."""
+    """A gap in a recording is not taken for a clock that was set, since /clock shows its duration. If only the stamps
+    jump by so many ms, a clock was set."""
     types, source = get_typestore(Stores.ROS2_JAZZY), open_bag(bag)
     kinds = {topic: source.types[topic] for topic in (naming.POINTS, f"{naming.KITTI.truth}/odom")} | {naming.IMU: IMU}
     set_at = BagSource(bag).stamps.tolist()[8]
@@ -200,7 +201,7 @@ def test_lockstep_joins_the_clouds_of_two_lidars_as_dpm2_run_does(
 
 
 def test_a_node_whose_answer_is_lost_is_asked_again(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
-    """The request is which clouds are those of its second LiDAR."""
+    """If the node's answer about the topic of its second LiDAR is lost, the player asks again."""
     recording, asked, never = with_second(bag, tmp_path / "two", 0), [], Future()
     node = ros().add(Listener(SECOND, start_parameter_services=False))
 

@@ -22,14 +22,15 @@ def count(stamps: list[int], numbers: list[int] | None = None) -> int:
 
 @given(arrived=st.sets(st.integers(0, 300), min_size=1), first=st.integers(1, 10**6), seed=st.integers(0, 9))
 def test_numbers_are_exact_whatever_the_stamps_say(arrived: set[int], first: int, seed: int) -> None:
-    """Losses are counted from the first received message to the last; numbers before the first do not count."""
+    """Losses are counted from the first received message to the last; earlier numbers do not count."""
     kept = sorted(arrived)
     stamps = np.cumsum(np.random.default_rng(seed).integers(0, 10**10, kept[-1] + 1))[kept]
     assert count(stamps.tolist(), [first + n for n in kept]) == kept[-1] - kept[0] + 1 - len(kept)
 
 
 def test_another_publisher_begins_anew() -> None:
-    """The first publisher had sent some messages before the subscription; the second is received from its first on."""
+    """A new publisher restarts the count. The first one had sent messages before the subscription; the second is
+    received from its first message on."""
     stamps = [n * PERIOD for n in range(6)]
     assert count(stamps, [7, 8, 10, 1, 2, 3]) == 1
     assert count(stamps, [7, 8, 10, 4, 5, 6]) == 1 + 3
@@ -49,7 +50,7 @@ def test_several_publishers_have_no_common_numbers() -> None:
 
 @pytest.mark.parametrize("missing", [{10}, {10, 11, 12}, {9, 15, 16, 40}, set(range(20, 35)), set(range(8, 60, 3))])
 def test_the_rhythm_of_the_stamps_tells_what_is_missing(missing: set[int]) -> None:
-    """The stamps jitter as those of a spinning LiDAR: by a twentieth of a period."""
+    """Losses are detected although the stamps jitter as those of a spinning LiDAR: by a twentieth of a period."""
     jitter = np.random.default_rng(0).integers(-PERIOD // 20, PERIOD // 20, 60)
     stamps = [n * PERIOD + int(jitter[n]) for n in range(60) if n not in missing]
     assert count(stamps) == len(missing - {59})
@@ -75,7 +76,7 @@ def test_nothing_is_said_before_the_rhythm_is_known() -> None:
 
 
 def test_what_is_rejected_is_not_lost() -> None:
-    """Its number is known; messages that are missing before it are still counted as lost."""
+    """A rejected message's number is known, so it is not lost; messages that are missing before it are."""
     losses = Losses()
     losses.add(0, 1)
     losses.skip(2)

@@ -93,7 +93,7 @@ def test_a_map_file_is_written_as_the_drive_goes_on(mapper: Any, tmp_path: Path)
 
 
 def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[..., Any], tmp_path: Path) -> None:
-    """The file could not be made when the drive began, but the node ended as if no file had been requested."""
+    """The node must report this error. Previously, it ended as if no file had been requested."""
     (tmp_path / "full").write_text("no folder")
     harness = ros(f"ros.map_file:={tmp_path / 'full' / 'town.dpm2map'}")
     harness.mapper = harness.add(MapperNode())
@@ -108,7 +108,7 @@ def test_a_map_that_ends_with_neither_file_nor_folder_is_an_error(ros: Callable[
 def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
     mapper: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The node that publishes the grid reports it once, as the export does: the grid shows the walls of both floors."""
+    """The node warns once, as the export does: the grid contains the walls of both floors."""
     grids, log = mapper.hear(OccupancyGrid, "/dpm2/grid", LAST_ONE), list[str]()
 
     def said() -> list[str]:
@@ -129,7 +129,7 @@ def test_a_grid_of_storeys_that_lie_over_each_other_is_said_to_be_of_no_use(
 
 
 def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
-    """It starts a trajectory of its own, without an edge to the first one; the ids continue."""
+    """A restarted odometry begins a trajectory without an edge to the first one; the ids continue."""
     for id in (0, 1, 2, 0):
         mapper.send(id, se3.exp([0, 0, 0, 5.0 * id, 0, 0]), points(id))
     mapped(mapper, 4)
@@ -139,8 +139,8 @@ def test_a_restarted_odometry_goes_on_in_the_same_map(mapper: Any) -> None:
 
 
 def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
-    """It is sent only once a keyframe of the robot is in the map. Before, the drive may be any, and the mapper may have
-    been restarted: it sent the identity until then."""
+    """map -> odom is sent only once a keyframe of the robot is in the map. Before that, the mapper may have been
+    restarted, and the drive may be any; previously it then sent the identity."""
     move, heard = placed(mapper)
     move(33)
     move(34, frame="no name")
@@ -156,7 +156,7 @@ def test_map_to_odom_goes_out_with_every_odometry(mapper: Any) -> None:
 
 
 def test_robots_whose_odometry_frames_have_one_name_are_reported(mapper: Any) -> None:
-    """map -> odom would switch between the transforms of the two robots."""
+    """Otherwise map -> odom would alternate between the transforms of the two robots."""
     told, keyframe = mapper.diagnostics, Keyframe(0, 1000, 0, np.eye(4), points(0))
     wires = {robot: Wires(mapper, f"/{robot}") for robot in ("red", "blue")}
     for count, (robot, its) in enumerate(wires.items()):
@@ -243,7 +243,8 @@ def test_descriptors_of_other_weights_are_made_anew(mapper: Any) -> None:
 
 
 def test_topics_that_bring_nothing_are_forgotten(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand namespaces cannot make a thousand subscriptions; a robot that appears after them is received."""
+    """Subscriptions are limited, and topics without a publisher are released: a robot that appears later is still
+    received."""
     monkeypatch.setattr(mapper_node, "PATIENCE", 1.0)
     topics = [f"/x{n}/dpm2/keyframe_odom" for n in range(80)]
     many = rclpy.create_node("many", use_global_arguments=False)

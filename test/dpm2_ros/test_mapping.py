@@ -50,7 +50,8 @@ def test_only_the_thread_of_the_map_gives_way() -> None:
 
 
 def test_the_path_of_a_long_drive_is_soon_made() -> None:
-    """It holds Python's lock, once per second: 2,000 keyframes, with all poses and stamps in the right order."""
+    """The path of 2,000 keyframes, made once per second, holds Python's lock only briefly, and all poses and stamps are
+    correct."""
     poses, best = se3.exp(np.arange(2000)[:, None] * np.array([0.001, 0.0, 0.02, 0.5, 0.0, 0.01])), np.inf
     for _ in range(3):
         begin = time.thread_time()
@@ -66,8 +67,8 @@ def test_the_path_of_a_long_drive_is_soon_made() -> None:
 def test_a_loop_after_which_the_robot_stands_still_counts(
     mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, saved: bool
 ) -> None:
-    """A solution that another process had computed for a large graph was applied only with the next keyframe. If the
-    robot had come home and stopped, its pose and the map of ~/save_map stayed without that loop."""
+    """The solution of another process for a large graph is applied without a further keyframe. Previously, if the robot
+    had come home and stopped, its pose and the map of ~/save_map stayed without that loop."""
     monkeypatch.setattr("dpm2_core.slam.graph.pose_graph.SHORT", 1)  # otherwise small graphs are solved immediately
     move, transforms = placed(mapper)
     send_all(mapper, 0, 1, 2)
@@ -91,8 +92,9 @@ def test_a_loop_after_which_the_robot_stands_still_counts(
 def test_a_map_file_catches_up_while_the_robot_stands(
     mapper: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The file was written only with the next keyframe. What a full disk had kept out of it was lost if a robot that
-    charged was then switched off, even hours after there was room. A lock for over 5 s acts as a full disk."""
+    """What a full disk kept out of the file is written once there is room. Previously, it was written only with the
+    next keyframe, and lost if a charging robot was switched off. Another program's lock acts as a full disk after 5
+    s."""
     monkeypatch.setattr("dpm2_ros.mapping.RETRY", 0.2)
     send_all(mapper, 0)
     mapped(mapper, 1)
@@ -108,8 +110,8 @@ def test_a_map_file_catches_up_while_the_robot_stands(
 
 
 def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once 10,000 loops waited for it in DDS, each later keyframe with loops delayed the map by 0.1 s and was an
-    internal error, after which neither path nor map nor grid was published for it."""
+    """A hung subscriber delays nothing. Previously, with 10,000 loops waiting for it in DDS, each later keyframe with
+    loops delayed the map by 0.1 s and was an internal error, and no path, map or grid was published for it."""
     hung = rclpy.create_node("hung", use_global_arguments=False)  # its callbacks are never called
     hung.create_subscription(DiagnosticArray, "/dpm2/loop_candidates", lambda message: None, KEEP_ALL)
     mapper.wait(lambda: mapper.mapper.count_subscribers("/dpm2/loop_candidates"), "the one that hangs")
@@ -126,7 +128,8 @@ def test_who_listens_to_loops_and_hangs_holds_up_nothing(mapper: Any, monkeypatc
 
 
 def test_keyframes_come_to_their_turn_while_a_large_map_is_built(mapper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Building the map of 2,000 keyframes takes 6 s, during which the thread of the map added no keyframes."""
+    """Keyframes are added while a large map is built. The map of 2,000 keyframes takes 6 s, during which none was added
+    before."""
     end, begun = time.monotonic() + 30, threading.Event()
 
     def large(*given: Any) -> Iterator[None]:
@@ -170,8 +173,8 @@ def test_what_takes_long_to_make_is_made_less_often(mapper: Any) -> None:
 
 
 def test_what_nobody_waits_for_any_more_is_not_built_on(mapper: Any) -> None:
-    """Otherwise, the next subscriber received the map of the time when the last one had left, and until then it stayed
-    in memory. It is built anew for the next subscriber, even if nothing has changed since."""
+    """If the last subscriber leaves, a partly built map is dropped, and built anew for the next one, even if nothing
+    has changed. Otherwise, the next subscriber would receive an old map, which would stay in memory until then."""
     publisher, begun = mapper.publisher(PathMsg, "/shown"), []
 
     def make() -> Generator[None, None, PathMsg]:
@@ -215,7 +218,8 @@ def test_a_map_that_is_replaced_while_it_is_built_is_not_shown(mapper: Any, monk
 
 
 def test_what_is_made_of_as_much_as_its_time_allows_goes_on_after_its_period(mapper: Any) -> None:
-    """The grid of a loaded map had a part of 0.3 s every 1.2 s, no longer every 0.5 s: Nav2 waited twice as long."""
+    """A part that used up its time is followed by the next after the period. Previously, the grid of a loaded map had a
+    part of 0.3 s every 1.2 s instead of 0.5 s: Nav2 waited twice as long."""
     publisher = mapper.publisher(PathMsg, "/shown")
     mapper.hear(PathMsg, "/shown")
     mapper.wait(publisher.get_subscription_count, "the subscription")
@@ -250,7 +254,8 @@ class Failing(GuardedNode):
 
 
 def test_work_that_fails_by_a_bug_is_answered(ros: Callable[..., Any]) -> None:
-    """The client waited forever. The node counts the failure and reports it in /diagnostics."""
+    """The client gets an answer, and the node counts the failure and reports it in /diagnostics. Previously, the client
+    waited forever."""
     harness = ros()
     node = harness.add(Failing())
     answer = harness.call(Trigger, "/failing/work")

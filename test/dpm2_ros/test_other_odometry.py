@@ -139,8 +139,8 @@ def test_late_stopping_and_coming_back(robot: Callable[..., Robot], drive: Any) 
 def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
     robot: Callable[..., Robot], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If its samples always arrived right after the clouds, and none had been there for the first clouds, none was ever
-    used: clouds no longer waited, and without that wait nothing was known at their stamps."""
+    """If samples always arrive right after the clouds, clouds still wait for them. Previously, if none had been there
+    for the first clouds, clouds no longer waited, and none was ever used."""
     monkeypatch.setattr("dpm2_ros.other_odometry.PATIENCE", 1)
     r = robot("topic")
     r.go(0, wheels=False)
@@ -158,8 +158,8 @@ def test_one_that_begins_after_the_clouds_is_awaited_as_any_other(
 
 
 def test_map_to_odom_waits_for_what_it_tells_of_the_end_of_a_sweep(robot: Callable[..., Robot], drive: Any) -> None:
-    """For clouds that are stamped at their end, an odometry at 10 Hz had reached only their middle when the pose was
-    ready. map -> odom was then never sent, and an odometry in use was reported as left out."""
+    """For clouds stamped at their end, an odometry at 10 Hz may have reached only their middle when the pose is ready:
+    map -> odom then waits. Previously, it was never sent, and an odometry in use was reported as left out."""
     r = robot("topic")
     points = scan(pose(0))  # the robot stands still
     columns = {name: points[:, i] for i, name in enumerate(("x", "y", "z"))}
@@ -180,7 +180,7 @@ def test_map_to_odom_waits_for_what_it_tells_of_the_end_of_a_sweep(robot: Callab
 
 
 def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any) -> None:
-    """Another frame, or values that are not finite: they are counted, and the drive continues."""
+    """Messages with another frame or with values that are not finite are counted, and the drive continues."""
     r = robot("topic")
     r.go(0, 1)
     good, nan = np.eye(4), np.full((6, 6), np.nan)
@@ -201,7 +201,7 @@ def test_what_is_no_odometry_is_rejected(robot: Callable[..., Robot], drive: Any
 def test_a_topic_without_odometry_of_use_is_named(
     robot: Callable[..., Robot], drive: Any, frame: str, child: str
 ) -> None:
-    """No missing transform is reported: TF is not involved."""
+    """The topic is named; no missing transform is reported, since TF is not involved."""
     r = robot("topic")
     r.topic.publish(edge_to_msg(np.eye(4), np.eye(6), drive.stamp(0), frame, child))
     r.wait(lambda: list(r.node.rejections.values()) == [1], "the rejection")
@@ -210,7 +210,8 @@ def test_a_topic_without_odometry_of_use_is_named(
 
 
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
-    """With 1000 m2 per cloud, "outweighed: 0.00 m, 0.0 deg from the motion of the scans" was reported wrongly."""
+    """With 1000 m2 per cloud it is reported as left out. Previously, "outweighed: 0.00 m, 0.0 deg from the motion of the
+    scans" was reported of a correct odometry."""
     r = robot("topic")
     r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
     r.go(*range(5))
@@ -220,8 +221,8 @@ def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot
 
 
 def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], drive: Any) -> None:
-    """The scan is registered at that time. At the stamp, here that of the first point, the distances of an accelerating
-    robot were too short; here the wheels begin between the two times."""
+    """The scan is registered at that time. With the stamp, here of the first point, the distances of an accelerating
+    robot were too short. In this test, the wheels begin between the two times."""
     r = robot("tf")
     for stamp in (drive.stamp(0) + 40_000_000, drive.stamp(0) + 60_000_000):
         r.tf.publish(TFMessage(transforms=[transform_to_msg(np.eye(4), stamp, "odom", "base_link")]))
@@ -249,7 +250,8 @@ def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], dr
     ids=["own, inverted", "another's, inverted", "mapper apart", "leaf, no odom", "apart, no odom", "apart, no map"],
 )
 def test_every_frame_has_one_parent(robot: Callable[..., Robot], parameters: tuple[str], expected: set) -> None:
-    """`publish_tf_odom` is for odom -> base only: with another odometry it separated the tree between map and odom."""
+    """`publish_tf_odom` controls odom -> base only; previously, with another odometry, it separated the tree between
+    map and odom."""
     r = robot(*parameters)
     r.go(0, 1, 2, wheels=parameters[0] == "tf")
     r.wait(lambda: set(r.links()) == expected and min(map(len, r.links().values())) >= 2, f"{expected}")

@@ -76,7 +76,8 @@ def test_ros2_run_starts_the_console_script_of_its_own_environment(wheel: zipfil
 
 
 def test_dpm2_is_on_the_path_of_a_workspace(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
-    """As colcon installs: console scripts in lib/dpm2_ros for `ros2 run`, and its environment has bin on PATH."""
+    """colcon installs console scripts in lib/dpm2_ros for `ros2 run`; its environment has bin on PATH, where dpm2
+    is."""
     source = Path(str(wheel.filename)).parent / "source"
     command = [sys.executable, "setup.py", "-q", "install", "--prefix", str(tmp_path), "--no-compile"]
     command += ["--single-version-externally-managed", "--record", str(tmp_path / "record")]

@@ -62,7 +62,8 @@ def test_every_setting_is_declared_described_and_read_only(load: Load) -> None:
 
 
 def test_some_change_while_a_node_runs(load: Load) -> None:
-    """One at a time or together, all or none; invalid values are rejected with the reason, as at the start."""
+    """Parameters change one at a time or together, all or none; invalid values are rejected with the reason, as at the
+    start."""
     config, node = load("ros.map_period:=3.0")
     seen: list[NodeConfig] = []
     follow_changes(node, config, seen.append)
@@ -127,7 +128,7 @@ def test_parameters_override_the_file(load: Load, tmp_path: Path) -> None:
 
 
 def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None:
-    """Parameter files and launch files pass empty texts."""
+    """Parameter files and launch files pass empty texts for settings that are not set."""
     empty = [name for name, info in flat_fields(NodeConfig) if info.get_default(call_default_factory=True) == ""]
     config, node = load("config_file:=''", *(f"{name}:=''" for name in empty))
     assert config == NodeConfig()
@@ -135,7 +136,8 @@ def test_empty_texts_are_defaults_where_the_default_is_empty(load: Load) -> None
 
 
 def test_what_was_dumped_can_be_loaded(load: Load, tmp_path: Path) -> None:
-    """`ros2 param dump` writes null for a setting without a value, which the parser of ROS reads as a string."""
+    """`ros2 param dump` writes null for a setting without a value, which ROS reads as a string; it is accepted as
+    unset."""
     node = load()[1]
     file = tmp_path / "dump.yaml"
     dumped: dict[str, Any] = {}
@@ -151,7 +153,7 @@ def test_what_was_dumped_can_be_loaded(load: Load, tmp_path: Path) -> None:
 
 
 def test_a_home_folder_is_meant_by_its_sign(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No shell expands `~` in parameters."""
+    """`~` is expanded, since no shell looks at parameters."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "settings.yaml").write_text("ros: {queue_depth: 5}\n")
     ros = load("config_file:='~/settings.yaml'", "ros.map_directory:='~/maps'", "ros.map_file:='~/town.dpm2map'")[0].ros
@@ -187,7 +189,7 @@ def test_mistakes_are_named(load: Load, parameter: str, message: str) -> None:
 
 
 def test_a_process_ends_with_2_and_one_line(run: Callable[..., subprocess.CompletedProcess[str]]) -> None:
-    """Here for an empty list, to which ROS gives no type; messages for other mistakes are tested above."""
+    """The error is one line, here for an empty list, to which ROS gives no type; other mistakes are tested above."""
     done = run("slam_node", "--ros-args", "-p", "input.T_lidar_cam:=[]")
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2
@@ -221,7 +223,7 @@ def test_a_preset_changes_what_is_not_given_and_shows_in_the_parameters(load: Lo
 
 
 def test_the_parameter_file_of_the_page_sets_what_it_names(load: Load, tmp_path: Path) -> None:
-    """As a reader copies it from docs/ros2.md."""
+    """The parameter file is used as a reader copies it from docs/ros2.md."""
     (block,) = re.findall(r"^```yaml\n(/\*\*:.*?)^```$", (DOCS.parent / "ros2.md").read_text(), re.M | re.S)
     file = tmp_path / "red.yaml"
     file.write_text(block)

@@ -46,7 +46,8 @@ def recording(tmp_path: Path) -> Path:
 def test_what_a_node_publishes_now_is_not_played_beside_it(
     ros: Callable[..., Any], recording: Path, capfd: pytest.CaptureFixture[str], runs: bool, asked: bool
 ) -> None:
-    """Otherwise, poses of the recording and of the node alternated, 16 m apart; a mapper took them for two robots."""
+    """Recorded topics that a node publishes now are left out, unless requested. Otherwise, two poses alternated, 16 m
+    apart, and a mapper took them for two robots."""
     harness = ros()
     heard = {topic: harness.hear(kind, topic) for topic, kind in KINDS.items()}
     if runs:

@@ -35,7 +35,8 @@ def all_gone(sent: int) -> Callable[[DiagnosticStatus], bool]:
 def test_started_at_the_same_moment_nothing_is_lost(
     ros: Callable[..., Any], bag: Path, drive: Any, tmp_path: Path
 ) -> None:
-    """The node subscribes only once it is ready: no cloud waits for an import. At high speed, drops are counted."""
+    """If player and node start at the same time, no cloud is lost, since the node subscribes only once it is ready. At
+    high speed, dropped clouds are counted."""
     harness = ros()
     diagnostics = harness.diagnostics
     arguments = ["--ros-args", "-p", "ros.map_directory:=''"]
@@ -68,7 +69,7 @@ def test_started_at_the_same_moment_nothing_is_lost(
 
 
 def test_losses_are_in_diagnostics(rig: Callable[..., Rig], drive: Any) -> None:
-    """The losses are real: while the executor is blocked, DDS keeps no more clouds than the queue depth."""
+    """Losses are counted: while the executor is blocked, DDS keeps no more clouds than the queue depth."""
     r = rig("ros.queue_depth:=2")
     r.send_and_wait(0)
     holding, going_on = threading.Event(), threading.Event()
@@ -99,7 +100,8 @@ def segments(process: subprocess.Popen[bytes]) -> list[int]:
 def test_the_dds_profile_is_used_unless_the_user_has_one(
     processes: list[Any], bag: Path, domains: Iterator[int], tmp_path: Path
 ) -> None:
-    """The user's profile may be named by either variable, or another variable may configure Fast DDS."""
+    """A profile of the user takes precedence, named by either variable; the same holds for a configuration by another
+    variable."""
     shipped = Path(__file__).parents[2] / "config" / "fastdds.xml"
     own = tmp_path / "own.xml"
     own.write_text(shipped.read_text().replace(str(SEGMENT), str(SEGMENT // 2)))

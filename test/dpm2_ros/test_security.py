@@ -71,7 +71,7 @@ APART = {
 def test_nodes_do_what_the_policy_allows(
     ros: Callable[..., Any], make: Any, managed: bool, parameters: tuple[str, ...], without: Graph
 ) -> None:
-    """All of it and nothing else, except for what that way of running the node leaves out."""
+    """A node does all that the policy allows and nothing else, except for what its mode of operation leaves out."""
     harness = ros("slam.loops.descriptors:=false", "slam.registration:=geometric", *parameters)
     made = make(managed)
     if managed:
@@ -83,7 +83,7 @@ def test_nodes_do_what_the_policy_allows(
 
 
 def test_the_player_does_what_the_policy_allows(ros: Callable[..., Any], bag: Path, tmp_path: Path) -> None:
-    """The bag is one that `dpm2 convert` makes of KITTI."""
+    """The player does all that the policy allows, with a bag that `dpm2 convert` makes of KITTI."""
     harness = ros()
     harness.start("bag_player", [str(bag), "--wait", "180", "--lockstep"], tmp_path / "log")
     expected = allowed("bag_player")

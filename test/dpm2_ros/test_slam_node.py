@@ -41,7 +41,7 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reli
 
 @pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
 def test_every_cloud_gives_its_pose(rig: Callable[..., Rig], drive: Any, reliable: bool) -> None:
-    """This includes a best-effort publisher, from which a reliable subscription would never receive a cloud."""
+    """Clouds of a best-effort publisher are received, too, which a reliable subscription would never receive."""
     r = rig("use_sim_time:=true", reliable=reliable)
     clock = r.harness.publisher(Clock, "/clock")
     r.wait(clock.get_subscription_count, "the subscription to /clock")
@@ -111,7 +111,8 @@ def test_the_map_is_bounded_and_built_only_for_listeners(
 
 
 def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], drive: Any) -> None:
-    """Built only for subscribers; a late one receives it immediately. House fronts are occupied, the street is free."""
+    """The grid is built only for subscribers; a late one receives it immediately. House fronts are occupied, the street
+    is free."""
     r = rig("ros.grid.resolution:=0.25", "ros.grid_max_cells:=200000")
     r.send_and_wait(0, 1)
     r.mapped(1)
@@ -141,7 +142,7 @@ def test_the_grid_is_latched_bounded_and_soon_there(rig: Callable[..., Rig], dri
 
 
 def test_it_is_silent_also_after_the_only_cloud(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not silent before that cloud: a driver may need long to start."""
+    """Before the first cloud, the node is not silent: a driver may need long to start."""
     monkeypatch.setattr("dpm2_ros.state.SILENT", 0.5)
     r = rig()
     states = r.harness.hear(String, "/dpm2/state", LATCHED)
@@ -194,7 +195,7 @@ def test_keyframes_that_no_mapper_has_received_are_counted(rig: Callable[..., Ri
 
 
 def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..., Rig], tmp_path: Path) -> None:
-    """A recorder or RViz receives them, but no mapper does."""
+    """A recorder or RViz receives the keyframes, but no mapper does: they are kept on the disk."""
     r, _, poses = mapped_elsewhere(rig, f"ros.map_directory:={tmp_path}")
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
@@ -209,7 +210,8 @@ def test_keyframes_stay_on_the_disk_whoever_else_has_heard_them(rig: Callable[..
 def test_keyframes_that_end_with_the_node_are_named(
     rig: Callable[..., Rig], tmp_path: Path, capfd: pytest.CaptureFixture[str], folder: str
 ) -> None:
-    """Without a mapper and without a usable folder, the keyframes were silently lost."""
+    """Keyframes that are lost when the node ends, without a mapper and without a usable folder, are reported;
+    previously they were lost silently."""
     (tmp_path / "file").touch()
     directory = tmp_path / folder if folder else "''"
     r = rig("ros.embed_mapper:=false", "slam.keyframes.distance:=0.5", f"ros.map_directory:={directory}")
@@ -224,7 +226,8 @@ def test_keyframes_that_end_with_the_node_are_named(
 
 
 def test_a_mapper_is_told_that_a_drive_is_over_that_it_has(rig: Callable[..., Rig]) -> None:
-    """Otherwise it continues to place the odometry of the next drive by that of the previous one."""
+    """Even if all keyframes have arrived, the mapper is informed of a drive's end. Otherwise it would place the
+    odometry of the next drive by that of the previous one."""
     r, received, poses = mapped_elsewhere(rig)
     r.send_and_wait(*range(6))
     r.wait(lambda: len({pose.child_frame_id for pose in poses}) >= 6, "every keyframe, however often")
@@ -256,7 +259,7 @@ def test_save_map_says_what_it_did(rig: Callable[..., Rig], drive: Any, tmp_path
 def test_clouds_are_processed_while_a_map_is_saved(
     rig: Callable[..., Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Saving a large map takes seconds."""
+    """Saving a large map takes seconds; clouds are processed meanwhile."""
     begun, may_end, save = threading.Event(), threading.Event(), ActiveMap.save
 
     def slow(self: ActiveMap, name: str = "") -> str:

@@ -66,7 +66,8 @@ SECOND = "input.second_image_topic:=/rear/image"
 
 
 def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second looks back. Without extrinsics it is left out, reported; late or silent, only its image is missing."""
+    """The second camera looks back. Without extrinsics it is left out and reported; if it is late or silent, only its
+    image is missing."""
     r, camera = with_camera(rig, PLACE, SECOND, "ros.sync_timeout:=1.0")
     rear = Camera(r, "/rear/image", "/rear/camera_info", "rear")
     frames, T = record_frames(r), se3.exp([0, 0, np.pi, 0, 0, 0]) @ AHEAD
@@ -102,7 +103,8 @@ def test_two_cameras_and_what_each_loss_costs(rig: Callable[..., Rig], monkeypat
 
 
 def test_two_cameras_of_one_frame_are_one_too_many(rig: Callable[..., Rig]) -> None:
-    """Drivers of stereo cameras may send them so: the extrinsics of the second camera are then unknown."""
+    """Drivers of stereo cameras may send the same frame for both: the second camera is left out, since its extrinsics
+    are unknown."""
     r, camera = with_camera(rig, PLACE, SECOND, "ros.sync_timeout:=1.0")
     rear = Camera(r, "/rear/image", "/rear/camera_info")
     frames = record_frames(r)
@@ -151,7 +153,8 @@ def test_extrinsics_come_from_tf_static(rig: Callable[..., Rig]) -> None:
 
 
 def test_two_lidars_are_one_scan(rig: Callable[..., Rig], drive: Any) -> None:
-    """Each sees one side of the street; the second is rotated and mounted to the right. Then it stops."""
+    """Each LiDAR sees one side of the street; the second is rotated and mounted to the right. When it stops, the drive
+    continues."""
     r = rig("input.second_points_topic:=/right", "ros.sync_timeout:=2.0", "input.vertical_angle_correction_deg:='0.0'")
     T = se3.exp([0, 0, -1.5, 0.3, -0.5, 0.1])
     publish_static(r, "lidar", "right", T)

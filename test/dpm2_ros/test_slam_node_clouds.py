@@ -32,7 +32,8 @@ from .conftest import pose, scan
 
 
 def test_times_that_the_motion_contradicts_are_said(rig: Callable[..., Rig], drive: Any) -> None:
-    """A driver de-skews its clouds, but still sends the times of their points, on a robot whose heading oscillates."""
+    """A driver de-skews its clouds but still sends the times of the points, on a robot whose heading oscillates: a
+    warning names the setting."""
     r = rig("input.images:=false")
     for n in range(14):
         points = scan(se3.exp([0, 0, 0.12 * np.sin(max(n - 3, 0) * np.pi / 6), 0, 0, 0]))
@@ -48,7 +49,7 @@ def test_times_that_the_motion_contradicts_are_said(rig: Callable[..., Rig], dri
 
 
 def test_each_part_of_a_sweep_has_a_pose_and_none_has_failed(rig: Callable[..., Rig], drive: Any) -> None:
-    """The driver sends a sweep in ten parts, before a reset and after it."""
+    """A driver sends a sweep in ten parts: each part gets a pose, before a reset and after it."""
     r = rig("input.images:=false")
     sent = []
     for n in range(4):
@@ -68,7 +69,8 @@ def test_each_part_of_a_sweep_has_a_pose_and_none_has_failed(rig: Callable[..., 
 
 
 def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None:
-    """Empty, of 50 points, all NaN, all zero, without x, cut short: each gets a pose, and the drive continues."""
+    """Clouds that are empty, of 50 points, all NaN, all zero, without x, or truncated get a pose each, and the drive
+    continues."""
     r = rig()
     r.send_and_wait(*range(5))
     good = decode_points(drive.cloud(5))[0]
@@ -94,7 +96,8 @@ def test_bad_clouds_among_good_ones(rig: Callable[..., Rig], drive: Any) -> None
 def test_a_bug_costs_its_cloud_and_is_a_warning(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bugs of the odometry were counted, but nothing warned of them, and each filled a page of the log."""
+    """A bug costs one cloud's pose and gives a warning. Previously, bugs were counted, but nothing warned of them, and
+    each filled a page of the log."""
     r = rig()
     r.send_and_wait(0)
     good = r.node.slam.odometry_step
@@ -112,7 +115,7 @@ def test_a_bug_costs_its_cloud_and_is_a_warning(
 
 
 def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Callable[..., Rig], drive: Any) -> None:
-    """As from a driver that sends millimeters: the odometry cannot start, which must be a warning."""
+    """If a driver sends millimeters, the odometry cannot start: this is a warning from the first cloud on."""
     r = rig()
     for n in range(3):
         points = decode_points(drive.cloud(n))[0] * np.float32(1000)
@@ -124,7 +127,8 @@ def test_clouds_without_a_point_in_range_are_a_warning_from_the_first(rig: Calla
 def test_clouds_that_are_not_of_this_drive_leave_it_alone(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In another frame, or unreadable with an arbitrary stamp: rejected, counted by reason, without a restart."""
+    """Clouds in another frame, or unreadable with an arbitrary stamp, are rejected, counted by reason, and cause no
+    restart."""
     monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 300.0)  # s: longer than any pause of the machine
     r = rig()
     r.send_and_wait(*range(3))
@@ -146,7 +150,8 @@ def test_clouds_that_are_not_of_this_drive_leave_it_alone(
 
 
 def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None:
-    """As from two robots without namespaces: poses 0.5 m off, alternating states, and no message gave the reason."""
+    """Two robots without namespaces publish on one topic. Previously, poses were 0.5 m off, states alternated, and no
+    message gave the reason."""
     r = rig()
     r.send_and_wait(0)
     assert "publishers" not in r.processed(1).message
@@ -160,7 +165,8 @@ def test_two_publishers_of_clouds_are_a_warning(rig: Callable[..., Rig]) -> None
 def test_another_lidar_on_the_topic_begins_another_drive(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The other LiDAR is rotated and elsewhere on the moving robot: its points were taken for the first one's."""
+    """Another LiDAR, rotated and elsewhere on the moving robot, starts a new drive. Previously, its points were taken
+    for the first one's."""
     monkeypatch.setattr("dpm2_ros.subscriptions.OTHER_FRAME", 0.0)
     T_base_rear = se3.exp([0.0, 0.0, np.pi, -1.5, 0.0, 0.0])
     r = rig("ros.base_frame:=base_link")
@@ -214,7 +220,8 @@ def test_time_that_goes_back_restarts_the_odometry_and_keeps_the_map(
 def test_a_clock_that_is_set_back_by_less_than_a_second_costs_nothing(
     rig: Callable[..., Rig], drive: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """By 0.5 s at 8 m/s: the clouds of that time were rejected, and the next was predicted 4 m too far back."""
+    """After a step of 0.5 s at 8 m/s, no cloud is lost. Previously, the clouds of that time were rejected, and the next
+    was predicted 4 m too far back."""
     r, half = rig(), drive.frames // 2
     r.send_and_wait(*range(half))
     back = 500_000_000
@@ -256,7 +263,7 @@ def test_clouds_that_stop_are_noticed(rig: Callable[..., Rig], monkeypatch: pyte
 
 
 def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: Callable[..., Any]) -> None:
-    """The message suggested to subscribe to the very same topic."""
+    """The error names the reliability. Previously, the message suggested to subscribe to the very same topic."""
     harness = ros("input.points_topic:=/points", "input.images:=false", "ros.reliability:=reliable")
     harness.publisher(PointCloud2, "/points", reliable=False)
     harness.add(SlamNode())
@@ -268,7 +275,8 @@ def test_a_lidar_whose_clouds_are_less_reliable_than_asked_for_is_reported(ros: 
 
 
 def test_other_sensors_that_are_less_reliable_than_asked_for_are_reported(ros: Callable[..., Any]) -> None:
-    """The messages were "no image yet" and "no fix yet", and there was none for an IMU."""
+    """The message names the reliability. Previously, it was "no image yet" and "no fix yet", and there was none for an
+    IMU."""
     topics = ("input.image_topic:=/image", "input.imu_topic:=/imu", "input.gnss_topic:=/fix", "ros.odom_topic:=/wheels")
     harness = ros(*topics, "ros.odom_source:=topic", "ros.reliability:=reliable")
     sensors = {"camera": (Image, "/image"), "imu": (Imu, "/imu"), "gnss": (NavSatFix, "/fix")}

@@ -36,8 +36,8 @@ def test_tf_can_be_switched_off(rig: Callable[..., Rig]) -> None:
 
 @pytest.mark.usefixtures("no_earlier_nodes")
 def test_two_publishers_that_place_the_lidar_otherwise_are_told(rig: Callable[..., Rig]) -> None:
-    """As from a robot description and a calibration: before the first cloud, the extrinsics were those received last,
-    and the pose of the base depended on them, without a message."""
+    """A warning is given if, for example, a robot description and a calibration differ. Previously, the extrinsics
+    received last before the first cloud were used without a message, and the pose of the base depended on them."""
     r = rig("ros.base_frame:=base_link")
     log = r.harness.hear(Log, "/rosout")
     r.wait(lambda: r.harness.found_by(r.node, "/rosout"), "the subscription to the log")
@@ -69,7 +69,8 @@ def test_the_base_is_the_root_of_tf_static(rig: Callable[..., Rig], drive: Any) 
 
 @pytest.mark.weights
 def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Rig], drive: Any) -> None:
-    """The network was trained on upright LiDARs: thus a robot can be localized in the map of another one."""
+    """A LiDAR that is mounted upside down gets the descriptors of an upright one, on which the network was trained.
+    Thus a robot can be localized in the map of another one."""
     T_base_lidar, network = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5]), load_network("small", 1)
     r = rig("slam.loops.descriptors:=true")
     publish_static(r, "base_link", "lidar", T_base_lidar)
@@ -86,7 +87,7 @@ def test_a_lidar_that_hangs_sees_what_one_that_stands_does(rig: Callable[..., Ri
 
 @pytest.mark.weights
 def test_the_network_is_told_how_a_lidar_hangs(rig: Callable[..., Rig], drive: Any) -> None:
-    """The odometry is the network's alone: its poses are level, and the base still starts at the origin."""
+    """With the network's odometry alone, whose poses are level, the base still starts at the origin."""
     T_base_lidar = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5])
     r = rig("slam.registration:=neural")
     publish_static(r, "base_link", "lidar", T_base_lidar)
@@ -101,7 +102,8 @@ def test_the_network_is_told_how_a_lidar_hangs(rig: Callable[..., Rig], drive: A
 
 @pytest.mark.weights
 def test_the_network_is_not_told_amid_a_drive_how_a_lidar_hangs(rig: Callable[..., Rig], drive: Any) -> None:
-    """If /tf_static arrived after the first cloud, level scans were compared with one upside down: 3.4 m off."""
+    """If /tf_static arrives after the first cloud, the mounting is not applied during the drive. Otherwise level scans
+    were compared with one upside down: 3.4 m off."""
     T_base_lidar = se3.exp([np.pi, 0.0, 0.0, 0.3, 0.0, 1.5])
     r = rig("slam.registration:=neural", "ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     for n in range(6):
@@ -118,7 +120,8 @@ def test_the_network_is_not_told_amid_a_drive_how_a_lidar_hangs(rig: Callable[..
 def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
     rig: Callable[..., Rig], drive: Any
 ) -> None:
-    """The driver's part of /tf_static comes first; the robot's part, with the base, comes three clouds later."""
+    """The driver's part of /tf_static arrives first; the robot's part, with the base, three clouds later. Then all
+    poses are published."""
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.1")
     keyframes, tf = r.harness.hear(Odometry, "/dpm2/keyframe_odom"), r.harness.hear(TFMessage, "/tf")
     r.wait(
@@ -146,7 +149,8 @@ def test_nothing_is_published_before_the_base_is_reachable_and_nothing_is_lost(
 def test_poses_kept_for_a_base_are_bounded(
     rig: Callable[..., Rig], drive: Any, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Then the drive begins anew: what is finally published is a whole drive from its first pose.
+    """If too many poses wait for the base, the drive begins anew: what is finally published is a whole drive from its
+    first pose.
 
     The log names the preset of each of the two drives, and none before it is known.
     """
@@ -194,7 +198,7 @@ def test_the_lidars_own_frame_is_the_base_where_tf_static_does_not_name_it(rig: 
 
 
 def test_stamps_of_another_clock_are_reported(rig: Callable[..., Rig]) -> None:
-    """A recording without /clock, or a sensor whose clock is not set: a warning shows both values."""
+    """For a recording without /clock, or a sensor whose clock is not set, a warning shows both values."""
     r = rig()
     r.send_and_wait(0, 1, 2)
     status = r.status("odometry", saying("tracking; clouds are stamped"), since=0)

@@ -78,7 +78,8 @@ def test_a_keyframe_that_is_never_sound_holds_up_the_others_for_seconds_only() -
 
 @pytest.mark.parametrize("claim", [(9, set()), (2, {5, 6, 7, 8})])
 def test_an_answer_that_claims_too_much_is_outweighed(claim: tuple[int, set[int]]) -> None:
-    """The mapper has 0, 1, 2 and 5; another sender claims, hundreds of times per second, that it has more."""
+    """The mapper has 0, 1, 2 and 5. Another sender claims, hundreds of times per second, that it has more: this is
+    ignored."""
     results = Acks()
     for tick in range(40):
         now = 0.1 * tick

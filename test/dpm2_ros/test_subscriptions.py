@@ -56,7 +56,8 @@ def raised(inputs: Inputs) -> float:
 
 
 def test_a_remapped_lidar_has_not_the_error_of_kittis(node: Callable[..., Node]) -> None:
-    """The setting still names KITTI's topic, but the clouds are received on another one."""
+    """If the LiDAR's topic is remapped from KITTI's, which the setting still names, KITTI's angle correction is not
+    applied."""
     made = inputs(node("/kitti/velo/pointcloud:=/ouster/points"))
     assert made.calibration.points_topic == "/ouster/points"
     assert raised(made) == 0
@@ -128,7 +129,7 @@ def test_compressed_images_come_on_a_topic_of_any_name(node: Callable[..., Node]
 
 
 def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node]) -> None:
-    """Its CameraInfo is expected next to the topic that its images really come from, whatever is set for the first."""
+    """Its CameraInfo is expected next to its real image topic after remapping, whatever is set for the first camera."""
     n = node("/rear/image:=/back/image/compressed", namespace="/red")
     made = inputs(n, image_topic="cam/image", camera_info_topic="/info", second_image_topic="/rear/image")
     assert [camera.topic for camera in made.calibration.cameras] == ["/red/cam/image", "/back/image/compressed"]
@@ -142,7 +143,7 @@ def test_a_second_camera_is_found_as_the_first_one_is(node: Callable[..., Node])
 
 
 def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
-    """The two topics are exchanged: a second application would undo that."""
+    """If a remapping exchanges two topics, it is applied once: a second application would undo it."""
     n = node("/a:=/b", "/b:=/a")
     assert inputs(n, points_topic="/a", images=False).calibration.points_topic == "/b"
     assert "/b" in {s.topic_name for s in n.subscriptions}
@@ -150,7 +151,7 @@ def test_a_remapping_is_applied_once(node: Callable[..., Node]) -> None:
 
 
 def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> None:
-    """It was latched, long before the subscription."""
+    """A latched CameraInfo that was sent long before the subscription is received."""
     n = node()
     n.create_publisher(CameraInfo, "/front/camera_info", LATCHED).publish(INFO)
     made = inputs(n, image_topic="/front/image")
@@ -161,7 +162,7 @@ def test_a_camera_info_that_was_sent_once_arrives(node: Callable[..., Node]) -> 
 
 
 def test_a_camera_info_that_cannot_be_used_replaces_none_that_can(node: Callable[..., Node]) -> None:
-    """This includes a CameraInfo from before the node was deactivated, as here."""
+    """An invalid CameraInfo does not replace a valid one, here one from before the node was deactivated."""
     n = node()
     assert isinstance(n, GuardedNode)
     known = Calibration("/points", camera=CameraTopic("/front/image", INFO))
@@ -183,8 +184,8 @@ class LastFirst(GuardedNode):
 
 
 def test_a_cloud_has_the_time_of_the_clock_that_was_sent_before_it(domain: int) -> None:
-    """This is true whichever message is taken first. With the time of the cloud before, a gap in a lockstep replay was
-    taken for a clock that was set."""
+    """The order of reception does not matter. With the time of the previous cloud, a gap in a lockstep replay was taken
+    for a clock that was set."""
     ros_context(["--ros-args", "-p", "use_sim_time:=true"], domain)
     n = LastFirst("listener")
     try:
@@ -205,7 +206,7 @@ def test_a_cloud_has_the_time_of_the_clock_that_was_sent_before_it(domain: int) 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 90.0, -5.1])
 def test_an_absurd_correction_from_the_wire_is_ignored(node: Callable[..., Node], value: float) -> None:
-    """This is independent of the publisher and of the values before."""
+    """An absurd value is ignored, whichever values were received before."""
     n = node()
     made = inputs(n)
     publisher = n.create_publisher(Float64, "/kitti/vertical_angle_correction_deg", LATCHED)

@@ -69,7 +69,7 @@ def test_a_cloud_waits_for_all_other_sensors_alike() -> None:
 
 @pytest.mark.parametrize(("depth", "behind", "rate"), [(10, 9, 60), (100, 12, 30), (100, 50, 10)])
 def test_clouds_that_wait_for_the_worker_keep_their_images(depth: int, behind: int, rate: int) -> None:
-    """This is true however many images arrive while the worker is behind."""
+    """Clouds keep their images, however many images arrive while the worker is behind."""
     synchronizer, out = make(depth=depth), list[Bundle]()
     clouds = [(0.1 * n, True) for n in range(60)]
     for now, is_cloud in sorted([*clouds, *((n / rate, False) for n in range(6 * rate))]):
@@ -84,7 +84,8 @@ def test_clouds_that_wait_for_the_worker_keep_their_images(depth: int, behind: i
 
 
 def test_a_camera_that_nobody_publishes_is_not_waited_for() -> None:
-    """The same holds for a camera that disappears; images that it has delivered are still used."""
+    """Clouds do not wait for a camera without a publisher, or one that has disappeared; images that it has delivered
+    are used."""
     synchronizer = make()
     camera_of(synchronizer).present = False
     synchronizer.add_cloud(100 * MS, "a", now=0.0)
@@ -149,7 +150,8 @@ def test_an_image_that_came_too_late_for_one_cloud_may_be_the_next_ones() -> Non
 
 
 def test_a_camera_that_comes_late_in_the_drive_is_used_from_then_on() -> None:
-    """Its images arrive shortly after the clouds: too late for clouds that do not wait, in time for those that do."""
+    """Its images arrive shortly after the clouds: too late for a cloud that does not wait, in time for one that
+    does."""
     synchronizer = make()
     joined = []
     for n in range(3 * PATIENCE):
@@ -176,7 +178,8 @@ def test_a_camera_that_is_always_too_late_costs_no_latency() -> None:
 
 @pytest.mark.parametrize("ahead", [-37, -0.3, 37])
 def test_a_camera_of_another_clock_costs_no_latency_and_is_said(ahead: float) -> None:
-    """It may be off by leap seconds, if its driver counts them, or by little: each image made the next clouds wait."""
+    """The stamps may be off by leap seconds, if the driver counts them, or by little. Previously, each image made the
+    next clouds wait."""
     synchronizer, waited = make(), list[bool]()
     for n in range(20):
         synchronizer.add("/image", round(100 + 100 * n + 1000 * ahead) * MS, n, 0.1 * n)
@@ -188,7 +191,7 @@ def test_a_camera_of_another_clock_costs_no_latency_and_is_said(ahead: float) ->
 
 
 def test_a_camera_beside_a_slow_lidar_is_waited_for() -> None:
-    """Each sends one message every 2 s, which does not indicate another clock."""
+    """Camera and LiDAR each send one message every 2 s: this does not indicate another clock."""
     synchronizer, joined = make(), list[bool]()
     for n in range(20):
         synchronizer.add_cloud((100 + 2000 * n) * MS, n, 2.0 * n)
@@ -200,7 +203,8 @@ def test_a_camera_beside_a_slow_lidar_is_waited_for() -> None:
 
 @pytest.mark.parametrize(("late", "fits"), [(0.0, True), (0.09, False)])
 def test_a_slow_camera_fits_where_its_images_are_used(late: float, fits: bool) -> None:
-    """With 2 Hz and a LiDAR at 20 Hz, most clouds have no image; every image has a cloud, unless it is too late."""
+    """For 2 Hz images and 20 Hz clouds, most clouds have no image. The camera fits if its images have clouds, and does
+    not if they are too late."""
     synchronizer, said = make(), list[bool]()
     for tick in range(2000):  # 10 ms
         now = 0.01 * tick
@@ -332,7 +336,7 @@ def feed(synchronizer: Synchronizer, *stamps_ms: int, period: float = 0.1) -> li
 
 @pytest.mark.parametrize("stray", [10_000 + 86_400_000, 12_000, 10_900, 10_450, 0, 8_000])
 def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
-    """Ahead or behind: the following clouds continue the drive before it, and nothing restarts."""
+    """After one stamp far ahead or behind, the following clouds continue the drive, and nothing restarts."""
     synchronizer = make(camera=False)
     assert feed(synchronizer, 9_900, 10_000, stray, 10_200, 10_300) == [
         (stamp, False) for stamp in (9_900, 10_000, 10_200, 10_300)
@@ -342,7 +346,7 @@ def test_one_stamp_far_off_costs_its_cloud_alone(stray: int) -> None:
 
 
 def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
-    """A looped bag, or a clock that was set: a step of 1.5 s is enough."""
+    """After a looped bag or a clock that was set, a step back of 1.5 s suffices for a restart; no cloud is lost."""
     for first in (0, 8_600):
         synchronizer = make(camera=False)
         stamps = (9_900, 10_000, first, first + 100, first + 200)
@@ -353,7 +357,7 @@ def test_a_jump_back_that_lasts_is_a_restart_and_loses_nothing() -> None:
 
 @pytest.mark.parametrize("back", [150, 250, 350, 500, 900])
 def test_a_clock_that_is_set_back_by_less_than_a_second_loses_nothing(back: int) -> None:
-    """As by an NTP client: the drive continues, with its clouds in the order of their arrival."""
+    """After an NTP client sets the clock back, the drive continues, with its clouds in the order of their arrival."""
     synchronizer = make(camera=False)
     stamps = [9_901, 10_001, *(stamp - back for stamp in range(10_100, 11_600, 100))]
     assert feed(synchronizer, *stamps) == [(stamp, False) for stamp in stamps]
@@ -361,7 +365,8 @@ def test_a_clock_that_is_set_back_by_less_than_a_second_loses_nothing(back: int)
 
 
 def test_three_clouds_that_come_too_late_are_rejected() -> None:
-    """These were delayed in transit, or come from a second publisher: never more than three in a row."""
+    """Clouds that were delayed in transit, or come from a second publisher, are rejected if at most three arrive in a
+    row."""
     synchronizer = make(camera=False)
     late = (9_500, 9_600, 9_700, 10_100, 9_800, 9_900, 10_000, 10_200, 10_140, 10_130, 10_120, 10_110, 10_300)
     kept = [10_000, 10_100, 10_200, 10_300]
@@ -370,13 +375,13 @@ def test_three_clouds_that_come_too_late_are_rejected() -> None:
 
 
 def test_a_jump_ahead_that_lasts_loses_nothing() -> None:
-    """As in a recording with a gap, played without the pause, or after a clock was set."""
+    """No cloud is lost after a gap of a recording that is played without the pause, or after a clock was set."""
     stamps = (9_900, 10_000, 15_000, 15_100)
     assert feed(make(camera=False), *stamps) == [(stamp, False) for stamp in stamps]
 
 
 def test_a_jump_ahead_is_told_from_a_pause() -> None:
-    """The elapsed time decides, also if the cloud that jumped had to be dropped."""
+    """The elapsed time distinguishes them, also if the cloud that jumped had to be dropped."""
     for arrival, stepped in ((0.1, True), (5.0, False)):
         synchronizer = make(camera=False)
         out = []
@@ -399,7 +404,8 @@ def test_a_jump_ahead_is_told_from_a_pause() -> None:
 def test_a_clock_that_is_set_ahead_is_told_by_the_pace_of_the_clouds(
     ahead: int, arrivals: tuple[float, ...], stepped: bool
 ) -> None:
-    """Also by less than a second: steps of 0.6 and 0.95 s on KITTI 04 and 00 caused 8 to 13 m, lost and broken."""
+    """Steps of less than a second are detected, too: 0.6 and 0.95 s on KITTI 04 and 00 led to errors of 8 to 13 m, lost
+    and broken."""
     synchronizer, out = make(camera=False), list[Bundle]()
     stamps = (9_900, 10_000, 10_100 + ahead, 10_200 + ahead, 10_300 + ahead)
     for stamp, now in zip(stamps, (0.0, *arrivals), strict=True):
@@ -411,7 +417,8 @@ def test_a_clock_that_is_set_ahead_is_told_by_the_pace_of_the_clouds(
 
 @pytest.mark.parametrize("ahead", [11_000, 10_300, 10_150])
 def test_a_stamp_ahead_costs_no_more_than_what_its_cloud_overtakes(ahead: int) -> None:
-    """Under three periods, it cannot be told from a pause: clouds until then are lost, all others are released."""
+    """A stamp less than three periods ahead cannot be told from a pause: clouds until then are lost, all others are
+    released."""
     synchronizer = make(camera=False)
     true = range(10_000, 11_600, 100)
     stamps = [ahead if stamp == 10_200 else stamp for stamp in true]
@@ -422,7 +429,7 @@ def test_a_stamp_ahead_costs_no_more_than_what_its_cloud_overtakes(ahead: int) -
 
 
 def test_a_burst_of_which_the_middle_was_lost_loses_nothing_more() -> None:
-    """A link delivers delayed clouds late: the clouds around the gap arrive at the same time, and no clock was set."""
+    """If a link delivers delayed clouds late, the clouds around a gap arrive at the same time, and no clock was set."""
     stamps, out = [10_000, 10_100, 10_200, 10_900, 11_000, 11_100], []
     synchronizer = make(camera=False, depth=8)
     for stamp, now in zip(stamps, (0.0, 0.1, 1.2, 1.2, 1.2, 1.2), strict=True):

@@ -25,8 +25,9 @@ from ..helpers.diagnostics import saying
 def test_another_node_that_places_the_same_frame_is_named(
     rig: Callable[..., Rig], parent: str, child: str, part: str
 ) -> None:
-    """A robot's own odometry without ros.odom_source, or a recorded one: `odom` -> base jumped between the two with
-    each message, and neither log nor diagnostics reported it. This includes the case that both have the same stamps."""
+    """With a robot's own odometry but without ros.odom_source, or with a recorded one, `odom` -> base jumped between
+    the two with each message, and nothing reported it. Now a warning names the frames, even if both have the same
+    stamps."""
     r = rig()
     other = r.harness.publisher(TFMessage, "/tf")
     r.wait(lambda: other.get_subscription_count() == 2, "slam_node's ears, of each transform that it sends")
@@ -39,8 +40,7 @@ def test_another_node_that_places_the_same_frame_is_named(
 
 
 def test_frames_of_others_are_theirs(rig: Callable[..., Rig]) -> None:
-    """A frame that only another node publishes is not checked; a transform of ours that a relay sends again is the
-    same one."""
+    """A frame that only another node publishes is not reported, nor is a transform of ours that a relay repeats."""
     r = rig()
     tf, other = r.harness.hear(TFMessage, "/tf"), r.harness.publisher(TFMessage, "/tf")
     r.wait(lambda: other.get_subscription_count() == 3 and r.harness.found_by(r.node, "/tf"), "connections")

@@ -16,7 +16,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "topics.md"
 
 @pytest.mark.slow
 def test_the_page_is_that_of_the_nodes(ros: Callable[..., Any]) -> None:
-    """`make topics` writes it. The network is not loaded, since it adds no topic."""
+    """The page equals the output of `make topics`. The network is not loaded, since it adds no topic."""
     ros("slam.registration:=geometric", "slam.loops.descriptors:=false", namespace="")
     found = describe()
     assert page(found) == PAGE.read_text()

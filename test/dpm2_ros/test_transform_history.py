@@ -78,7 +78,7 @@ def test_time_that_goes_back_begins_anew_and_samples_out_of_order_are_left_out()
 
 
 def test_a_clock_that_is_set_back_by_less_than_a_second_tells_the_time() -> None:
-    """Samples at the same stamps from before it was set are not used afterwards."""
+    """Samples with the same stamps from before the clock was set are not used afterwards."""
     history, elsewhere = moving(*range(0, SECOND, SECOND // 20)), pose_to_msg(se3.exp([0, 0, 0, 7.0, 0, 0]))
     for k in range(4):
         before = history.lookup("odom", "base", SECOND // 2, TransformTree())[0]

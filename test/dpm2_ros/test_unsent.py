@@ -79,7 +79,8 @@ def test_a_full_disk_costs_no_keyframe_and_leaves_no_gap(tmp_path: Path) -> None
 def test_a_disk_that_can_only_be_read_by_now_does_not_keep_a_node_from_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Linux remounts a disk with errors read-only. Remaining keyframes are sent again; the mapper recognizes them."""
+    """Linux remounts a disk with errors read-only: the node still ends. Remaining keyframes are sent again, and the
+    mapper recognizes them."""
     file = KeyframeFile(path := path_of(tmp_path, "", "5f3a9c01"))
     file.append([b"pose", b"descriptors", b"cloud"])
 
@@ -108,7 +109,7 @@ def test_a_file_belongs_to_one_process_and_one_robot(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_closed_meanwhile_is_opened_again(tmp_path: Path) -> None:
-    """If another process has opened it meanwhile, this is an error."""
+    """A closed file is opened again when needed; if another process has opened it meanwhile, this is an error."""
     path, before = tmp_path / "drive.00000001.unsent", len(os.listdir("/proc/self/fd"))
     file = KeyframeFile(path)
     for _ in range(2):
@@ -157,9 +158,10 @@ def test_drives_that_wait_for_the_mapper_hold_no_file_open(ros: Callable[..., An
 def test_a_full_disk_is_said_and_what_ends_with_the_process_is_counted(
     ros: Callable[..., Any], tmp_path: Path, capfd: pytest.CaptureFixture[str], room: bool
 ) -> None:
-    """All were reported as to be sent at the next start, and nothing was reported during the drive.
+    """A full disk is reported at once, and keyframes that are lost at the end are counted. Previously, all were
+    reported as to be sent at the next start, and nothing was reported during the drive.
 
-    `room`: the disk has room after the last keyframe; keyframes that waited in memory were lost nevertheless.
+    `room`: the disk has room after the last keyframe; keyframes that waited in memory are lost nevertheless.
     """
     ros()
     node = rclpy.create_node("robot", use_global_arguments=False)
@@ -235,7 +237,8 @@ print(sum(file.read(n) == parts for n, parts in enumerate(sent)), len(file))
 
 
 def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) -> None:
-    """It stayed in memory to the end, but was reported as to be sent at the next start."""
+    """Keyframes in memory are written once the disk has room. Previously, they stayed in memory to the end, but were
+    reported as to be sent at the next start."""
     path = path_of(tmp_path, "", "5f3a9c01")
     file, sent = KeyframeFile(path), [[bytes([n]), b"", os.urandom(50_000)] for n in range(30)]
     with largest_file(600_000):
@@ -254,7 +257,7 @@ def test_what_found_no_room_is_in_the_file_once_there_is_some(tmp_path: Path) ->
 
 
 def test_what_holds_no_keyframe_holds_no_file() -> None:
-    """One is made with every new start of the odometry, even if nothing will be kept."""
+    """Every start of the odometry makes a KeyframeFile, even if nothing will be kept: an empty one has no open file."""
     before = len(os.listdir("/proc/self/fd"))
     files = [KeyframeFile() for _ in range(10)]
     assert len(os.listdir("/proc/self/fd")) == before
