@@ -49,8 +49,8 @@ def test_results_are_found_again_by_a_run_of_the_same_settings_and_weights(tmp_p
 def test_a_training_of_other_settings_or_pairs_is_not_taken_for_this_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The checkpoint of a previous training was resumed, whatever its settings: with no steps left, the old weights
-    were evaluated again, and recorded as those of the new settings."""
+    """Previously, the checkpoint of any previous training was resumed: with no steps left, the old weights were
+    evaluated again, and recorded as those of the new settings."""
     resumed: list[bool] = []
 
     def train(settings: FinetuneSettings, out: Path, data: Path) -> Path:

@@ -35,8 +35,8 @@ from ..helpers.networks import tiny
 def test_parts_of_other_options_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: dict[str, Any]
 ) -> None:
-    """They were kept, although the record stated the options of the new call: another solver seemed to make no
-    difference, since nothing was measured."""
+    """Parts measured with other options are measured again. Previously they were kept, although the record stated the
+    new options: another solver seemed to make no difference, since nothing was measured."""
     measured: list[str] = []
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
@@ -78,7 +78,8 @@ def _worlds(folder: Path, points: int) -> Path:
 def test_parts_of_other_drives_and_worlds_of_the_same_name_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With an excerpt of 00 and then the whole sequence, the table was that of the first in both calls."""
+    """An excerpt of 00 and the whole sequence are different drives. Previously, the table was that of the first call in
+    both cases."""
     measured: list[Path] = []
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:

@@ -35,7 +35,8 @@ def test_each_way_is_a_part_of_the_preset() -> None:
 
 @pytest.mark.slow
 def test_the_simulated_drive_is_of_every_second_scan_of_a_good_lap() -> None:
-    """It had the length of the whole drive, although no scan of the second half exists."""
+    """The drive has as many scans as poses. Previously, it had the length of the whole drive, although no scan of the
+    second half exists."""
     drive = lap()
     assert len(drive) == len(drive.poses)
     (last,) = drive.frames(len(drive) - 1)

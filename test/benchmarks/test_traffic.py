@@ -62,7 +62,8 @@ def test_the_summary_is_of_means_and_medians_and_counts_drives_that_strayed() ->
 def test_other_weights_of_the_network_or_threads_are_another_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Figures of other weights were shown as theirs, and times with two threads next to those with one."""
+    """Drives are then measured again. Previously, figures of other weights were shown as theirs, and times with two
+    threads next to those with one."""
     monkeypatch.setattr(traffic, "PLACES", {})  # no drive, only the recipe
     options = Options(threads=1, out=tmp_path)
     trained = tmp_path / "mine.safetensors"

@@ -51,7 +51,8 @@ def straight(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("name", "command"), [*all_commands()], ids=[name for name, _ in all_commands()])
 def test_no_word_of_a_help_is_taken_for_markup(name: str, command: TyperCommand) -> None:
-    """`--workers` of `dpm2 fleet` had lost its default, which was in square brackets."""
+    """Help texts contain no markup. Previously, `--workers` of `dpm2 fleet` had lost its default, which was in square
+    brackets."""
     texts = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
     assert [text for text in texts if text and Text.from_markup(text).plain != text] == []
 
@@ -169,7 +170,8 @@ def test_completion(words: str, offered: list[str]) -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_command_without_a_traceback_and_at_once(tmp_path: Path) -> None:
-    """500 frames would take a minute. A tunnel is built in a tenth of the time of a city."""
+    """Ctrl-C ends the command within 10 s: 500 frames would take a minute. A tunnel is built in a tenth of the time of
+    a city."""
     drive = ("sim", tmp_path / "drive", "--frames", 500, "--preset", "tunnel", "--no-images")
     with started(*drive, until=lambda: list(tmp_path.rglob("*.bin"))) as process:
         process.send_signal(signal.SIGINT)

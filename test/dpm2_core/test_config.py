@@ -237,7 +237,8 @@ def test_a_number_with_leading_zeros_stays_what_was_typed() -> None:
 
 
 def test_a_number_is_a_text_where_one_is_wanted(tmp_path: Path) -> None:
-    """KITTI's sequences from 10 on needed quotes that the shell keeps; true and lists are not strings."""
+    """Numbers are accepted as strings: previously, KITTI's sequences from 10 on needed quotes that the shell keeps.
+    true and lists are rejected."""
     (tmp_path / "a.yaml").write_text("sequence: 10")
     assert load_settings(InputSettings, tmp_path / "a.yaml").sequence == "10"
     assert load_settings(InputSettings, None, ["sequence=10"]).sequence == "10"

@@ -51,7 +51,8 @@ def test_a_point_is_seen_where_it_was_in_an_image_of_another_size() -> None:
 
 
 def test_what_would_be_read_as_something_else_is_refused() -> None:
-    """Transposed matrices made a camera unusable and a drive wrong by its length; seconds were read as nanoseconds."""
+    """Such values are errors. Previously, transposed matrices made a camera unusable and a drive wrong by its length,
+    and seconds were read as nanoseconds."""
     moved = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
     with pytest.raises(ValueError, match=r"left: T_lidar_cam is no rigid transform"):
         replace(CAMERA, T_lidar_cam=moved.T)

@@ -84,8 +84,8 @@ with interrupt_deferred() as interrupted:
 
 
 def test_a_terminal_that_is_closed_is_as_one_ctrl_c(tmp_path: Path) -> None:
-    """Unhandled, it ends a drive without results, and every later write to the terminal is an error. The shell sends
-    the signal a second time, which does not count as a second Ctrl-C."""
+    """Closing the terminal acts as one Ctrl-C; the shell's second signal does not count as a second one. Unhandled, the
+    signal would end the drive without results, and later writes to the terminal are errors."""
     screen, terminal = os.openpty()
     attach = partial(fcntl.ioctl, terminal, termios.TIOCSCTTY, 0)
     with subprocess.Popen(
@@ -119,8 +119,8 @@ Path("results").touch()
 
 
 def test_a_program_that_is_not_told_goes_on_without_its_terminal(tmp_path: Path) -> None:
-    """As for a background program whose shell was left by `exit`: each write to the terminal is an error, which ended a
-    drive with code 1 and without results."""
+    """A background program whose shell was left by `exit` continues. Previously, a write to the closed terminal was an
+    error, which ended a drive with code 1 and without results."""
     screen, terminal = os.openpty()
     with subprocess.Popen(
         [sys.executable, "-c", OUTLIVES], cwd=tmp_path, stdin=terminal, stdout=terminal, stderr=terminal,

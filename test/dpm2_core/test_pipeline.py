@@ -55,7 +55,8 @@ def result(recording: Path) -> Result:
 
 @pytest.mark.slow
 def test_a_path_may_be_a_text(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a notebook: `save` ended with an AttributeError after the drive."""
+    """Strings are accepted as paths, as in a notebook. Previously, `save` ended with an AttributeError after the
+    drive."""
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(dump_settings(CONFIG))
     config = load_settings(Config, "mine.yaml")
@@ -86,8 +87,8 @@ def test_it_is_the_slam_frame_by_frame(recording: Path, result: Result) -> None:
 def test_a_stamp_that_is_off_is_corrected_whoever_reads_the_drive(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stamps of bags and KITTI are corrected. In a user's own loader, a stamp 1 s ahead caused an error of 9 m without
-    a message. This includes the frames where a drive begins or is resumed."""
+    """Wrong stamps are corrected for any source, also where a drive begins or is resumed. Previously, in a user's own
+    loader, a stamp 1 s ahead caused an error of 9 m without a message."""
     source = open_source(recording)
     scans = list(source.frames())
     wrong = scans[4].stamp + 10**9
@@ -193,8 +194,8 @@ def test_truth_that_turns_out_not_to_fit_costs_nothing_else(recording: Path, res
 
 
 def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
-    """It ended with a trajectory of identities and exit code 0. A new map file is removed, so the next run can make
-    it."""
+    """Previously, it ended with a trajectory of identities and exit code 0. A new map file is removed, so the next run
+    can make it."""
     (tmp_path / "scans").mkdir()
     for n in range(3):
         (tmp_path / "scans" / f"{n}.ply").write_bytes(b"hello")
@@ -211,8 +212,8 @@ def test_a_drive_without_a_readable_scan_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: Path, tmp_path: Path) -> None:
-    """It has 25 Hz, 12 ms late and longer than the drive: the nearest pose was 0.1 m off, and most frames were left
-    out."""
+    """A ground truth of 25 Hz, 12 ms late and longer than the drive, is interpolated. Previously, the nearest pose was
+    0.1 m off, and most frames were left out."""
     source = open_source(recording)
     assert source.poses is not None
     stamps = np.array([frame.stamp for frame in source.frames()])
@@ -228,7 +229,8 @@ def test_a_tum_file_of_another_clock_gives_the_figures_of_the_poses(recording: P
 
 
 def test_the_frames_of_a_drive_are_counted_whatever_its_truth_is_sampled_at(result: Result) -> None:
-    """Failed frames are counted among all frames; with ground truth at 2 Hz there were more of them than frames."""
+    """Failed frames are counted among all frames. Previously, with ground truth at 2 Hz, there were more of them than
+    frames."""
     stamps = np.array(result.recorder.stamps)
     slower = replace(result, ground_truth=Trajectory(result.poses[::5], stamps[::5], "tum"))
     assert (slower.metrics.frames, slower.metrics.failed_frames) == (len(result), result.methods["failed"])
@@ -272,7 +274,8 @@ def test_the_frame_where_a_drive_goes_on_is_in_the_trajectory_of_its_map_once(re
 
 
 def test_a_run_is_over_once(recording: Path) -> None:
-    """A second run added the drive to the same map again; then the first result could not be saved, either."""
+    """A second run is an error. Previously, it added the drive to the same map again, and the first result could not be
+    saved, either."""
     drive = OfflineRun(recording, CONFIG, (0, 3))
     result = drive.run()
     with pytest.raises(UsageError, match="00: it was run already; a second run needs another OfflineRun"):
@@ -294,7 +297,8 @@ def test_a_drive_with_missing_scans_goes_on(recording: Path, tmp_path: Path) -> 
 
 
 def test_another_drive_of_the_same_stamps_is_not_gone_on_with(recording: Path, tmp_path: Path) -> None:
-    """All synthetic drives have the same stamps: another one was tied to the end of the map, to the millimeter."""
+    """This is an error. All synthetic drives have the same stamps: previously, another one was tied to the end of the
+    map, to the millimeter."""
     path, other = tmp_path / "drive.dpm2map", tmp_path / "other"
     with OfflineRun(recording, CONFIG, (0, 4), map_file=path) as begun:
         begun.run()

@@ -103,7 +103,7 @@ def test_the_wrong_number_of_cells_is_an_error() -> None:
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_records_of_benchmarks_are_shown_in_full(width: int) -> None:
-    """`dpm2 bench geometric` printed 0.0... in 80 columns."""
+    """Figures are never truncated; previously, `dpm2 bench geometric` printed 0.0... in 80 columns."""
     drives = json.loads((ROOT / "benchmarks" / "geometric.json").read_text())["drives"]
     printed = lines(geometric.view(drives), width)
     assert max(map(len, printed)) <= width

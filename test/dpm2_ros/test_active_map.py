@@ -83,8 +83,8 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 def test_a_map_that_was_asked_for_by_name_and_does_not_go_on_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """If a named map file exists and the drive cannot continue it, the new map's name is reported, as after a crash of
-    mapper_node. Drives without a named file, and resets, start a new map without a warning."""
+    """If the named map file exists already, as after a crash of mapper_node, the name of the new map is reported.
+    Drives without a named file, and resets, start a new map without a warning."""
     caplog.set_level(logging.WARNING)
     town = tmp_path / "town.dpm2map"
     for file in ("auto", "auto", str(town)):

@@ -48,7 +48,8 @@ def _drive(count: int = 60) -> np.ndarray:
 
 
 def test_frames_that_an_estimate_is_not_of_are_not_said_to_have_failed(tmp_path: Path) -> None:
-    """For a run with `--frames` it reported "10 failed, 0 breaks", and the length of the whole drive as its path."""
+    """For a run with `--frames`, the other frames did not fail, and do not count for the path. Previously, "10 failed,
+    0 breaks" was reported, and the length of the whole drive."""
     write_kitti(tmp_path / "gt.txt", _drive())
     write_indexed(tmp_path / "est.txt", _drive()[:-10], range(50))
     shown = " ".join(succeeded("eval", "--gt", tmp_path / "gt.txt", "--est", tmp_path / "est.txt").stdout.split())
@@ -88,7 +89,8 @@ def test_speeds_are_those_of_the_stamps(tmp_path: Path, faster: int) -> None:
 
 @pytest.mark.parametrize("stamped", [True, False])
 def test_a_gap_makes_no_drive_faster(tmp_path: Path, stamped: bool) -> None:
-    """10 m/s; with two seconds missing, the estimate seemed to be up to 30 m/s fast."""
+    """At 10 m/s, two missing seconds do not change the speed; previously, the estimate seemed to be up to 30 m/s
+    fast."""
     poses, there = _drive(), np.r_[0:20, 40:60]
     if stamped:
         write_tum(tmp_path / "gt.txt", np.arange(60) * 100_000_000 + 3_000_000, poses)
@@ -101,7 +103,8 @@ def test_a_gap_makes_no_drive_faster(tmp_path: Path, stamped: bool) -> None:
 
 
 def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: Path, kitti_excerpt: Path) -> None:
-    """Compared without it, a drive that rotates by 90 degrees seems to be decimeters off."""
+    """With the calibration, the error is zero. Without it, a drive that rotates by 90 degrees seems to be decimeters
+    off."""
     folder = kitti_excerpt / "00"
     T_cam_lidar = read_calib(folder / "calib.txt")["Tr"]
     T_lidar = se3.inverse(T_cam_lidar) @ read_trajectory(folder / "poses.txt").poses @ T_cam_lidar
@@ -112,9 +115,9 @@ def test_lidar_poses_meet_camera_ground_truth_through_the_calibration(tmp_path: 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["straight", "round"])
 def test_poses_along_other_axes_are_said(tmp_path: Path, turned: bool) -> None:
-    """LiDAR poses were compared with camera poses, as examples/odometry_of_a_folder.py writes them. The drift was 140 %
-    for an odometry with an error of 0.7 %, or 0 % for a drive that ends where it began, and no message gave the
-    reason."""
+    """A warning is given if LiDAR poses, as examples/odometry_of_a_folder.py writes them, are compared with camera
+    poses. Previously, the drift was 140 % for an odometry with an error of 0.7 %, or 0 % for a drive that ends where it
+    began, without a message."""
     T_cam_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])
     step = se3.exp([0, 2 * np.pi / 60 * turned, 0, 0, 0, 1.0])
     poses = np.stack([np.linalg.matrix_power(step, n) for n in range(61)])
@@ -139,7 +142,8 @@ def test_different_lengths_are_rejected_naming_both(tmp_path: Path) -> None:
 
 
 def test_a_run_of_some_frames_is_told_which_of_its_files_a_drive_is_the_truth_of(tmp_path: Path) -> None:
-    """The message suggested to use the drive as ground truth, which had been done."""
+    """The message names trajectory.tum. Previously, it suggested to use the drive as ground truth, which had been
+    done."""
     folder, poses = drive_with_truth(tmp_path)
     write_kitti(tmp_path / "est.txt", poses[2:5])
     assert "trajectory.tum" in refused("eval", "--gt", folder, "--est", tmp_path / "est.txt")
@@ -181,7 +185,8 @@ def test_a_drive_is_its_own_ground_truth(tmp_path: Path) -> None:
 
 
 def test_a_drive_is_the_truth_of_stamped_poses_of_its_lidar(tmp_path: Path) -> None:
-    """`dpm2 run` writes trajectory.tum so, and --localise nothing else; they were compared with poses of the camera."""
+    """Stamped poses, as in trajectory.tum of `dpm2 run`, the only file of --localise, are compared with poses of the
+    LiDAR; previously, with those of the camera."""
     folder, poses = drive_with_truth(tmp_path)
     (folder / "times.txt").write_text("".join(f"{0.1 * n}\n" for n in range(6)))
     T_cam_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1]])
@@ -204,8 +209,8 @@ def test_a_drive_that_is_one_file_is_its_own_ground_truth(tmp_path: Path) -> Non
 
 
 def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
-    """Scans 3 and 4 are missing, and the poses end at frame 6. The estimate's ten lines were taken for frames 0 to 9,
-    since there are more lines than known poses; an exact estimate had a t_err of 28 %."""
+    """Scans 3 and 4 are missing, and the poses end at frame 6. Previously, the estimate's ten lines were taken for
+    frames 0 to 9, since there are more lines than known poses; an exact estimate had a t_err of 28 %."""
     folder, poses = drive_with_truth(tmp_path, range(12))
     for n in (3, 4):
         (folder / "velodyne" / f"{n:06d}.bin").unlink()

@@ -191,7 +191,8 @@ def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> No
 
 
 def test_a_drive_of_which_all_is_pruned_is_written_and_where_nothing_places_it_named(tmp_path: Path) -> None:
-    """Drives were searched among the remaining keyframes only: GeoJSON silently omitted this one, the page had it."""
+    """A drive whose keyframes are all pruned is exported. Previously, only the remaining keyframes were searched for
+    drives: GeoJSON silently omitted this one, the page had it."""
     data = two_drives(fixes=False)
     beside = se3.exp([0, 0, 0, 0, 2.0, 0])
     trail = [RemovedKeyframe(100 + node, "", 3, node * 10**9, node, beside) for node in range(20)]
@@ -261,7 +262,8 @@ def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
 
 
 def test_a_recovered_map_is_where_its_fixes_are(tmp_path: Path) -> None:
-    """The row with the georeference was damaged: the recovered map had none, and "80 fixes do not tell it"."""
+    """If the row with the georeference is damaged, it is computed again from the fixes. Previously, the recovered map
+    had none, and "80 fixes do not tell it"."""
     data = two_drives()
     save_as(data, tmp_path / "map")
     with closing(sqlite3.connect(tmp_path / "map")) as sql, sql:

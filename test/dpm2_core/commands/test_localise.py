@@ -73,8 +73,8 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
 
 
 def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tmp_path: Path) -> None:
-    """The drive ended where the tile was needed, with nothing in the folder. The exit code reports it to scripts, as
-    for a map file that is incomplete."""
+    """Without a tile, the drive continues, and the exit code reports the problem to scripts, as for an incomplete map
+    file. Previously, the drive ended there, with nothing in the folder."""
     assert dpm2("map", "export", made, tmp_path / "tiles", "--tiles", "100").returncode == 0
     missing = tmp_path / "tiles" / "0_0.dpm2map"
     missing.unlink()
@@ -86,7 +86,7 @@ def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tm
 
 
 def test_a_wrong_hint_only_costs_time(recording: Path, made: Path, tmp_path: Path) -> None:
-    """Nothing is there; it searches everywhere after a second, although the robot has hardly moved."""
+    """Nothing is at the hint: after a second it searches everywhere, although the robot has hardly moved."""
     succeeded(
         "run", recording, "--out", tmp_path / "o", "--frames", ":13", "--localise", made, "--hint", "500,0,0", *QUICK
     )

@@ -87,7 +87,7 @@ def test_occupancy(tmp_path: Path, map_file: Path) -> None:
 
 
 def test_a_grid_of_a_map_that_is_not_level_is_said_to_be_of_no_use(tmp_path: Path, recording: Path) -> None:
-    """As for a LiDAR that is tilted in a drive without an IMU: the road is then full of obstacles."""
+    """A warning is given for a LiDAR that is tilted in a drive without an IMU: the road is then full of obstacles."""
     scene = next(iter(open_source(recording).frames())).points[::4]
     for name, degrees in (("level", 0), ("tilted", 25)):
         data, T_tilted_level = ring(6), se3.exp([0, np.radians(degrees), 0, 0, 0, 0])
@@ -127,7 +127,7 @@ def test_an_export_replaces_neither_the_map_nor_another_grid(tmp_path: Path, map
 
 
 def test_maps_of_different_weights_are_not_merged(tmp_path: Path, map_file: Path) -> None:
-    """No robot could localize in the result."""
+    """This is an error, since no robot could localize in the result."""
     other = tmp_path / "other.dpm2map"
     other.write_bytes(map_file.read_bytes())
     with closing(sqlite3.connect(other)) as connection:
@@ -195,8 +195,9 @@ def test_the_length_is_that_of_all_ways(tmp_path: Path) -> None:
 
 
 def test_two_drives_of_a_session_are_two_ways(tmp_path: Path) -> None:
-    """The odometry started again in the session, as when a recording is played again. The 1 km from the end of one
-    drive to the start of the other counted as length, and was a line on the page and in GeoJSON."""
+    """If the odometry starts again in a session, as for a recording that is played again, there are two trajectories.
+    Previously, the 1 km from the end of one to the start of the other counted as length, and was a line on the page and
+    in GeoJSON."""
     both = side_by_side({"one": ring(12), "two": ring(12)}, [])
     poses = both.poses.copy()
     poses[12:, 0, 3] += 1000
@@ -265,7 +266,7 @@ def test_merge_by_transform_keeps_the_place_on_earth_of_either_map(tmp_path: Pat
 
 
 def test_merge_by_a_transform_that_the_fixes_contradict_says_so(tmp_path: Path, map_file: Path) -> None:
-    """As for a wrong sign, or the two maps exchanged."""
+    """A warning is given, for example, for a wrong sign, or if the two maps are exchanged."""
     with MapStore.open(map_file, read_only=False) as store:
         store.write(Change(georeference=Georeference(np.array([49.0, 8.4, 110.0]), se3.exp([0, 0, 1.0, 2, 3, 4]))))
     for words, said in (("500 0 0 0", "500 m from its pose by the fixes of both maps"), ("1 0 0 0", "")):

@@ -32,8 +32,9 @@ def test_wrong_loops_are_named_and_left_out(tmp_path: Path) -> None:
 
 
 def test_covariances_that_do_not_fit_are_said(tmp_path: Path) -> None:
-    """The information is identity, as many programs write it: all 13 wrong loops of a graph were kept and the map was
-    bent, without a message."""
+    """If the covariances do not match the residuals, a warning is given, and they are scaled. Previously, with
+    information of identity, as many programs write it, all 13 wrong loops of a graph were kept and the map was bent,
+    without a message."""
     _, graph = made_drive(15, count=1500, right=20)
     path, out, info = tmp_path / "in.g2o", tmp_path / "out.g2o", tmp_path / "out.json"
     write_g2o(path, G2o(scaled(graph, 1e4), np.arange(1500), planar=False))

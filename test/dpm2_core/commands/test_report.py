@@ -31,7 +31,8 @@ def report(out: Path, *folders: Path) -> tuple[Done, str]:
 
 
 def test_an_experiment_without_a_run_has_its_tables(tmp_path: Path) -> None:
-    """An experiment with a task leaves only figures: it was rejected, as a folder without a run."""
+    """A folder of an experiment without runs is accepted, as of a task that leaves only figures; previously, it was
+    rejected."""
     done, page = report(tmp_path / "r.html", experiment(tmp_path / "ground", "gndnet", 0.125))
     assert done.returncode == 0, done.stderr
     assert "<h2>Table of &lt;gndnet&gt;</h2>" in page
@@ -42,7 +43,7 @@ def test_an_experiment_without_a_run_has_its_tables(tmp_path: Path) -> None:
 
 
 def test_experiments_below_a_folder_have_their_tables_by_its_name(tmp_path: Path) -> None:
-    """Their runs were on the page, but their tables were not."""
+    """Both runs and tables of the experiments are on the page; previously, the tables were not."""
     for number, name in enumerate(("first", "second")):
         run = experiment(tmp_path / "out" / name, "kitti", number + 0.25) / "ours" / "06"
         run.mkdir(parents=True)

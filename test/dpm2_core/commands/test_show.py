@@ -77,7 +77,7 @@ def test_several_weights_are_drawn_below_each_other_of_a_sensor_that_fails(seque
 
 
 def test_one_of_several_sequences_is_shown(sequence: Path, tmp_path: Path) -> None:
-    """The error named a setting that the command did not accept."""
+    """The sequence can be chosen with --set. Previously, the error named a setting that the command did not accept."""
     for name in ("00", "01"):
         shutil.copytree(sequence / "velodyne", tmp_path / "sequences" / name / "velodyne")
     call = ("show", tmp_path, "0", "1", "--out", tmp_path / "m.png", "--weights", sequence / "tiny.safetensors")

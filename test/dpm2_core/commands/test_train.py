@@ -37,8 +37,8 @@ def notes(done: str) -> list[str]:
 
 @pytest.mark.slow
 def test_sequences_that_a_task_is_measured_on_and_learns_from_are_named(tmp_path: Path) -> None:
-    """With `--val-sequences 02`, and `--sequences` forgotten, the task also learned from 02. It was reported only if
-    all the evaluation data was all the training data."""
+    """With `--val-sequences 02`, and `--sequences` forgotten, the task also learns from 02, which is reported.
+    Previously, it was reported only if all the evaluation data was all the training data."""
     data = tmp_path / "data"
     for name in ("00", "01", "02"):
         labelled_drive(data / "sequences" / name, range(2), points=300, seed=int(name))
@@ -95,7 +95,8 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
 @pytest.mark.weights
 @pytest.mark.slow
 def test_weights_to_start_from_have_a_name_as_everywhere(tmp_path: Path) -> None:
-    """For weights that come with dpm2, trainings required the path, unlike other commands."""
+    """Trainings accept the names of weights that come with dpm2, as other commands do; previously, they required the
+    path."""
     done = dpm2("train", "phase1", "--out", tmp_path / "a", "--set", "start=small")
     assert "data.packed: want packed drives" in done.stderr  # the weights were found
     (content,) = [

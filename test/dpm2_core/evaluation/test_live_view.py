@@ -35,7 +35,7 @@ def recorded(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_without_a_display_a_view_is_an_error_at_once(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rerun reported nothing, and the run never ended."""
+    """A view without a display is an error. Previously, Rerun reported nothing, and the run never ended."""
     pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

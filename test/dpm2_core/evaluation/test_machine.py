@@ -55,7 +55,7 @@ def test_a_package_that_is_missing_is_an_error() -> None:
 
 @pytest.mark.slow
 def test_a_missing_ros_is_a_warning() -> None:
-    """In a Python that does not find rclpy."""
+    """If Python does not find rclpy, this is a warning."""
     program = (
         "import json, sys; from importlib.machinery import PathFinder\n"
         "find = PathFinder.find_spec\n"

@@ -156,7 +156,8 @@ def test_mean_and_root_mean_square_of_the_position_error() -> None:
 
 
 def test_a_speed_between_two_classes_is_in_one() -> None:
-    """Rounding half to even put 5 m/s, the speed of every segment in a steady drive, into the class that ends there."""
+    """5 m/s, the speed of every segment in a steady drive, is in the class around it. Previously, rounding half to even
+    put it into the class that ends there."""
     gt = np.tile(np.eye(4), (201, 1, 1))
     gt[:, 0, 3] = np.arange(201)
     found = evaluate(gt, gt, [9.9], stamps=np.arange(201) * 180_000_000)  # 10 steps count as 11 frames
@@ -164,7 +165,8 @@ def test_a_speed_between_two_classes_is_in_one() -> None:
 
 
 def test_gaps_of_the_ground_truth_make_no_drive_faster() -> None:
-    """10 m/s throughout; with every other 4 frames without ground truth it seemed to be 16 to 20 m/s."""
+    """At 10 m/s throughout, with every other 4 frames without ground truth, the speed stays 10 m/s; previously, it
+    seemed to be 16 to 20 m/s."""
     gt, est = _straight(), _straight()
     gt[np.arange(101) // 4 % 2 == 1] = np.nan
     found = evaluate(gt, est, [20.0])
@@ -174,8 +176,8 @@ def test_gaps_of_the_ground_truth_make_no_drive_faster() -> None:
 
 
 def test_a_gap_of_the_frames_makes_no_drive_faster() -> None:
-    """10 m/s; without frames 20 to 69 the segments across them seemed to be up to 70 m/s fast. The step across them is
-    not one between consecutive frames, either: only there, the estimate is wrong."""
+    """At 10 m/s without frames 20 to 69, segments across the gap seemed to be up to 70 m/s fast. The step across the
+    gap does not count for the RPE, either: only there, the estimate is wrong."""
     there = np.r_[0:20, 70:101]
     gt, est = _straight()[there], _straight()[there]
     est[20:, 0, 3] += 5

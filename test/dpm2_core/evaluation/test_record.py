@@ -41,7 +41,8 @@ def test_the_commit_is_that_of_the_programs_own_repository(repository: Path, mon
 def test_a_changed_benchmark_and_a_new_module_are_no_clean_commit(
     repository: Path, monkeypatch: pytest.MonkeyPatch, file: str, marked: bool
 ) -> None:
-    """Only tracked files of dpm2_core counted, although a benchmark defines what a success is."""
+    """Such a commit is marked. Previously, only tracked files of dpm2_core counted, although a benchmark defines what a
+    success is."""
     monkeypatch.setattr(record, "REPOSITORY", repository)
     path = repository / file
     path.parent.mkdir()

@@ -81,7 +81,8 @@ def test_runs_of_one_drive_are_drawn_together_in_the_frame_of_its_truth(tmp_path
 
 
 def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Path) -> None:
-    """Errors over 20 and 50 m were in the column of errors over 100 to 800 m, and looked twice as large."""
+    """Errors over 20 and 50 m have a column of their own. Previously, they were in the column of errors over 100 to 800
+    m, and looked twice as large."""
     short, official = (write_run(tmp_path / name, 240, 1.02) for name in ("short", "official"))
     truth, est = (read_trajectory(official / f"{name}.tum").poses for name in ("ground_truth", "trajectory"))
     whole = evaluate(truth, est)
@@ -99,7 +100,8 @@ def test_errors_of_other_segment_lengths_have_columns_of_their_own(tmp_path: Pat
 
 @pytest.mark.parametrize("known", [False, True])
 def test_a_run_without_a_pose_is_on_the_page(tmp_path: Path, known: bool) -> None:
-    """A localization without a result leaves such a run; it prevented the page for all other runs."""
+    """A localization without a result leaves a run without poses. Previously, it prevented the page for all other
+    runs."""
     write_run(tmp_path / "found", 5)
     (tmp_path / "none").mkdir()
     write_tum(tmp_path / "none" / "trajectory.tum", [], np.zeros((0, 4, 4)))

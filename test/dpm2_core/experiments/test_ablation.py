@@ -76,7 +76,7 @@ def test_seeds_are_trainings_of_their_own(packed: Path, tmp_path: Path) -> None:
 def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
     packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Figures of the previous training were next to its weights, and were printed as its own."""
+    """Previously, figures of the previous training remained next to the new weights, and were printed as theirs."""
     variants = {"no camera": {"image": {"backbone": "none"}}}
     settings = AblationSettings(
         training=quick(packed), variants=variants, seeds=1, measure={"same": str(packed)}, pairs=2
@@ -100,7 +100,8 @@ def test_a_training_that_is_stopped_while_it_is_measured_is_measured_again(
 def test_other_drives_in_a_folder_are_learned_from_and_measured_anew(
     packed: Path, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """The record contained figures of drives that no longer existed."""
+    """Drives that changed are used for training and evaluation again. Previously, the record contained figures of
+    drives that no longer existed."""
     measured, out = tmp_path / "val", tmp_path / "out"
     write_packed(measured / "world", samples, {"source": "boxes"})
     variants = {"no camera": {"image": {"backbone": "none"}}}

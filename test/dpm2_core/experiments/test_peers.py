@@ -40,8 +40,8 @@ class SpeedingUp:
 def test_poses_at_the_end_of_sweeps_are_compared_at_their_stamps(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """KITTI-360's true poses are at the middle of a sweep. For a program with poses at the end, the car's motion in
-    half a sweep counted as an error, which differs from step to step if the car accelerates."""
+    """KITTI-360's true poses are at the middle of a sweep, those of the program at its end. Without a correction, the
+    motion in half a sweep would count as an error, which differs from step to step if the car accelerates."""
     root = kitti_360(recording, tmp_path / "data", ("0007",), 12)
     truth = enumerate(speeding_up(np.arange(12) / 10))
     rows = "".join(f"{k} {' '.join(map(str, T[:3].ravel()))}\n" for k, T in truth)

@@ -33,7 +33,8 @@ def kitti(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_measured_otherwise_than_in_the_paper_is_said(tmp_path: Path) -> None:
-    """Only KITTI's table stated that the paper's rows are not comparable, and none stated which segments were used."""
+    """A note states that the paper's rows are not comparable, and which segments were used. Previously, only KITTI's
+    table had such a note."""
     request, paper = Request(tmp_path, tmp_path), ("06", "10")
     assert (paper_notes(request, paper, paper), segments(request)) == ([], "all segments")
     (missing,) = paper_notes(request, ("10",), paper)
@@ -89,7 +90,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_program_that_was_lost_has_no_better_row_without_a_word(kitti: Path, tmp_path: Path) -> None:
-    """Its figures cover the frames before that: figures of half a drive were listed with those of whole drives."""
+    """The rows name the missing frames. Previously, figures of half a drive were listed with those of whole drives."""
     truth = read_trajectory(kitti / "poses" / "06.txt").poses
     for name, count in (("whole", 6), ("lost", 4)):
         write_tum(tmp_path / f"{name}.tum", np.arange(count) * 10**8, truth[:count])
@@ -162,7 +163,7 @@ def test_what_cannot_be_done_is_said_in_one_line(
 
 
 def test_two_peers_in_one_folder_are_refused(kitti: Path, tmp_path: Path) -> None:
-    """The second would overwrite the first, and both rows would show its figures."""
+    """This is an error, since the second would overwrite the first, and both rows would show its figures."""
     peers = ("--peer", "my slam=a.txt", "--peer", "my_slam=b.txt")
     done = dpm2("experiment", "kitti", kitti, "--out", tmp_path, "--sequences", "10", *peers)
     assert (done.returncode, "two results of one name (my_slam/10)" in done.stderr) == (2, True)
@@ -195,7 +196,8 @@ def gathering_speed(root: Path) -> tuple[Drive, np.ndarray]:
 
 
 def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None:
-    """A program may write the poses of its keyframes: such a file was rejected, one of two of three frames was not."""
+    """A program may write only the poses of its keyframes. Previously, a file with every second frame was rejected, but
+    one with two of three frames was not."""
     drive, t = gathering_speed(tmp_path)
     write_tum(tmp_path / "peer.tum", np.round(t * 1e9).astype(np.int64)[::2], ahead(t[::2]))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
@@ -205,8 +207,8 @@ def test_a_file_of_every_second_frame_is_of_these_frames(tmp_path: Path) -> None
 
 
 def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -> None:
-    """Each pose is 8 ms after a frame, as from a program with other stamps: for an accelerating car the nearest pose
-    was up to 0.2 m off."""
+    """Poses 8 ms after the frames, as from a program with other stamps, are interpolated. For an accelerating car the
+    nearest pose was up to 0.2 m off."""
     drive, t = gathering_speed(tmp_path)
     write_tum(tmp_path / "peer.tum", np.round((t + 0.008) * 1e9).astype(np.int64), ahead(t + 0.008))
     found = given(tmp_path, lambda *_: None, drive, tmp_path / "peer.tum")
@@ -215,7 +217,8 @@ def test_a_file_of_other_stamps_is_read_at_those_of_the_frames(tmp_path: Path) -
 
 
 def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path: Path) -> None:
-    """Scans 3 to 8 of twelve, of which frames 1 to 4 are selected: it was an error whose advice did not apply."""
+    """Of scans 3 to 8 of twelve, frames 1 to 4 are selected, and the file's poses of these frames are used. Previously,
+    this was an error whose advice did not apply."""
     folder, at = tmp_path / "sequences" / "10", np.arange(12.0) ** 2
     (folder / "velodyne").mkdir(parents=True)
     for n in range(3, 9):
@@ -230,8 +233,9 @@ def test_a_file_of_a_whole_sequence_is_read_at_the_frames_of_an_excerpt(tmp_path
 
 
 def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_path: Path) -> None:
-    """While a sequence was still being downloaded, the figures of its first scans were listed as those of the whole,
-    also next to the row of a peer that had all of them."""
+    """A sequence whose scans or ground truth changed is processed again. Previously, for a sequence that was still
+    being downloaded, the figures of its first scans were listed as those of the whole, also next to a peer's row with
+    all of them."""
     folder, request = tmp_path / "sequences" / "06", Request(tmp_path, tmp_path / "out", peers=("kiss-icp", "x=x.txt"))
     (folder / "velodyne").mkdir(parents=True)
     (tmp_path / "poses").mkdir()
@@ -251,7 +255,8 @@ def test_a_sequence_that_has_more_scans_or_another_truth_is_driven_again(tmp_pat
 
 
 def test_weights_in_the_home_folder_are_an_input_of_the_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the weights changed, the figures of the earlier ones were kept."""
+    """If weights in the home folder change, the drives are processed again; previously, the earlier figures were
+    kept."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "sequences" / "06" / "velodyne").mkdir(parents=True)
     np.zeros(4, "<f4").tofile(tmp_path / "sequences" / "06" / "velodyne" / "000000.bin")

@@ -204,8 +204,8 @@ def test_a_training_whose_last_losses_are_not_finite_has_no_last_loss(tmp_path: 
 
 
 def test_seeds_count_from_that_of_the_settings(tmp_path: Path) -> None:
-    """`--set optimiser.seed=100` trained seeds 0, 1, 2 again, and the second table equaled the first to the last digit,
-    as if the result were certain."""
+    """Seeds count from `optimiser.seed`. Previously, `--set optimiser.seed=100` trained seeds 0, 1, 2 again, and the
+    second table equaled the first to the last digit, as if the result were certain."""
 
     def seeds(*settings: str) -> list[int]:
         of = (Training(task="gndnet", data=tmp_path, learn=[], config=None, settings=settings, seed=seed, arm="with")
@@ -230,8 +230,8 @@ def test_the_last_loss_of_a_part_of_the_epochs_is_of_the_last_that_was_trained(t
     ("gndnet", [1e-2, 1e-2, 8e-3, 1e-2 * 0.8**5, 1e-2 * 0.8**9]), ("dslr", [1e-3] * 5), ("ae_lidar", [5e-4] * 5)
 ])  # fmt: skip
 def test_the_authors_recipes_have_the_authors_rates(name: str, rates: list[float]) -> None:
-    """GndNet's has steps, the others' are constant. DSLR's third stage, which uses the SLAM loss, began at a tenth of
-    it and ended at a hundredth, by a cosine schedule that is not theirs."""
+    """GndNet's rate has steps, the others' are constant. Previously, DSLR's third stage, which uses the SLAM loss,
+    began at a tenth of it and ended at a hundredth, by a cosine schedule that is not the authors'."""
     path = Path(__file__).resolve().parents[3] / "config" / f"{name}_authors.yaml"
     settings = load_settings(task_type(name).training_type, path)
     of_epochs = OptimizerSettings(**settings.optimiser.model_dump(), steps=settings.epochs)

@@ -109,16 +109,17 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
 def test_settings_that_no_variant_is_trained_by_are_errors(
     asked: str, said: str, kitti: Path, weights: Path, tmp_path: Path
 ) -> None:
-    """Another preset, or other weights to start from, had no effect and no message: the table was of `small`.
-    Misspelled settings were reported only after packing all drives. With weights to drive, all rows were of these."""
+    """Settings that would have no effect are errors. Previously, another preset or start was ignored without a message,
+    and the table was of `small`; misspelled settings were reported only after packing all drives; with other weights to
+    drive, all rows were of these."""
     with pytest.raises(UsageError, match=said):
         fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=(asked,)))
     fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=("preset=tiny",)))  # the network's preset
 
 
 def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, weights: Path, tmp_path: Path) -> None:
-    """`--set input...` affected only the test drives: a data set that needs it was packed differently, or not at
-    all."""
+    """`--set input...` applies to all drives. Previously, it affected only the test drives: a data set that needs it
+    was packed differently, or not at all."""
     asked = ("input.images=false", "optimiser.steps=1", "slam.threads=1")
     packs, _, driven = fusion.parts(Request(kitti, tmp_path, weights=str(weights), overrides=asked))
     assert [part.arguments["settings"] for part in packs] == [["input.sequence='00'", "input.images=false"]]
@@ -126,7 +127,8 @@ def test_drives_to_learn_from_are_read_as_those_to_be_tested_on(kitti: Path, wei
 
 
 def test_table_4_has_as_many_reference_points_as_the_papers(kitti: Path, tmp_path: Path) -> None:
-    """256, whose figures in its Table 3 are those of biased attention; with the shipped weights it had 320."""
+    """Both have 256, whose figures in the paper's Table 3 are those of biased attention; with the shipped weights,
+    there were 320."""
     _, trained, _ = fusion.parts(Request(kitti, tmp_path, weights="small"))
     for part in trained:
         training = training_of(**part.arguments["training"], network=part.arguments["network"], packed=())
@@ -134,7 +136,8 @@ def test_table_4_has_as_many_reference_points_as_the_papers(kitti: Path, tmp_pat
 
 
 def test_a_row_of_table_3_has_as_many_reference_points_as_its_name_says(kitti: Path, tmp_path: Path) -> None:
-    """Two rows of 256 had the number of the weights: 320 of `small`, a quarter more than the rows to compare with."""
+    """Previously, two rows of 256 had the number of the weights: 320 of `small`, a quarter more than the rows to
+    compare with."""
     _, trained, _ = reference_points.parts(Request(kitti, tmp_path, weights="small"))
     found = {}
     for part in trained:

@@ -182,7 +182,8 @@ def test_a_sweep_of_nothing_is_an_error_of_use(settings: list[str], words: str) 
 
 
 def test_a_drive_with_its_own_value_of_what_is_swept_is_an_error_of_use(tmp_path: Path) -> None:
-    """A drive's own value takes precedence, so all its rows were equal, as if the setting made no difference."""
+    """A drive's own value would take precedence, so that all its rows were equal, as if the setting made no
+    difference."""
     drives = [ManifestDrive(path="x", name="x", set=("slam.map.voxel=0.3", "slam.keyframes.distance = 5"))]
     with pytest.raises(UsageError, match=r"^x: the list has slam\.keyframes\.distance = 5 for it"):
         list(sweep_parts(drives, tmp_path / "base.yaml", variants(["slam.keyframes.distance=4,6"])))
@@ -200,7 +201,8 @@ def test_values_of_a_sweep_may_be_lists() -> None:
     ("slam.neural.weights=a/b", "slam.neural.weights=a%2Fb"),
 ])  # fmt: skip
 def test_other_settings_have_another_folder(one: str, other: str) -> None:
-    """Otherwise the second of two sweeps replaced the runs of the first, or one of two such values was left out."""
+    """Otherwise the second of two sweeps would replace the runs of the first, or one of two such values would be left
+    out."""
     assert not variants([one]).keys() & variants([other]).keys()
 
 

@@ -102,7 +102,8 @@ def test_what_a_new_drive_does_not_touch_is_neither_read_nor_moved(tmp_path: Pat
 
 
 def test_a_drive_that_meets_hundreds_of_others_is_added(tmp_path: Path) -> None:
-    """As the road to a depot does. SQLite accepted no query about more than 500 drives."""
+    """A road to a depot, for example, meets hundreds of drives. Previously, SQLite accepted no query about more than
+    500."""
     poses, names, path = fleet_maps(1)[0]["d0"][:3], [f"d{number:03}" for number in range(502)], tmp_path / "map"
     maps = {name: _at(drive_map(poses, number), poses) for number, name in enumerate(names)}
     same = Registration(np.eye(4), FIRM)

@@ -75,7 +75,7 @@ def test_the_search_for_loops_and_the_index_know_which_keyframes_borrow(
 @pytest.mark.slow
 def test_a_drive_is_not_joined_where_another_place_that_was_passed_once_looks_alike(tmp_path: Path) -> None:
     """The street is twice in the map of the first drive: at one place driven eight times, and once where the other
-    drive was. All keyframes of the other drive were joined to the first place, 500 m off."""
+    drive was. Previously, all keyframes of the other drive were joined to the first place, 500 m off."""
     at, world, describe = np.arange(55.0, 66.0, 5.0), street("suburb", 8), PlaceRecognition(load_network("small", 1))
 
     def seen(s: float, lateral: float, time: float) -> Points:

@@ -142,7 +142,8 @@ def test_a_map_that_does_not_fit_on_the_disk_leaves_the_one_before(
 def test_a_merge_that_is_stopped_at_its_end_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
-    """The map had its name, but no record of its content: from then on it counted as a file of another program."""
+    """A merge that was interrupted after the map had its name can be resumed. Previously, without a record of its
+    content, the map counted as a file of another program."""
     out = _fleet(tmp_path, monkeypatch)
 
     def stopped(source: Path, target: Path) -> None:
@@ -183,8 +184,8 @@ def _interrupt() -> None:
 def test_a_drive_that_was_added_to_a_merge_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replaced: bool
 ) -> None:
-    """It was added by `dpm2 run --extend`, or (`replaced`) the map is a different one, next to an older merge's
-    record."""
+    """A merge is rejected if its map contains a drive that was added by `dpm2 run --extend`, or (`replaced`) if it is a
+    different map, next to an older merge's record."""
     out = _fleet(tmp_path, monkeypatch)
     merge(tmp_path, out, SlamSettings(), nullcontext())
     if replaced:
@@ -200,7 +201,8 @@ def test_a_drive_that_was_added_to_a_merge_is_not_lost(
 
 
 def test_a_log_that_a_map_was_moved_without_is_not_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The log of a drive that was killed: the last keyframes of the moved map were lost with it."""
+    """If the log of a moved map is at the target, the merge is rejected. Previously, the last keyframes of that map,
+    whose drive was killed, were lost with its log."""
     out = _fleet(tmp_path, monkeypatch)
     log = out.with_name(f"{out.name}-wal")
     log.write_bytes(bytes(5000))
@@ -228,7 +230,8 @@ class Stopped(Cluster):
 
 
 def test_a_merge_that_is_stopped_leaves_no_drive_out(tmp_path: Path) -> None:
-    """It became a map of only the drives that had been processed, in place of the map of all."""
+    """An interrupted merge writes no map. Previously, a map of only the drives that had been processed replaced the map
+    of all."""
     for name, data in fleet_maps(3)[1].items():
         (tmp_path / name).mkdir()
         save_as(data, tmp_path / name / MAP)
@@ -260,8 +263,8 @@ def leave_a_map(folder: Path, advance: Advance, voxel: float, end: str) -> Figur
 
 
 def test_maps_of_settings_that_were_given_up_are_not_joined_with_the_new_ones(tmp_path: Path) -> None:
-    """Drives that failed or were not reached with other settings still had their old maps. These were joined with the
-    maps of the new settings without a message."""
+    """Previously, drives that failed or were not reached with new settings still had their old maps, and these were
+    joined with the maps of the new settings without a message."""
 
     def run(voxel: float, ends: dict[str, str]) -> list[str]:
         work = f"{__name__}:leave_a_map"
@@ -299,7 +302,7 @@ class Described(Cluster):
 
 
 def test_a_drive_under_two_names_is_joined_once(tmp_path: Path, noise: np.random.Generator) -> None:
-    """A copied recording was in the map twice, joined with itself, without a message."""
+    """A copied recording is left out. Previously, it was in the map twice, joined with itself, without a message."""
     search = Search(tmp_path, SlamSettings(), Described(), View())
     parts = {name: Part(f"places/{name}", "", {"version": [1, 2]}, fresh=True) for name in "abc"}
     one, other = noise.normal(size=(2, 50, WIDTH)).astype(np.float32)

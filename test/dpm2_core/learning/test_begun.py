@@ -42,7 +42,7 @@ def read(tmp_path: Path) -> Path:
 
 
 def test_the_same_training_goes_on(tmp_path: Path, read: Path) -> None:
-    """This includes settings that do not change what is learned."""
+    """The same training is resumed, also with settings that do not change what is learned."""
     folder = tmp_path / "training"
     begin_training(folder, Training(), [read], {"SRC": "a"})
     left(folder)
@@ -53,7 +53,7 @@ def test_the_same_training_goes_on(tmp_path: Path, read: Path) -> None:
 
 @pytest.mark.parametrize("changed", ["settings", "data", "content", "missing"])
 def test_another_one_begins_anew(tmp_path: Path, read: Path, changed: str) -> None:
-    """This includes a file of the same name whose content has changed."""
+    """Another training begins anew, also if only the content of a file of the same name has changed."""
     folder = tmp_path / "training"
     begin_training(folder, Training(), [read], {"SRC": "a"})
     left(folder)
@@ -68,7 +68,7 @@ def test_another_one_begins_anew(tmp_path: Path, read: Path, changed: str) -> No
 
 
 def test_it_goes_on_from_the_checkpoint_of_another_one(tmp_path: Path) -> None:
-    """It does so until the other training has a new checkpoint."""
+    """A training starts from the checkpoint of another one, and is resumed until that one has a new checkpoint."""
     start, folder = tmp_path / "start", tmp_path / "training"
     start.mkdir()
     left(start)
@@ -100,7 +100,8 @@ def test_a_folder_that_cannot_be_is_an_error_that_names_it(tmp_path: Path) -> No
 def test_a_training_is_not_resumed_with_something_else(
     tmp_path: Path, tree: dict[str, object], data: dict[str, object], difference: str
 ) -> None:
-    """It continued with another seed, rate or data without a message, and its weights recorded the last request."""
+    """Another seed, rate or data is an error. Previously, the training continued without a message, and its weights
+    recorded the last request."""
     begin_or_resume(tmp_path, False, Training(), data={"SRC": "a"})
     left(tmp_path)
     begin_or_resume(tmp_path, True, Training(), data={"SRC": "a"})
@@ -110,7 +111,8 @@ def test_a_training_is_not_resumed_with_something_else(
 
 
 def test_a_training_of_another_version_is_resumed_where_its_settings_are_the_same(tmp_path: Path) -> None:
-    """It continued without a setting that no longer exists, and with any value of a setting that was added."""
+    """A setting that no longer exists, or a different value of one that was added, is an error; previously, the
+    training continued."""
     begin_or_resume(tmp_path, False, Training())
     left(tmp_path)
     asked = tmp_path / "begun.json"
@@ -126,7 +128,7 @@ def test_a_training_of_another_version_is_resumed_where_its_settings_are_the_sam
 
 
 def test_a_training_that_needs_a_setting_is_resumed_with_the_same(tmp_path: Path) -> None:
-    """The overlap training needs `start`: its --resume ended with a traceback."""
+    """The overlap training needs `start`, and can be resumed with it; previously, --resume ended with a traceback."""
     asked = OverlapTrainingSettings(start="phase1")
     begin_or_resume(tmp_path, False, asked)
     left(tmp_path)
@@ -138,7 +140,8 @@ def test_a_training_that_needs_a_setting_is_resumed_with_the_same(tmp_path: Path
 def test_weights_of_another_content_and_other_processes_are_something_else(
     tmp_path: Path, read: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file name is the same, and torchrun runs it; settings that do not change what is learned may change."""
+    """Weights of the same name with other content, or another number of processes under torchrun, are an error.
+    Settings that do not change what is learned may change."""
     out = tmp_path / "out"
     begin_or_resume(out, False, Training(), [read])
     left(out)
@@ -166,7 +169,8 @@ def test_weights_of_another_content_and_other_processes_are_something_else(
 def test_processes_that_would_all_do_the_same_are_refused(
     tmp_path: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two processes trained a task on the same scans, to the weights of one; fine-tunings packed the same folders."""
+    """Commands that do not divide their work reject torchrun. Previously, two processes trained a task on the same
+    scans, to the weights of one, and fine-tunings packed the same folders."""
     monkeypatch.setenv("WORLD_SIZE", "2")
     places = {"DATA": str(tmp_path), "OUT": str(tmp_path / "out")}
     done = dpm2(*(places.get(word, word) for word in command))
@@ -176,7 +180,7 @@ def test_processes_that_would_all_do_the_same_are_refused(
 
 
 def test_a_checkpoint_that_does_not_say_how_it_began_is_gone_on_with(tmp_path: Path) -> None:
-    """An earlier version wrote it; a new training does not replace it."""
+    """A checkpoint of an earlier version is resumed; a new training does not replace it."""
     left(tmp_path)
     begin_or_resume(tmp_path, True, Training())
     with pytest.raises(UsageError, match="contains a training; continue it with --resume"):

@@ -60,7 +60,8 @@ def test_without_a_drive_of_some_weight_there_is_nothing_to_learn(packed: Path, 
 
 
 def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tmp_path: Path) -> None:
-    """Only LiDAR data was learned, but the metadata of the weights stated that they use images."""
+    """`data.images` without images is an error. Previously, only LiDAR data was learned, but the metadata of the
+    weights stated that they use images."""
     write_packed(tmp_path / "one", [sample._replace(images=()) for sample in samples], {})
     settings = DataSettings(packed={str(tmp_path): 1.0}, images=True)
     with pytest.raises(UsageError, match=r"data\.images: no packed drive"):
@@ -71,7 +72,8 @@ def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tm
 def test_drives_that_differ_in_their_images_alone_are_told_apart(
     samples: list[Sample], tmp_path: Path, frame: int
 ) -> None:
-    """The same points and poses, as of a world at another time of day; or the same pixels from another camera."""
+    """Drives with the same points and poses, as of a world at another time of day, or with the same pixels of another
+    camera, have different digests."""
     image = samples[frame].images[0]
     turned = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ se3.exp([0, 0, 0.1, 0, 0, 0]))
     others = [image, replace(image, pixels=255 - image.pixels), replace(image, camera=turned)]
@@ -86,7 +88,7 @@ def test_drives_that_differ_in_their_images_alone_are_told_apart(
 
 
 def test_foreign_folders_are_rejected(tmp_path: Path) -> None:
-    """They have no poses, or another format."""
+    """Folders without poses or of another format are rejected."""
     (tmp_path / "about.json").write_text("{}")
     with pytest.raises(UsageError, match="no packed drive"):
         open_packed(tmp_path)
@@ -150,7 +152,8 @@ def test_groups_are_near_and_spread() -> None:
 
 
 def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None:
-    """In a tunnel, pairs far apart taught the network to match structures that are not the same."""
+    """The radius can be set for each kind of place: in a tunnel, pairs far apart taught the network to match structures
+    that are not the same."""
     cloud = np.zeros((0, 3), np.float32)
     samples = [Sample(cloud, se3.make(np.eye(3), [x, 0, 0]), ()) for x in np.arange(100.0)]
     settings = DataSettings(radius=50, radii={"tunnel": 15})
@@ -164,7 +167,7 @@ def test_the_radius_may_be_another_where_all_looks_alike(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("setting", [{"emphasis": {"citty": 100}}, {"radii": {"tunel": 1}}])
 def test_an_unknown_place_is_rejected(setting: dict) -> None:
-    """It was accepted, but had no effect."""
+    """A misspelled place is an error. Previously, it was accepted without any effect."""
     with pytest.raises(ValidationError, match="there are city, suburb, rural"):
         DataSettings(**setting)
 
@@ -195,7 +198,7 @@ def test_average_precision_of_known_rankings() -> None:
 
 
 def test_batches_depend_on_their_number_alone(packed: Path) -> None:
-    """Thus a resumed run, with any number of workers, receives the same batches."""
+    """A resumed run, with any number of workers, receives the same batches."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, images=True, workers=0)
     data = GroupDataset(settings, tiny(), settings.draw, seed=3)
     later = GroupDataset(settings.model_copy(update={"workers": 2}), tiny(), settings.draw, seed=3)
@@ -208,7 +211,8 @@ def test_batches_depend_on_their_number_alone(packed: Path) -> None:
 
 @pytest.mark.parametrize("every", [False, True])
 def test_a_scan_that_shows_nothing_does_not_end_a_training(samples: list[Sample], tmp_path: Path, every: bool) -> None:
-    """As next to a truck: another place is drawn. It is an error only if there is no other place."""
+    """If a scan is nearly empty, as next to a truck, another place is drawn. It is an error only if there is no other
+    place."""
     nothing = [sample._replace(cloud=sample.cloud[:3]) for sample in samples]
     write_packed(tmp_path / "world", nothing if every else [*samples, nothing[0]], {})
     settings = DataSettings(packed={str(tmp_path): 1.0}, groups=1, frames=2)

@@ -161,8 +161,9 @@ def carried(frame: Frame) -> Frame:
 
 @pytest.mark.slow
 def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording: Path) -> None:
-    """The pose of the second part relative to the first is a guess, but was used for training and evaluation. The last
-    scan before the pause is left out: the motion to the next scan, which its de-skewing needs, is invalid."""
+    """The pose of the second part relative to the first is only a guess, and must not be used for training or
+    evaluation. The last scan before the pause is left out: the motion to the next scan, which its de-skewing needs, is
+    invalid."""
     referenced = refer(InMemory([*map(carried, open_source(recording).frames())]), GEOMETRIC)
     poses, truth = referenced.poses, _truth(recording)
     there = np.flatnonzero(np.isfinite(poses).all((1, 2)))
@@ -180,7 +181,8 @@ def test_scans_on_two_sides_of_a_pause_that_is_not_bridged_are_no_pair(recording
 
 @pytest.mark.slow
 def test_times_that_the_motion_contradicts_do_not_bend_what_is_learned_from() -> None:
-    """The SLAM detects that the clouds are de-skewed already; they were packed de-skewed a second time."""
+    """The SLAM detects that the clouds are de-skewed already, and they are packed as they are; previously, they were
+    de-skewed a second time."""
     lidar = LidarConfig(beams=32, columns=512, height=1.4, car_body=False)
     robot = TurningRobot(build_world("loop", "suburb", seed=1, length=300.0), 40, RIDES["waved"], lidar)
     frames = []
@@ -224,7 +226,8 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
 def test_the_reference_leaves_as_many_threads_as_there_were(
     recording: Path, packed: Path, tmp_path: Path, settings: FinetuneSettings
 ) -> None:
-    """The SLAM used all but one, and --resume, with no references left to compute, used all: other weights resulted."""
+    """The number of threads after the reference's SLAM is as before it. Previously, training used fewer threads than
+    --resume, which computes no reference, and other weights resulted."""
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
@@ -285,7 +288,8 @@ def test_errors_of_use_are_one_line(recording: Path, tmp_path: Path, settings: F
 def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
     recording: Path, packed: Path, samples: list[Sample], tmp_path: Path, settings: FinetuneSettings
 ) -> None:
-    """After packing them again with another drive, other weights resulted without a message."""
+    """If the drives for the rehearsal changed, --resume is an error. Previously, other weights resulted without a
+    message."""
     short = tmp_path / "short" / "velodyne" / "000000.bin"
     short.parent.mkdir(parents=True)
     shutil.copy(recording / "sequences" / "00" / "velodyne" / "000000.bin", short)

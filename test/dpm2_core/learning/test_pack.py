@@ -59,7 +59,7 @@ class Sweeps(IndexedSource):
 
 
 def test_a_room_is_packed_as_the_network_sees_it(tmp_path: Path) -> None:
-    """It is enlarged, including the trajectory."""
+    """A room is enlarged, including its trajectory."""
     poses = rooms.walk(5)
     source = InMemory(rooms.frames(poses))
     source.poses = poses
@@ -90,7 +90,7 @@ class Leaning(IndexedSource):
 
 
 def test_scans_of_a_sensor_that_leans_are_packed_in_level_axes(tmp_path: Path) -> None:
-    """The network receives them in these axes; poses and cameras are transformed with them."""
+    """Points are in level axes, as the network receives them; poses and cameras are transformed with them."""
     source = Leaning()
     pack(source, tmp_path / "d", tiny())
     drive = PackedDrive(tmp_path / "d")
@@ -124,8 +124,8 @@ def test_packed_sweeps_are_rigid_and_fit_each_other(tmp_path: Path) -> None:
 
 
 def test_a_scan_that_shows_hardly_anything_is_left_out_and_said(kitti: Path, tmp_path: Path) -> None:
-    """An empty file, and a scan that shows only the sensor's own housing: the first validation pair with such a scan
-    ended the training, and also every resumed one."""
+    """An empty file, and a scan that shows only the sensor's own housing, are left out. Previously, the first
+    validation pair with such a scan ended the training, and also every resumed one."""
     drive, out = kitti / "sequences" / "03", tmp_path / "d"
     (drive / "velodyne" / "000000.bin").write_bytes(b"")
     np.full((500, 4), 0.2, np.float32).tofile(drive / "velodyne" / "000002.bin")
@@ -235,7 +235,8 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
 
 
 def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path, tmp_path: Path) -> None:
-    """The first drive without scans or with a missing image ended this call and each later one, without being named."""
+    """Other drives are packed, and the failed ones are named. Previously, the first drive without scans or with a
+    missing image ended this call and each later one."""
     for name in ("01", "05"):
         shutil.copytree(kitti / "sequences" / "03", kitti / "sequences" / name)
     for scan in (kitti / "sequences" / "01" / "velodyne").iterdir():
@@ -275,7 +276,7 @@ def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path
 def test_a_packed_drive_that_is_damaged_is_an_error_when_it_is_opened(
     file: str, content: bytes | list[Any] | None, tmp_path: Path
 ) -> None:
-    """It is not an error in the middle of a training, nor undetected; None: truncated."""
+    """The error comes when the drive is opened, not in the middle of a training. None: the file is truncated."""
     folder = tmp_path / "one"
     image = Image(np.zeros((4, 8, 3), np.uint8), Camera(np.eye(3), np.eye(4), (8, 4)))
     write_packed(folder, [Sample(np.zeros((5, 3), np.float32), np.eye(4), (image,)) for _ in range(3)], {})
@@ -317,7 +318,7 @@ def test_a_world_that_cannot_be_written_ends_the_others(tmp_path: Path) -> None:
 
 
 def test_worlds_of_other_settings_are_not_taken_for_those_that_are_asked_for(tmp_path: Path) -> None:
-    """A set that is continued with another sensor would silently mix both."""
+    """This is an error, since a set that is continued with another sensor would silently mix both."""
     settings = GenerateSettings(worlds=1, frames=2, length=60, beams=16, mixture={"tunnel": 1})
     generate(tmp_path, settings, 1)
     generate(tmp_path, settings, 1)

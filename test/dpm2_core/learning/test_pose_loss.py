@@ -81,7 +81,7 @@ def test_what_has_diverged_starts_at_the_truth_and_learns_what_pulls_it_away() -
 
 
 def test_features_that_are_not_finite_take_the_truth() -> None:
-    """A step without a pose has no gradient, instead of one that is not a number."""
+    """The pose is then the truth, without a gradient, so that no gradient is NaN."""
     torch.manual_seed(0)
     model = DeepPointMap2(tiny()).eval()
     source, target = places(60, model.settings.channels)

@@ -79,13 +79,13 @@ def test_the_recipes_of_the_paper_are_of_its_network_and_fit_each_other() -> Non
 
 @pytest.mark.parametrize("name", ["train_paper_registration", "train_paper_overlap"])
 def test_the_recipes_of_the_paper_change_scans_as_its_predecessor_and_leave_images_as_they_are(name: str) -> None:
-    """By default, exposure, colors and calibration are changed at random, too."""
+    """The defaults would also change exposure, colors and calibration at random."""
     settings = load_settings(READ_BY[name], CONFIG / f"{name}.yaml").data.augment
     changed = {key for key, value in settings if value != getattr(UNCHANGED, key)}
     assert changed == {"drop", "occlusion", "jitter", "yaw", "tilt", "shift"}
 
 
 def test_the_papers_network_has_its_reference_points() -> None:
-    """They are the farthest ones, as in v1; the paper's network had half of them on edges and corners, as `small`
-    does."""
+    """They are the farthest ones, as in v1. Previously, the paper's preset had half of them on edges and corners, as
+    `small` does."""
     assert [preset(name).fusion.reference for name in ("paper", "v1")] == ["fps", "fps"]

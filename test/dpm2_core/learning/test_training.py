@@ -127,7 +127,8 @@ def test_a_checkpoint_of_another_network_is_rejected(settings: RegistrationTrain
 
 
 def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTrainingSettings, tmp_path: Path) -> None:
-    """Its weights recorded two steps instead of four."""
+    """A checkpoint with more steps than requested is an error. Previously, the weights recorded two steps instead of
+    four."""
     train_registration(settings, tmp_path / "out")
     fewer = settings.model_copy(update={"optimiser": settings.optimiser.model_copy(update={"steps": 2})})
     with pytest.raises(UsageError, match=r"has 4 steps, optimiser\.steps wants 2"):
@@ -160,7 +161,8 @@ def trainer(module: Toy, out: Path, saved: list[Toy] | None = None, **steps: int
 
 
 def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
-    """Each step was skipped, and untrained weights were written as if the training had succeeded."""
+    """If each step is skipped, the training is an error. Previously, untrained weights were written as if it had
+    succeeded."""
     saved: list[Toy] = []
     with pytest.raises(Dpm2Error, match="none of 3 steps had a finite gradient"):
         trainer(line(lambda x, y: y.sum() * torch.nan), tmp_path, saved, steps=3).run()
@@ -168,9 +170,9 @@ def test_a_training_that_learns_nothing_says_so(tmp_path: Path) -> None:
 
 
 def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
-    """A second training could begin in it until the first checkpoint, also with other settings. The log then mixed both
-    or had either. One checkpoint and one set of weights were left of two trainings that had both ended without an
-    error."""
+    """A second training in the same folder is an error, also before the first checkpoint. Previously, the log mixed
+    both or had either, and one checkpoint and one set of weights were left of two trainings that had both ended without
+    an error."""
     steps, kept = OptimizerSettings(steps=3, seed=1), tmp_path / "begun.json"
     begin_or_resume(tmp_path, False, OptimizerSettings(steps=3))
     before = kept.read_text()
@@ -191,7 +193,8 @@ def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
 
 
 def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
-    """The other steps were skipped, for hours, and weights after the few first ones were written without an error."""
+    """A training that diverges is an error. Previously, the other steps were skipped, for hours, and weights after the
+    few first ones were written."""
     saved: list[Toy] = []
     module = line(lambda x, y: y.square().sum() * (1.0 if float(x[0]) < 7 else torch.nan))
     batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
@@ -203,8 +206,8 @@ def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
 def test_the_progress_of_a_training_is_that_of_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It goes to stderr, in lines if there is no terminal, and not with --quiet; it was a bar among the results, in any
-    case."""
+    """Progress goes to stderr, in lines if there is no terminal, and not with --quiet. Previously, it was a bar among
+    the results in any case."""
 
     def shown(quiet: bool) -> tuple[str, list[str]]:
         token = QUIET.set(quiet)
@@ -222,7 +225,8 @@ def test_the_progress_of_a_training_is_that_of_every_command(
 
 
 def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None:
-    """The means of the validation drives entered the weights: each figure came from a forward pass in training mode."""
+    """Validation does not change the running means. Previously, means of the validation drives entered the weights,
+    since each figure came from a forward pass in training mode."""
     saved: list[Toy] = []
     for name, validate in (("with", lambda m: {"seen": float(m(torch.full((8, 2), 100.0))[0])}), ("without", None)):
         module = Toy(torch.nn.BatchNorm1d(2), lambda x, y: (y - x).square().mean())
@@ -232,7 +236,8 @@ def test_validation_leaves_the_running_means_as_they_are(tmp_path: Path) -> None
 
 
 def test_a_validation_that_is_stopped_is_repeated(tmp_path: Path) -> None:
-    """The checkpoint recorded its step as done, so the figures of the last steps were lost."""
+    """A validation that was interrupted is repeated. Previously, the checkpoint recorded its step as done, so the
+    figures of the last steps were lost."""
     outcomes = iter([1.0, None, 2.0])
 
     def validate(module: Toy) -> dict[str, float]:
@@ -269,7 +274,8 @@ def test_a_checkpoint_that_does_not_fit_is_an_error_of_use(damage: str, tmp_path
 
 @pytest.mark.parametrize("damage", ["empty", "text", "zeros", "half", "flipped", "folder", "none"])
 def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path) -> None:
-    """The message was empty, or paragraphs from torch about its own settings; flipped bytes were loaded as weights."""
+    """The error is one line. Previously, it was empty, or paragraphs from torch about its own settings, and flipped
+    bytes were loaded as weights."""
     path, module = tmp_path / "checkpoint.pt", torch.nn.Linear(32, 32)
     made = make_optimizer(module, OptimizerSettings())
     save_checkpoint(path, module, module, made, 7)
@@ -300,7 +306,8 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
 def test_drives_that_were_packed_anew_are_not_gone_on_with(
     settings: RegistrationTrainingSettings, packed: Path, tmp_path: Path
 ) -> None:
-    """The same number of frames does not mean the same frames."""
+    """Drives that were packed again are an error on --resume: the same number of frames does not mean the same
+    frames."""
     drives = shutil.copytree(packed, tmp_path / "drives")
     settings = settings.model_copy(
         update={"data": settings.data.model_copy(update={"packed": {str(drives): 1.0}}), "validation": ""}
@@ -331,7 +338,7 @@ def test_overlap_changes_the_heads_that_judge_alone(settings: RegistrationTraini
 def test_the_decoder_alone_learns_where_the_encoder_does_not(
     settings: RegistrationTrainingSettings, tmp_path: Path
 ) -> None:
-    """Thus the descriptors stay those of the weights that it started from."""
+    """If the encoder is not trained, the descriptors stay those of the weights that the training started from."""
     start = train_registration(settings, tmp_path / "one")
     second = settings.model_copy(update={"start": str(start), "encoder": False})
     before, after = load_file(start), load_file(train_registration(second, tmp_path / "two"))
@@ -343,7 +350,8 @@ def test_the_decoder_alone_learns_where_the_encoder_does_not(
 def test_overlap_with_images_is_validated_on_worlds_without(
     settings: RegistrationTrainingSettings, samples: list[Sample], tmp_path: Path
 ) -> None:
-    """The recipe of the shipped weights does this: it was an error that no packed drive has images."""
+    """As in the recipe of the shipped weights, images are used for training only. Previously, it was an error that no
+    packed drive for validation has images."""
     write_packed(tmp_path / "val" / "world", [sample._replace(images=()) for sample in samples], {"source": "boxes"})
     start = train_registration(settings, tmp_path / "one")
     second = _overlap(settings, start, steps=1)
@@ -353,8 +361,8 @@ def test_overlap_with_images_is_validated_on_worlds_without(
 
 
 def test_what_a_training_makes_of_its_scans_is_not_measured(samples: list[Sample], tmp_path: Path) -> None:
-    """Trainings with different augmentation were evaluated on different scans, whose distance of 20 m depended on the
-    shift by the augmentation."""
+    """Augmentation does not change the validation. Previously, trainings with different augmentation were evaluated on
+    different scans, whose distance of 20 m depended on the shift by the augmentation."""
     apart = se3.exp([0, 0, 0, 1, 0, 0])
     drive = [s._replace(pose=np.linalg.matrix_power(apart, 9 * k)) for k, s in enumerate(samples)]
     write_packed(tmp_path / "val" / "world", drive, {"source": "boxes", "preset": "city"})
@@ -369,7 +377,8 @@ def test_what_a_training_makes_of_its_scans_is_not_measured(samples: list[Sample
 
 
 def test_overlap_leaves_the_running_means_of_the_encoder_as_they_are() -> None:
-    """Backbones of timm have running means: the descriptors no longer equaled those of the maps."""
+    """Backbones of timm have running means. They must not change in the overlap training: the descriptors would no
+    longer equal those of the maps."""
     module = OverlapTraining(tiny()).train()
     assert module.model.decoder.training
     assert not any(part.training for part in module.model.encoder.modules())
@@ -396,8 +405,8 @@ class Normed(torch.nn.Module):
 def test_an_encoder_that_does_not_learn_keeps_its_running_means(
     phase: str, settings: RegistrationTrainingSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Backbones of timm have running means. They were those of the training's last batches: the descriptors no longer
-    equaled those of the maps, which then rejected these weights."""
+    """Backbones of timm have running means. Previously, they became those of the training's last batches: the
+    descriptors no longer equaled those of the maps, which then rejected these weights."""
     monkeypatch.setitem(sys.modules, "timm", SimpleNamespace(create_model=lambda *_, **__: Normed()))
     network = merged(settings.network, {"image": {"backbone": "timm:normed"}})
     settings = settings.model_copy(update={"network": network, "validation": ""})
@@ -544,7 +553,7 @@ def test_tensorboard_has_the_figures_of_the_log(settings: RegistrationTrainingSe
 
 
 def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its package is optional."""
+    """The package of tensorboard is optional."""
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # as a missing package appears to an import
     log = Log(tmp_path)
     log.write(7, {"loss": 0.5})
@@ -554,7 +563,7 @@ def test_without_tensorboard_the_log_alone_is_written(tmp_path: Path, monkeypatc
 
 
 def test_a_log_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
-    """Steps since the last checkpoint are repeated after a kill; they were in the log twice."""
+    """After a kill, steps since the last checkpoint are repeated; their earlier lines are removed from the log."""
     log = Log(tmp_path)
     for step in range(4):
         log.write(step, {"loss": 0.5})

@@ -89,7 +89,8 @@ def test_unknown_preset_and_backbone_are_rejected() -> None:
     ],
 )
 def test_settings_that_do_not_fit_each_other_are_named(changes: dict[str, Any], message: str) -> None:
-    """They ended in tracebacks, some of them at the first step of a training."""
+    """The error names the settings. Previously, they ended in tracebacks, some of them at the first step of a
+    training."""
     with pytest.raises(UsageError, match=f"preset small.*{message}"):
         preset("small", changes)
 
@@ -128,7 +129,8 @@ def test_padding_changes_nothing(model: DeepPointMap2, noise: np.random.Generato
 
 
 def test_a_result_that_is_not_finite_is_an_error(noise: np.random.Generator) -> None:
-    """As from a library that does not write parts of its results, or from damaged weights."""
+    """A result with values that are not finite, as from damaged weights or a library that does not write parts of its
+    results, is an error."""
     broken = DeepPointMap2(tiny()).eval()
     with torch.no_grad():
         next(broken.encoder.parameters()).fill_(torch.nan)

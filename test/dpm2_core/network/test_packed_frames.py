@@ -51,8 +51,8 @@ def test_a_cloud_cropped_anew_is_like_one_that_was_never_packed(change: dict[str
 
 
 def test_a_network_with_a_coarser_grid_learns_and_is_measured_on_it(packed: Path) -> None:
-    """That is the grid in use. Before, it was trained and evaluated on the grid of the packed drive, so that no grid
-    made a difference until the network drove."""
+    """A packed drive is cropped again to a coarser grid. Previously, such a network was trained and evaluated on the
+    grid of the packed drive, and used another grid only when it drove."""
     settings = DataSettings(packed={str(packed): 1.0}, groups=1, frames=2, workers=0)
     coarse = tiny(points={"voxel": 6.0})
     learned, measured = [], []

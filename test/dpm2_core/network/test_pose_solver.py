@@ -63,7 +63,8 @@ def test_outliers_are_left_out(noise: np.random.Generator) -> None:
 
 
 def test_the_papers_start_trusts_the_most_confident(noise: np.random.Generator) -> None:
-    """It is correct if those are, however wrong the rest is. It fails if they are wrong, where a consensus does not."""
+    """The paper's start is correct if its most confident matches are, however wrong the rest is. If they are wrong, it
+    fails, but a consensus does not."""
     pairs, T = perfect(noise)
     right = torch.arange(pairs.source.shape[1]) % 12 < 7  # 70 of 120, in both halves
     target = torch.where(
@@ -124,7 +125,7 @@ def test_alternatives_of_matches_without_weight_are_the_known_pose(noise: np.ran
 
 
 def test_guidance_leaves_what_the_pose_brings_together() -> None:
-    """Descriptors that the pose moves far apart cannot match; among near ones the scores decide, as before."""
+    """Descriptors that the pose moves far apart cannot match; for near ones the scores do not change."""
     xyz = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]])
     tokens = Tokens(xyz, torch.zeros(1, 3, 4), torch.zeros(1, 3, 2), torch.ones(1, 3, dtype=torch.bool))
     scores = torch.rand(1, 3, 3)

@@ -43,7 +43,7 @@ def test_bf16_is_used_where_the_processor_has_it(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("features", [("avx2",), ("avx2", "avx512f", "avx512bw"), ("neon",)])
 def test_elsewhere_float32(monkeypatch: pytest.MonkeyPatch, features: tuple[str, ...]) -> None:
-    """These are desktop processors, and servers from before 2020."""
+    """Desktop processors, and servers from before 2020, use float32."""
     processor(monkeypatch, *features)
     with precision.mixed_precision(CPU):
         assert not torch.is_autocast_enabled("cpu")

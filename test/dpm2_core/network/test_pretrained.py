@@ -76,7 +76,7 @@ def test_a_run_with_every_part_that_has_a_network_opens_each_file_once(
 
 
 def test_a_file_that_changed_is_loaded_again(network_file: Path, model: DeepPointMap2, opened: Counter[str]) -> None:
-    """Networks that are already in use do not change."""
+    """A changed file is loaded again; networks that are already in use do not change."""
     one, same = load_network(str(network_file), 1), load_network(str(network_file), 1)
     with torch.no_grad():
         next(model.parameters()).add_(1)
@@ -128,7 +128,8 @@ def test_loading_does_not_import_the_compiler_of_torch() -> None:
 
 
 def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPointMap2, tmp_path: Path) -> None:
-    """With a new decoder the descriptors are the same, but their maps were treated as made with other weights."""
+    """A new decoder does not change the descriptors, so that maps with them stay valid; previously, such maps counted
+    as made with other weights."""
     file = tmp_path / "tiny.safetensors"
     save_weights(model, file, {})
     before = weights_id(str(file))
@@ -141,7 +142,7 @@ def test_a_map_outlives_another_decoder_and_not_another_encoder(model: DeepPoint
 
 
 def test_the_encoder_of_another_network_is_another_one(tmp_path: Path) -> None:
-    """The tensors are the same, but the settings for processing a scan differ."""
+    """If the settings for processing a scan differ, the encoder counts as another one, even with the same tensors."""
     torch.manual_seed(0)
     network, file = DeepPointMap2(tiny()), tmp_path / "tiny.safetensors"
     save_weights(network, file, {})

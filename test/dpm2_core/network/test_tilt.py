@@ -114,7 +114,7 @@ def test_where_there_is_nothing_to_level_the_descriptors_are_those_of_the_scan_a
 
 
 def test_what_hangs_or_lies_by_its_mounting_is_described_as_if_it_stood(noise: np.random.Generator) -> None:
-    """The mounting alone defines the level if no ground is visible, and both do if ground is visible."""
+    """If no ground is visible, the mounting alone defines the level; if ground is visible, both do."""
     network, standing = model(), street(noise)
     R = np.diag([1.0, -1, -1])  # exact, so that the rotated scan is the same
     plain, found = network.describe(frame(standing)), network.describe(replace(frame(standing @ R), up=(0.0, 0.0, -1)))

@@ -43,7 +43,8 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
 
 
 def test_the_same_weights_are_the_same_file(model: DeepPointMap2, tmp_path: Path) -> None:
-    """The metadata was written in any order, so that equal trainings counted as other weights for a map."""
+    """Equal weights and metadata give equal files. Previously, the metadata was written in any order, so that equal
+    trainings counted as other weights for a map."""
     path = tmp_path / "equal.safetensors"
     about = {key: f"{key} \u00e4\n" for key in "abcdefgh"}
     files = set()

@@ -93,7 +93,8 @@ def in_slots(scans: int = 2, columns: int = 512) -> np.ndarray:
 def test_points_in_slots_stay_where_they_are_in_whatever_order_the_columns_come(
     tmp_path: Path, start: int, mirrored: bool
 ) -> None:
-    """Points of arrays that begin at another azimuth, or go to the right, were rotated or mirrored."""
+    """Arrays that begin at another azimuth, or go to the right, give the same points; previously, these were rotated or
+    mirrored."""
     plain = in_slots()
     other = np.roll(plain[:, :, ::-1] if mirrored else plain, start, axis=2)
     for name, xyz in (("plain", plain), ("other", other)):

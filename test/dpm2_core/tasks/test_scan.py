@@ -37,7 +37,8 @@ def test_a_scan_is_what_its_files_hold(write_drive: Callable[..., Path], tmp_pat
 
 
 def test_points_that_are_none_are_left_out_with_their_classes(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """An unknown intensity becomes 0: GndNet learned nothing from such scans, or its training stopped."""
+    """Invalid points are removed with their classes, and an unknown intensity becomes 0. Previously, GndNet learned
+    nothing from such scans, or its training stopped."""
     folder = write_drive(tmp_path / "00", range(2))
     path = folder / "velodyne" / "000000.bin"
     raw = np.fromfile(path, "<f4").reshape(-1, 4)
@@ -118,7 +119,8 @@ def test_damaged_files_are_named_at_once(
 
 
 def test_a_name_is_that_of_the_outermost_folders_that_have_it(write_drive: Callable[..., Path], tmp_path: Path) -> None:
-    """Each drive of `dpm2 train tasks-data` is a data set with a sequence 00: that name selected all of them."""
+    """Each drive of `dpm2 train tasks-data` is a data set with a sequence 00. Previously, the name 00 selected all of
+    these."""
     for drive in ("00", "01"):
         write_drive(tmp_path / drive / "sequences" / "00")
     assert open_scans(tmp_path, sequences=["00"]).lengths == open_scans(tmp_path / "00").lengths
