@@ -209,8 +209,9 @@ def test_a_drive_that_is_one_file_is_its_own_ground_truth(tmp_path: Path) -> Non
 
 
 def test_frames_of_a_drive_without_a_pose_stay(tmp_path: Path) -> None:
-    """Scans 3 and 4 are missing, and the poses end at frame 6. Previously, the estimate's ten lines were taken for
-    frames 0 to 9, since there are more lines than known poses; an exact estimate had a t_err of 28 %."""
+    """Frames keep their numbers if scans 3 and 4 are missing and the poses end at frame 6. Previously, the estimate's
+    ten lines were taken for frames 0 to 9, since there are more lines than known poses; an exact estimate had a t_err
+    of 28 %."""
     folder, poses = drive_with_truth(tmp_path, range(12))
     for n in (3, 4):
         (folder / "velodyne" / f"{n:06d}.bin").unlink()
