@@ -231,7 +231,7 @@ def test_processors_are_limited_inside_the_block_alone() -> None:
 def test_drives_are_read_as_the_settings_say(sequence: Path) -> None:
     options = Options(sources=[sequence], overrides=["input.vertical_angle_correction_deg=0.3"])
     with drives(options) as sources:
-        assert [source.vertical_angle_correction_deg for source in sources.values()] == [0.3]  # the recording says 0
+        assert [source.vertical_angle_correction_deg for source in sources.values()] == [0.3]  # the recording has 0
 
 
 def test_a_packed_excerpt_is_unpacked_for_as_long_as_the_run_lasts(

@@ -32,7 +32,7 @@ def test_each_way_is_given_the_samples_that_its_name_says(tmp_path: Path, monkey
     assert row["ratio"] == row["with"]["ape_rmse_m"] / row["without"]["ape_rmse_m"]
     assert row["with"]["worst_tilt_deg"] < 3
     without, with_it = (results["pauses"][way] for way in ("without", "with"))
-    assert list(without) == list(with_it) == ["1 s", "2 s", "all"]  # what 4.5 s have room for, with what is around
+    assert list(without) == list(with_it) == ["1 s", "2 s", "all"]  # pauses that fit into 4.5 s, with surroundings
     assert without["all"]["gaps"] == 10
     assert with_it["all"]["bridged"] >= without["all"]["bridged"]
     assert with_it["all"]["median_error_m"] <= with_it["all"]["worst_error_m"] <= without["all"]["worst_error_m"] + 0.1

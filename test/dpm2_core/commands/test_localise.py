@@ -58,7 +58,7 @@ def test_the_drive_is_found_in_the_map_which_stays_as_it_is(
     hints = [] if hint is None else ["--hint", hint]
     out = tmp_path / "out"
     out.mkdir()
-    (out / "metrics.json").write_text("{}")  # of a run that made a map
+    (out / "metrics.json").write_text("{}")  # left by a run that made a map
     done = succeeded("run", recording, "--out", out, "--frames", "8:24", "--localise", map_, *hints, *QUICK)
     assert hashlib.sha256(made.read_bytes()).hexdigest() == before
     assert sorted(path.name for path in made.parent.iterdir()) == ["drive.dpm2map", "out"]

@@ -49,7 +49,7 @@ def test_experiments_below_a_folder_have_their_tables_by_its_name(tmp_path: Path
         run.mkdir(parents=True)
         write_tum(run / "trajectory.tum", [1, 2], np.stack([np.eye(4)] * 2))
     (tmp_path / "out" / "notes").mkdir()
-    (tmp_path / "out" / "notes" / "kitti.json").write_text("{}")  # of another program
+    (tmp_path / "out" / "notes" / "kitti.json").write_text("{}")  # written by another program
     done, page = report(tmp_path / "r.html", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     for name, value in (("first", "0.250"), ("second", "1.250")):

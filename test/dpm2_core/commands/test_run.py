@@ -171,7 +171,7 @@ def test_a_run_leaves_nothing_of_the_one_before(sequence: Path, tmp_path: Path) 
     out = tmp_path / "out"
     run = ("run", sequence, "--out", out, "--frames", ":3", *QUICK)
     assert dpm2(*run).returncode == 0
-    (out / "localisation.json").write_text("{}")  # of a localization in a map
+    (out / "localisation.json").write_text("{}")  # left by a localization in a map
     assert (out / "metrics.json").exists()
     (sequence / "poses.txt").unlink()
     assert dpm2(*run).returncode == 0

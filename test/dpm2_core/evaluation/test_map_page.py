@@ -37,7 +37,7 @@ def test_positions_come_back(noise: np.random.Generator) -> None:
     np.testing.assert_allclose(ahead, data.poses[:, :2, 0], atol=1e-3)  # the page's resolution is 0.1 degrees
     points = np.frombuffer(base64.b64decode(found["points"]), "<i2").reshape(-1, 3) * found["scale"] + found["middle"]
     away = np.abs(np.hypot(points[:, 0], points[:, 1]) - np.hypot(*data.poses[0, :2, 3]))
-    np.testing.assert_allclose(away, 8.0, atol=0.1)  # of the walls, in clouds that are packed to half a centimeter
+    np.testing.assert_allclose(away, 8.0, atol=0.1)  # from the walls, in clouds packed to half a centimeter
     assert [len(track) for track in found["tracks"]] == [24]
     assert [(loop["ok"], loop["reason"]) for loop in found["loops"]] == [(True, ""), (False, "<b>points</b> disagree")]
 

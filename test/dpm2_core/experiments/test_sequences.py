@@ -71,7 +71,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     record = json.loads((out / "kitti.json").read_text())
     speeds = {row["name"]: row["cells"]["10"] for row in record["tables"][1]["rows"]}
     assert speeds["dpm2 geometric"]["fps"] > 0
-    assert speeds["other-slam"] == {"ape_rmse_m": pytest.approx(0, abs=1e-4), "fps": None}  # a file tells no time
+    assert speeds["other-slam"] == {"ape_rmse_m": pytest.approx(0, abs=1e-4), "fps": None}  # a file has no times
     assert record["request"]["lengths"] == [2.0, 3.0]
     assert record["parts"]["dpm2_geometric/06"]["truth"] == "poses/06.txt"
     assert (out / "trajectories_10.png").stat().st_size > 5000

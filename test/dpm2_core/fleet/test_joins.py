@@ -33,8 +33,7 @@ LIDAR = Lidar(LidarConfig(columns=1024))
 
 
 class Asked(LoopCloser):
-    """Finds no loop, and records for which keyframe it was called, and which keyframes it was told have their own
-    clouds."""
+    """Finds no loop, and records the keyframe of each call, and the keyframes with clouds of their own."""
 
     channels = None
 

@@ -254,7 +254,7 @@ def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path
     assert "03: left out: 03: frame 2 has no usable image of camera_color_left, frame 0 has one" in done.stderr
     assert done.stderr.endswith("dpm2: 2 of 3 drives were left out: 01, 03\n")
     assert [packed.name for packed in open_packed(tmp_path / "all")] == ["05"]
-    assert dpm2("train", "pack", kitti, tmp_path / "all", "--all", "--preset", "none").returncode == 2  # of any drive
+    assert dpm2("train", "pack", kitti, tmp_path / "all", "--all", "--preset", "none").returncode == 2  # for any drive
 
 
 @pytest.mark.parametrize(

@@ -620,7 +620,7 @@ def test_the_whole_loop_runs_under_torchrun(settings: RegistrationTrainingSettin
     assert done.returncode == 0, done.stderr[-3000:]
     assert sorted(losses(tmp_path / "two")) == [0, 1, 2, 3]
     rows = (tmp_path / "two" / "log.jsonl").read_text().splitlines()
-    assert len([row for row in rows if '"loss"' in row]) == 4  # of one rank
+    assert len([row for row in rows if '"loss"' in row]) == 4  # from one rank only
     train_registration(settings, tmp_path / "one")
     one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys()
