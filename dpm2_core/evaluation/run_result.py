@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ class Result:
         imu: number of frames by the reason why the IMU was unusable, "used" if it was used; empty without an IMU.
         problems: number of frames by the problem with an image or with the times of their points, in words.
         frame_methods: registration method of each frame, "failed" if it failed. frame_states: state after each frame.
-        seconds: wall time of each frame by stage.
+        seconds: wall time of each frame by stage; 0 for a stage that the frame did not pass.
         wall_s: of the whole run, reading included.
         lengths: of the KITTI metric's segments, m.
     """
@@ -89,8 +90,9 @@ class Result:
         if tracked.imu is not None:
             self.imu[tracked.imu or "used"] += 1
         self.problems.update(problem for problem in (tracked.camera, tracked.times) if problem)
-        for stage, time in tracked.seconds.items():
-            self.seconds.setdefault(stage, []).append(time)
+        for stage in {**self.seconds, **tracked.seconds}:  # parts of a sweep pass only some stages
+            times = self.seconds.setdefault(stage, [0.0] * (len(self) - 1))
+            times.append(tracked.seconds.get(stage, 0.0))
 
     @property
     def registered(self) -> list[bool]:
@@ -144,7 +146,8 @@ class Result:
 
     @property
     def timing(self) -> dict[str, Any]:
-        """Content of timing.json."""
+        """Content of timing.json; the times of the stages are those of whole sweeps."""
+        whole = [method != BETWEEN for method in self.frame_methods]
         stages = {**self.seconds, "total": self._frame_seconds.tolist()}
         return {
             "frames": len(self),
@@ -155,7 +158,7 @@ class Result:
             "breaks": self.recorder.breaks,
             **({"imu": dict(self.imu)} if self.imu else {}),
             **({"problems": dict(self.problems)} if self.problems else {}),
-            "stages_ms": {stage: _summary(times) for stage, times in stages.items()},
+            "stages_ms": {stage: _summary([*compress(times, whole)]) for stage, times in stages.items()},
         }
 
     @cached_property
