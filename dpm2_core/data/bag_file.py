@@ -37,8 +37,8 @@ from dpm2_core.errors import UsageError, one_line
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _NO_SCHEMA = "__schemaless__"  # rosbags' name of a type that is missing in a file's summary
-_LARGEST = 1 << 29  # bytes of a message: an image of 67 million pixels may have 6 bytes each
-_LATEST = 2**63 - 1  # ns; MCAP allows twice that
+_MAX_MESSAGE_BYTES = 1 << 29  # bytes of a message: an image of 67 million pixels may have 6 bytes each
+_MAX_TIME = 2**63 - 1  # ns; MCAP allows twice that
 
 
 @dataclass(eq=False)
@@ -72,7 +72,7 @@ class Bag:
         try:
             for topic, time, data in self._read(requested):
                 count += 1
-                yield topic, min(time, _LATEST), _unpacked(data)
+                yield topic, min(time, _MAX_TIME), _decompressed(data)
         except Exception as error:  # a damaged chunk raises anything from ReaderError to struct.error
             self.notes.append(
                 f"{self.path}: damaged after {count} messages of {', '.join(requested)} ({one_line(error)})"
@@ -96,7 +96,7 @@ class Bag:
         try:
             if self.types[topic] in LIVOX:
                 return cloud_of_custom(data)
-            return _jazzy().deserialize_cdr(data, self.types[topic])
+            return _jazzy_types().deserialize_cdr(data, self.types[topic])
         except Exception as error:  # overwritten bytes raise anything from SerdeError to UnicodeDecodeError
             raise MessageError(f"{topic}: message of {len(data)} bytes is damaged ({one_line(error)})") from None
 
@@ -127,19 +127,19 @@ def open_bag(path: Path) -> Bag:
         return _open_file(path)
     files = sorted(file for file in path.iterdir() if file.suffix in STORAGES and file.is_file())
     check_unpacked(path.iterdir())
-    types, missing = dict[str, str](), ""
+    types, problem = dict[str, str](), ""
     try:
         if files:
             files, types = recorded(path)
         else:  # of rosbag record --split
-            files, missing = sorted(path.glob("*.bag")), f"{path}: bags of ROS 1 in one folder are one recording"
+            files, problem = sorted(path.glob("*.bag")), f"{path}: bags of ROS 1 in one folder are one recording"
     except UsageError as error:
-        missing = str(error)
+        problem = str(error)
     if not files:
         raise UsageError(f"{path}: no .mcap or .db3 file in this folder")
     bag = _open_files(path, files, types)
-    if missing and not bag.notes:  # a damaged file was not closed, so that metadata are missing anyway
-        bag.notes.append(f"{missing}; read {', '.join(file.name for file in files)}")
+    if problem and not bag.notes:  # a damaged file was not closed, so that metadata are missing anyway
+        bag.notes.append(f"{problem}; read {', '.join(file.name for file in files)}")
     return bag
 
 
@@ -186,12 +186,12 @@ def _is_ros1(file: Path) -> bool:
 
 
 @cache
-def _jazzy() -> Typestore:
+def _jazzy_types() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
+def _open_reader(file: Path) -> Iterator[Reader | Ros1Reader]:
     if file.suffix == ".db3":
         check_plain(file)
     with Ros1Reader(file) if _is_ros1(file) else Reader(file) as reader:
@@ -199,7 +199,7 @@ def _opened(file: Path) -> Iterator[Reader | Ros1Reader]:
 
 
 def _open_indexed(file: Path) -> Bag:
-    with _opened(file) as reader:
+    with _open_reader(file) as reader:
         _check_index(reader)
         connections, start = list(reader.connections), reader.start_time  # closing discards them
     types = {connection.topic: connection.msgtype for connection in connections}
@@ -217,15 +217,15 @@ def _check_index(reader: Reader | Ros1Reader) -> None:
     """
     if isinstance(reader, Ros1Reader) or not isinstance(reader.storage, McapReader):
         return
-    chunks, known = reader.storage.chunks, {c.id for c in reader.connections if c.msgtype != _NO_SCHEMA}
-    indexed = sum(count for chunk in chunks for key, count in chunk.channel_count.items() if key in known)
+    chunks, typed_ids = reader.storage.chunks, {c.id for c in reader.connections if c.msgtype != _NO_SCHEMA}
+    indexed = sum(count for chunk in chunks for key, count in chunk.channel_count.items() if key in typed_ids)
     if indexed < reader.message_count or (chunks and not indexed):
         raise ReaderError("its index does not lead to every message")
 
 
 def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
     ros1 = _is_ros1(file)
-    with _opened(file) as reader:
+    with _open_reader(file) as reader:
         requested = [connection for connection in reader.connections if connection.topic in topics]
         for connection, time, data in reader.messages(connections=requested):
             yield connection.topic, time, _as_ros2(data, connection.msgtype) if ros1 else data
@@ -234,19 +234,19 @@ def _read_indexed(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
 def _as_ros2(data: bytes, kind: str) -> bytes:
     """A message of ROS 1 in ROS 2's serialization; no bytes for damaged messages and unknown types."""
     with suppress(Exception):  # SerdeError, KeyError, struct.error by the kind of damage
-        return custom_of_ros1(data) if kind in LIVOX else bytes(_jazzy().ros1_to_cdr(data, kind))
+        return custom_of_ros1(data) if kind in LIVOX else bytes(_jazzy_types().ros1_to_cdr(data, kind))
     return b""
 
 
-def _unpacked(data: bytes) -> bytes:
+def _decompressed(data: bytes) -> bytes:
     """A message, decompressed if it was compressed by itself; no bytes if it is damaged or too large."""
     if data[:4] != _ZSTD_MAGIC:  # no message of ROS 2 begins with these bytes
         return data
     with suppress(ZstdError):
-        unpacker, size = ZstdDecompressor(), get_frame_info(data).decompressed_size
-        if size is not None and size <= _LARGEST:
-            message = unpacker.decompress(data, size + 1)
-            return message if unpacker.eof else b""
+        decompressor, size = ZstdDecompressor(), get_frame_info(data).decompressed_size
+        if size is not None and size <= _MAX_MESSAGE_BYTES:
+            message = decompressor.decompress(data, size + 1)
+            return message if decompressor.eof else b""
     return b""
 
 
@@ -259,7 +259,7 @@ def _open_scanned(file: Path, reason: str) -> Bag:
     if head != _MCAP_MAGIC:
         kind = "is no MCAP file (wrong magic bytes)" if file.suffix == ".mcap" else "cannot be read as a bag"
         raise UsageError(f"{file}: {kind}: {reason}")
-    types, counts, start, notes = dict[str, str](), Counter[str](), _LATEST, list[str]()
+    types, counts, start, notes = dict[str, str](), Counter[str](), _MAX_TIME, list[str]()
     try:
         for message in scanned_messages(file):
             types[message.topic] = message.kind
@@ -273,12 +273,12 @@ def _open_scanned(file: Path, reason: str) -> Bag:
 
 
 def _read_scanned(file: Path, topics: Collection[str]) -> Iterator[RawMessage]:
-    for message in by_log_time(_up_to_cut(file, topics)):
+    for message in by_log_time(_messages_before_damage(file, topics)):
         data = _as_ros2(message.data, message.kind) if message.ros1 else message.data
         yield message.topic, message.time, data
 
 
-def _up_to_cut(file: Path, topics: Collection[str]) -> Iterator[McapMessage]:
+def _messages_before_damage(file: Path, topics: Collection[str]) -> Iterator[McapMessage]:
     """The messages up to where the file is cut; that was reported when it was opened."""
     with suppress(Exception):
         yield from (message for message in scanned_messages(file) if message.topic in topics)

@@ -23,12 +23,12 @@ def header(stamp: int, frame: str) -> Any:
     return _TYPES["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
-def _parts(T: Array) -> tuple[list[float], list[float]]:
+def _translation_and_quaternion(T: Array) -> tuple[list[float], list[float]]:
     return T[:3, 3].tolist(), se3.quaternion(T).tolist()
 
 
 def _transform(stamp: int, parent: str, child: str, T: Array) -> Any:
-    t, q = _parts(T)
+    t, q = _translation_and_quaternion(T)
     transform = _TYPES["geometry_msgs/msg/Transform"](
         translation=_TYPES["geometry_msgs/msg/Vector3"](*t), rotation=_TYPES["geometry_msgs/msg/Quaternion"](*q)
     )
@@ -38,7 +38,7 @@ def _transform(stamp: int, parent: str, child: str, T: Array) -> Any:
 
 
 def _pose(T: Array) -> Any:
-    t, q = _parts(T)
+    t, q = _translation_and_quaternion(T)
     return _TYPES["geometry_msgs/msg/Pose"](
         position=_TYPES["geometry_msgs/msg/Point"](*t), orientation=_TYPES["geometry_msgs/msg/Quaternion"](*q)
     )

@@ -18,7 +18,7 @@ from dpm2_core.data.naming import frame_name
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 
-_LOOKED_AT = 20  # CameraInfo messages, to find one in the frame of the images
+_MAX_CAMERA_INFOS = 20  # CameraInfo messages, to find one in the frame of the images
 
 
 class TopicChoice:
@@ -33,13 +33,16 @@ class TopicChoice:
 
     def points(self) -> str:
         """Topic of the point clouds."""
-        asked, found = self._settings.points_topic, self._bag.topics(*CLOUDS)
-        if asked or not found:
-            if asked in found:
-                return asked
-            hint = "" if asked else "; convert a driver's packets to clouds first, by replaying them into the driver"
+        requested, found = self._settings.points_topic, self._bag.topics(*CLOUDS)
+        if requested or not found:
+            if requested in found:
+                return requested
+            hint = (
+                "" if requested else "; convert a driver's packets to clouds first, by replaying them into the driver"
+            )
             raise UsageError(
-                f"{self._path}: no PointCloud2 messages{f' on {asked}' * bool(asked)}; {self._contents()}{hint}"
+                f"{self._path}: no PointCloud2 messages{f' on {requested}' * bool(requested)};"
+                f" {self._topic_list()}{hint}"
             )
         if len(found) > 1:
             if naming.POINTS not in found:
@@ -51,37 +54,39 @@ class TopicChoice:
 
     def second(self, key: str, first: str, kinds: Sequence[str], messages: str) -> str:
         """The topic of a second sensor, from the setting `key`; empty for none."""
-        asked: str = getattr(self._settings, key)
-        if asked and (asked == first or asked not in self._bag.topics(*kinds)):
-            raise UsageError(f"{self._path}: input.{key}: no other {messages} on {asked}; {self._contents()}")
-        return asked
+        requested: str = getattr(self._settings, key)
+        if requested and (requested == first or requested not in self._bag.topics(*kinds)):
+            raise UsageError(f"{self._path}: input.{key}: no other {messages} on {requested}; {self._topic_list()}")
+        return requested
 
     def image(self, second: str) -> str:
         """Image topic of the first camera, different from `second`; empty without one, or if there is only depth."""
-        asked, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
-        silent = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
-        if silent and not asked:
-            self._bag.notes.append(f"no message on the image topic {', '.join(silent)}")
-        depth = [] if asked else [topic for topic in found if is_depth(self._bag.first(topic))]
+        requested, found = self._settings.image_topic, [topic for topic in self._bag.topics(*IMAGES) if topic != second]
+        empty = [topic for topic, kind in self._bag.types.items() if kind in IMAGES and topic not in (*found, second)]
+        if empty and not requested:
+            self._bag.notes.append(f"no message on the image topic {', '.join(empty)}")
+        depth = [] if requested else [topic for topic in found if is_depth(self._bag.first(topic))]
         if depth:
             self._bag.notes.append(f"depth images are not used: {', '.join(depth)}")
         compressed = {f"{topic}/compressed" for topic in (*found, second) if topic}  # the same images as the raw topics
-        found = [topic for topic in found if topic not in depth and (topic == asked or topic not in compressed)]
-        usual = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kitti2bag variants
-        return self._one_of(found, asked, usual, "image", "images")
+        found = [topic for topic in found if topic not in depth and (topic == requested or topic not in compressed)]
+        default = naming.IMAGE if naming.IMAGE in found else naming.IMAGE.removesuffix("_raw")  # two kitti2bag variants
+        return self._choose(found, requested, default, "image", "images")
 
     def imu(self) -> str:
         """Topic of an IMU; empty for none."""
         if not self._settings.imu:
             return ""
-        return self._one_of(self._bag.topics(IMU), self._settings.imu_topic, naming.IMU, "Imu", "Imu messages")
+        return self._choose(self._bag.topics(IMU), self._settings.imu_topic, naming.IMU, "Imu", "Imu messages")
 
     def gnss(self) -> str:
         """Topic of GNSS fixes; empty for none."""
-        asked = self._settings.gnss_topic
-        return asked and self._one_of(self._bag.topics(FIX), asked, asked, "NavSatFix", "NavSatFix messages")
+        requested = self._settings.gnss_topic
+        return requested and self._choose(
+            self._bag.topics(FIX), requested, requested, "NavSatFix", "NavSatFix messages"
+        )
 
-    def camera(self, topic: str, info_topic: str, asked: bool) -> CameraTopic | None:
+    def camera(self, topic: str, info_topic: str, required: bool) -> CameraTopic | None:
         """The camera of an image topic with its first usable CameraInfo. If the messages are of several cameras, the
         first in the frame of the first image. None without; that is an error if the topic was asked for."""
         info_topic = info_topic or info_topic_beside(topic)
@@ -97,34 +102,34 @@ class TopicChoice:
             usable.append(CameraTopic(topic, info))
             if frame_name(info.header.frame_id) == frame:
                 return usable[-1]
-            if len(usable) == _LOOKED_AT:
+            if len(usable) == _MAX_CAMERA_INFOS:
                 break
         if usable:
             return usable[0]
-        if asked:
-            raise UsageError(f"{self._path}: {problem} for {topic}; {self._contents()}")
+        if required:
+            raise UsageError(f"{self._path}: {problem} for {topic}; {self._topic_list()}")
         self._bag.notes.append(f"images of {topic} are left out: {problem}")
         return None
 
     def truth(self) -> str:
         """Topic of the ground truth, empty without any."""
-        asked, found = self._settings.ground_truth_topic, self._bag.topics(*TRUTHS)
-        if asked and asked not in found:
-            raise UsageError(f"{self._path}: no Odometry or Path messages on {asked}; {self._contents()}")
-        return next((topic for topic in (asked, *naming.TRUTHS) if topic in found), "")
+        requested, found = self._settings.ground_truth_topic, self._bag.topics(*TRUTHS)
+        if requested and requested not in found:
+            raise UsageError(f"{self._path}: no Odometry or Path messages on {requested}; {self._topic_list()}")
+        return next((topic for topic in (requested, *naming.TRUTHS) if topic in found), "")
 
-    def _one_of(self, found: Sequence[str], asked: str, usual: str, kind: str, messages: str) -> str:
+    def _choose(self, found: Sequence[str], requested: str, default: str, kind: str, messages: str) -> str:
         """The requested topic, else the usual one, else the only one; empty if several remain."""
-        if asked:
-            if asked not in found:
-                raise UsageError(f"{self._path}: no {messages} on {asked}; {self._contents()}")
-            return asked
-        if len(found) > 1 and usual not in found:
+        if requested:
+            if requested not in found:
+                raise UsageError(f"{self._path}: no {messages} on {requested}; {self._topic_list()}")
+            return requested
+        if len(found) > 1 and default not in found:
             key = f"input.{kind.lower()}_topic"
             self._bag.notes.append(f"{kind} topics {', '.join(found)}: none is used; choose one with {key}")
             return ""
-        return usual if usual in found else "".join(found)
+        return default if default in found else "".join(found)
 
-    def _contents(self) -> str:
+    def _topic_list(self) -> str:
         listed = (f"{topic} ({kind}, {self._bag.counts[topic]})" for topic, kind in sorted(self._bag.types.items()))
         return f"topics: {', '.join(listed) or 'none'}"

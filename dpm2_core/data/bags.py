@@ -37,11 +37,12 @@ from dpm2_core.geometry.scale import is_room
 from dpm2_core.geometry.tilt import up_of
 
 Stamps = NDArray[np.int64]
-_NO_BASE = ("map", "odom")  # frames that a base moves in
-_LOOKED_AT = 10  # clouds, to find the ground
-_LEVEL, _LIKE = np.cos(np.radians([10.0, 45.0]))  # a larger tilt is reported; largest angle between ground and base
+_WORLD_FRAMES = ("map", "odom")  # frames that a base moves in
+_MAX_GROUND_CLOUDS = 10  # clouds, to find the ground
+# A larger tilt of the LiDAR is reported; largest angle between the base and the ground.
+_MIN_COS_TILT, _MIN_COS_SAME_UP = np.cos(np.radians([10.0, 45.0]))
 
-_CLOCKS = 0.15
+_MAX_DELAY_DIFFERENCE = 0.15
 """s: a larger difference between the delays from stamp to recording of two LiDARs suggests that their clocks differ.
 Whether a driver stamps the start or the end of a sweep makes a smaller difference."""
 
@@ -84,9 +85,9 @@ class BagSource:
         self._calibration.gnss_topic = self._topics.gnss()
         self._imu, self._gnss = ImuBuffer(), FixBuffer()
         self._delays: dict[str, list[int]] = {}  # ns from stamp to time of recording, of the clouds of each topic
-        self._unsound: dict[str, tuple[int, str]] = {}  # by topic: messages left out, and why the first one was
+        self._skipped: dict[str, tuple[int, str]] = {}  # by topic: messages left out, and why the first one was
         imu, gnss = self._imu if self.imu_topic else None, self._gnss if self._calibration.gnss_topic else None
-        self.T_base_lidar = self._mounted(first)
+        self.T_base_lidar = self._mounting(first)
         self._frames = FrameBuilder(self._settings, self._calibration, self.notes.append, self._bag.decode, imu, gnss)
         if self.T_base_lidar is not None:
             x, y, z = self.T_base_lidar[2, :3].tolist()
@@ -99,54 +100,56 @@ class BagSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 as recorded, even if their stamps repeat or go back; `notes` reports that."""
-        before, recorded_before, period, count, known = None, 0, 0, 0, self._calibration
+        last_stamp, last_recorded, period, count, calibration = None, 0, 0, 0, self._calibration
         found, unusable = Counter[str](), Counter[str]()  # by topic: frames with a message, with an unusable message
         self._imu.clear()
         self._gnss.clear()
-        self._unsound.clear()
-        known.heard.clear()
-        for index, (stamp, recorded, cloud, beside) in enumerate(islice(self._pairs(), stop)):
+        self._skipped.clear()
+        calibration.heard.clear()
+        for index, (stamp, recorded, cloud, associated) in enumerate(islice(self._clouds_with_messages(), stop)):
             if index < start:
                 continue
-            if before is not None and stamp <= before:
+            if last_stamp is not None and stamp <= last_stamp:
                 note_once(
-                    self.notes, "time stamps do not increase", f"at frame {index}: {(stamp - before) * 1e-9:+.3f} s"
+                    self.notes, "time stamps do not increase", f"at frame {index}: {(stamp - last_stamp) * 1e-9:+.3f} s"
                 )
-            step, gone = (0, 0) if before is None else (stamp - before, recorded - recorded_before)
+            step, elapsed = (0, 0) if last_stamp is None else (stamp - last_stamp, recorded - last_recorded)
             # A step of less than a second counts only if the cloud came when it was due: else some may be lost.
-            stepped = step - gone > (min(AHEAD * period, JUMP) if is_due(gone, period) else JUMP)
+            stepped = step - elapsed > (min(AHEAD * period, JUMP) if is_due(elapsed, period) else JUMP)
             period = period if stepped or step <= 0 else step
-            frame = replace(self._frames.frame(stamp, cloud, index, beside), stepped=stepped)
-            before, recorded_before, count = stamp, recorded, count + 1
-            found.update(list(beside))
-            unusable.update([topic for topic in beside if topic in self._frames.problems and not frame.problem])
-            found[known.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
+            frame = replace(self._frames.frame(stamp, cloud, index, associated), stepped=stepped)
+            last_stamp, last_recorded, count = stamp, recorded, count + 1
+            found.update(list(associated))
+            unusable.update([topic for topic in associated if topic in self._frames.problems and not frame.problem])
+            found[calibration.gnss_topic] += frame.fix is not None and stamp - frame.fix.stamp < JUMP
             if self._frames.time_problem:
                 note_once(self.notes, f"{self.points_topic}: {self._frames.time_problem}", f"first at frame {index}")
             yield frame
-        for topic, (left_out, why) in self._unsound.items():
-            note_once(self.notes, f"{topic}: {left_out} samples left out", f"the first: {why}")
+        for topic, (skipped, reason) in self._skipped.items():
+            note_once(self.notes, f"{topic}: {skipped} samples left out", f"the first: {reason}")
         self._note_missing(found, unusable, count)
 
     def _note_missing(self, found: Counter[str], unusable: Counter[str], count: int) -> None:
         """Note what is missing from the other sensors. `found`: number of the `count` frames that have a message of
         each topic; `unusable`: number of those whose message cannot be used."""
-        known, within = self._calibration, f"within {self._settings.image_tolerance} s"
-        missing = [(camera.topic, "image", within) for camera in known.cameras]
-        if known.second_topic:
-            missing.append((known.second_topic, "cloud", within))
-        if known.gnss_topic and not found[known.gnss_topic] and count:  # fixes are rarer than clouds
-            missing.append((known.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
+        calibration, within = self._calibration, f"within {self._settings.image_tolerance} s"
+        missing = [(camera.topic, "image", within) for camera in calibration.cameras]
+        if calibration.second_topic:
+            missing.append((calibration.second_topic, "cloud", within))
+        if calibration.gnss_topic and not found[calibration.gnss_topic] and count:  # fixes are rarer than clouds
+            missing.append((calibration.gnss_topic, "fix", f"within {JUMP * 1e-9:g} s"))
         for topic, what, within in missing:
-            absent, useless = count - found[topic], unusable[topic]
-            details = [(absent, within), (useless, f"{useless} have an unusable one")]
-            if absent or useless:
-                text = f"{absent + useless} of {count} frames have no {what} of {topic}"
-                note_once(self.notes, text, "; ".join(detail for number, detail in details if number))
-        if found[known.second_topic]:
-            first, second = (float(np.median(self._delays[t])) for t in (known.points_topic, known.second_topic))
-            if abs(apart := (second - first) * 1e-9) > _CLOCKS:
-                what = f"{known.second_topic}: recorded {apart:+.2f} s later after its stamps than the first LiDAR"
+            absent_count, unusable_count = count - found[topic], unusable[topic]
+            details = [(absent_count, within), (unusable_count, f"{unusable_count} have an unusable one")]
+            if absent_count or unusable_count:
+                text = f"{absent_count + unusable_count} of {count} frames have no {what} of {topic}"
+                note_once(self.notes, text, "; ".join(detail for occurrences, detail in details if occurrences))
+        if found[calibration.second_topic]:
+            first, second = (
+                float(np.median(self._delays[t])) for t in (calibration.points_topic, calibration.second_topic)
+            )
+            if abs(lag := (second - first) * 1e-9) > _MAX_DELAY_DIFFERENCE:
+                what = f"{calibration.second_topic}: recorded {lag:+.2f} s later after its stamps than the first LiDAR"
                 note_once(self.notes, what, "is its clock off? Clouds with the same stamps are joined")
 
     @cached_property
@@ -165,7 +168,7 @@ class BagSource:
         if not self.truth:
             return None
         try:
-            stamps, T = self._truth(self.truth)
+            stamps, T = self._read_truth(self.truth)
         except UsageError as error:
             if self._settings.ground_truth_topic:
                 raise UsageError(f"{self.path}: {self.truth}: {error}") from None
@@ -184,15 +187,15 @@ class BagSource:
 
     def _choose_cameras(self) -> Camera | None:
         """Find the cameras; returns the first one, or None if there is none."""
-        settings, known = self._settings, self._calibration
+        settings, calibration = self._settings, self._calibration
         second = self._topics.second("second_image_topic", settings.image_topic, IMAGES, "images")
         if topic := self._topics.image(second):
-            asked = bool(settings.image_topic or settings.camera_info_topic)
-            known.camera = self._topics.camera(topic, settings.camera_info_topic, asked)
+            required = bool(settings.image_topic or settings.camera_info_topic)
+            calibration.camera = self._topics.camera(topic, settings.camera_info_topic, required)
         if second:
-            known.second_camera = self._topics.camera(second, "", asked=True)
-        cameras = [self._camera(camera) for camera in known.cameras]
-        return None if known.camera is None else cameras[0]
+            calibration.second_camera = self._topics.camera(second, "", required=True)
+        cameras = [self._camera(camera) for camera in calibration.cameras]
+        return None if calibration.camera is None else cameras[0]
 
     def _camera(self, camera: CameraTopic) -> Camera:
         image = None if camera.info.header.frame_id else self._bag.first(camera.topic)
@@ -214,32 +217,32 @@ class BagSource:
             what = f"{naming.TF_STATIC}: {len(problems)} transforms left out"
             note_once(self.notes, what, f"the first: {printable(problems[0])}")
 
-    def _mounted(self, first: Any) -> Array | None:
+    def _mounting(self, first: Any) -> Array | None:
         """T_base_lidar (4, 4); the base is, as in slam_node, the root above the LiDAR in /tf_static.
 
         None without a base, or if the first clouds show that the root is not one, such as the frame of a camera.
         """
-        base = self.transforms.root(self.lidar_frame, _NO_BASE)
+        base = self.transforms.root(self.lidar_frame, _WORLD_FRAMES)
         if first is None or base == frame_name(self.lidar_frame):
             return None
         T_base_lidar = self.transforms.lookup(base, self.lidar_frame)
         up = T_base_lidar[2, :3]
-        if up[2] > _LEVEL:
+        if up[2] > _MIN_COS_TILT:
             return T_base_lidar
         angle = float(np.degrees(np.arccos(max(up[2], -1.0))))
         tilted = f"{naming.TF_STATIC} shows the LiDAR tilted by {angle:.0f} degrees in {base}"
-        seen = self._ground()
-        if seen is not None and seen @ up < _LIKE:
+        ground_up = self._up_from_ground()
+        if ground_up is not None and ground_up @ up < _MIN_COS_SAME_UP:
             note_once(self.notes, tilted, "which is not used as base: the ground is not level in it")
             return None
         note_once(self.notes, tilted, "by which the map is leveled")
         return T_base_lidar
 
-    def _ground(self) -> Points | None:
+    def _up_from_ground(self) -> Points | None:
         """Up direction (3,) in the LiDAR frame, estimated from the ground in the first cloud that shows enough of it.
         The first clouds of a driver may be empty or part of a sweep. Only outdoor clouds count, as ceilings look like
         ground."""
-        for cloud in islice(self._bag.decoded(self.points_topic), _LOOKED_AT):
+        for cloud in islice(self._bag.decoded(self.points_topic), _MAX_GROUND_CLOUDS):
             with suppress(MessageError):
                 points, _ = decode_points(cloud)
                 if is_room(points) is False and (up := up_of(points)) is not None:
@@ -251,37 +254,37 @@ class BagSource:
         message = self._bag.first(topic) if wanted else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
-    def _pairs(self) -> Iterator[tuple[int, int, bytes, dict[str, tuple[int, bytes]]]]:
+    def _clouds_with_messages(self) -> Iterator[tuple[int, int, bytes, dict[str, tuple[int, bytes]]]]:
         """(stamp, time of recording, cloud, topic to stamp and message associated with it), messages serialized. The
         IMU samples before the cloud are in the buffer by then."""
-        known, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
-        others = dict.fromkeys((camera.topic for camera in known.cameras), offset)
-        more = ((known.second_topic, 0), (self.imu_topic, -SWEEP))
-        others |= {topic: ahead for topic, ahead in more if topic}
-        beside = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
-        gnss = known.gnss_topic  # clouds do not wait for fixes: a late fix can still be placed on the trajectory
+        calibration, offset = self._calibration, round(self._settings.image_time_offset * 1e9)
+        others = dict.fromkeys((camera.topic for camera in calibration.cameras), offset)
+        without_time_offset = ((calibration.second_topic, 0), (self.imu_topic, -SWEEP))
+        others |= {topic: stamp_offset for topic, stamp_offset in without_time_offset if topic}
+        buffers = {topic: Beside(self._settings.image_tolerance) for topic in others if topic != self.imu_topic}
+        gnss = calibration.gnss_topic  # clouds do not wait for fixes: a late fix can still be placed on the trajectory
         messages = self._in_order(self._bag.messages([self.points_topic, *others, *([gnss] if gnss else [])]))
         waiting: deque[tuple[int, RawMessage]] = deque()
-        delays = self._delays = {topic: [] for topic in (self.points_topic, known.second_topic)}
+        delays = self._delays = {topic: [] for topic in (self.points_topic, calibration.second_topic)}
         for topic, time, data in clouds_after_others(messages, [self.points_topic], others, waiting):
             stamp = serialized_stamp(data, time)
             if topic in delays:
                 delays[topic].append(time - stamp)
             if topic == self.points_topic:
-                found = ((other, sensor.nearest(stamp)) for other, sensor in beside.items())
+                found = ((other, buffer.nearest(stamp)) for other, buffer in buffers.items())
                 yield stamp, time, data, {other: message for other, message in found if message is not None}
-                for sensor in beside.values():
-                    sensor.forget(stamp)
+                for buffer in buffers.values():
+                    buffer.forget(stamp)
                 continue
-            with self._or_left_out(topic):
+            with self._skip_invalid(topic):
                 if topic in (self.imu_topic, gnss):
                     sample = self._bag.decode(topic, data)
-                    known.check_sensor(topic, sample.header.frame_id, stamp)
+                    calibration.check_sensor(topic, sample.header.frame_id, stamp)
                     (self._imu if topic == self.imu_topic else self._gnss).add(stamp, sample)
                 else:
-                    if topic != known.second_topic:  # whose clouds are each transformed from their own frame
-                        known.check_sensor(topic, serialized_frame(data), stamp)
-                    beside[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
+                    if topic != calibration.second_topic:  # whose clouds are each transformed from their own frame
+                        calibration.check_sensor(topic, serialized_frame(data), stamp)
+                    buffers[topic].add(stamp + others[topic], data, [cloud for cloud, _ in waiting])
 
     def _in_order(self, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
         """The messages, with corrected stamps where a cloud's stamp is not between its neighbors'; this is noted."""
@@ -289,15 +292,15 @@ class BagSource:
         return in_order(messages, topic, partial(note_corrected, self.notes, whose=f"{topic}: "))
 
     @contextmanager
-    def _or_left_out(self, topic: str) -> Iterator[None]:
+    def _skip_invalid(self, topic: str) -> Iterator[None]:
         """Guards the handling of a message of a sensor other than the LiDAR; an invalid one is skipped and counted."""
         try:
             yield
         except MessageError as error:
-            left_out, why = self._unsound.get(topic, (0, str(error)))
-            self._unsound[topic] = left_out + 1, why
+            skipped, reason = self._skipped.get(topic, (0, str(error)))
+            self._skipped[topic] = skipped + 1, reason
 
-    def _truth(self, topic: str) -> tuple[Stamps, Array]:
+    def _read_truth(self, topic: str) -> tuple[Stamps, Array]:
         """Stamps (M,) ns and T_world_lidar (M, 4, 4). Of several Path messages the last, the most complete, counts.
         Poses that cannot be decoded, or are no rigid transforms, are left out, with a note.
 

@@ -14,9 +14,9 @@ MAX_PIXELS = 1 << 26
 _SENSOR_BITS = (10, 12, 14, 16)
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that contain the size
-_SCAN, _END = b"\xff\xda", b"\xff\xd9"  # both are escaped within the data of a scan
-_BARE = {0x01, *range(0xD0, 0xD8)}  # segments without a length
+_SIZE_SEGMENTS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG segments that contain the size
+_SOS, _EOI = b"\xff\xda", b"\xff\xd9"  # start of scan, end of image; both are escaped within the data of a scan
+_NO_LENGTH = {0x01, *range(0xD0, 0xD8)}  # segments without a length
 
 
 def compressed_size(data: bytes) -> tuple[int, int] | None:
@@ -24,16 +24,16 @@ def compressed_size(data: bytes) -> tuple[int, int] | None:
     if data.startswith(_PNG) and data[12:16] == b"IHDR" and len(data) >= 24:
         width, height = struct.unpack_from(">II", data, 16)
         return int(width), int(height)
-    at = 2 if data.startswith(_JPEG) else len(data)
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        kind = data[at + 1]
-        if kind in _FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
+    position = 2 if data.startswith(_JPEG) else len(data)
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker in _SIZE_SEGMENTS:
+            height, width = struct.unpack_from(">HH", data, position + 5)
             return int(width), int(height)
-        if kind == 0xFF:  # fill byte
-            at += 1
+        if marker == 0xFF:  # fill byte
+            position += 1
         else:
-            at += 2 + (0 if kind in _BARE else struct.unpack_from(">H", data, at + 2)[0])
+            position += 2 + (0 if marker in _NO_LENGTH else struct.unpack_from(">H", data, position + 2)[0])
     return None
 
 
@@ -46,14 +46,14 @@ def decode_compressed(data: bytes, size: tuple[int, int] | None = None) -> NDArr
     Raises:
         ValueError: another format, another size, too large, or damaged.
     """
-    found = compressed_size(data)
-    if found is None:
+    actual = compressed_size(data)
+    if actual is None:
         raise ValueError("neither JPEG nor PNG, or cut off")
-    if size is not None and found != size:
-        raise ValueError(f"{found[0]} x {found[1]} pixels, the camera has {size[0]} x {size[1]}")
-    if not 0 < found[0] * found[1] <= MAX_PIXELS:
-        raise ValueError(f"{found[0]} x {found[1]} pixels, at most {MAX_PIXELS} are decoded")
-    if data.startswith(_JPEG) and data.rfind(_END) < data.rfind(_SCAN):  # OpenCV 4 fills the missing part with gray
+    if size is not None and actual != size:
+        raise ValueError(f"{actual[0]} x {actual[1]} pixels, the camera has {size[0]} x {size[1]}")
+    if not 0 < actual[0] * actual[1] <= MAX_PIXELS:
+        raise ValueError(f"{actual[0]} x {actual[1]} pixels, at most {MAX_PIXELS} are decoded")
+    if data.startswith(_JPEG) and data.rfind(_EOI) < data.rfind(_SOS):  # OpenCV 4 fills the missing part with gray
         raise ValueError("cut off")
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH

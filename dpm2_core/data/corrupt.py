@@ -54,10 +54,10 @@ class CorruptionSettings(Settings):
     """
 
 
-_BAND = np.radians(0.4)  # the spacing of an HDL-64
-_OF_FRAMES = ("camera", "no_image", "overexposed", "underexposed", "obstruction")
-_STREAMS = (*_OF_FRAMES, "beams", "extrinsic", "box", "dust")  # independent streams of random numbers
-_DUSTY = (0.4, 6.0)  # m, uniform along a pulse
+_BEAM_SPACING = np.radians(0.4)  # the spacing of an HDL-64
+_FRAME_FAILURES = ("camera", "no_image", "overexposed", "underexposed", "obstruction")
+_RANDOM_STREAMS = (*_FRAME_FAILURES, "beams", "extrinsic", "box", "dust")  # independent streams of random numbers
+_DUST_RANGE = (0.4, 6.0)  # m, uniform along a pulse
 
 
 class Box(NamedTuple):
@@ -97,11 +97,11 @@ def in_dust(points: Points, fraction: float, rng: np.random.Generator) -> Points
 
     The points moved at a fraction of 0.3 are among those moved at 0.5.
     """
-    away = np.linalg.norm(points[:, :3], axis=1)
-    chance, at = rng.random(len(points)), rng.uniform(*_DUSTY, len(points))
-    met = (chance < fraction) & (at < away)  # False for NaN
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    draws, dust_distance = rng.random(len(points)), rng.uniform(*_DUST_RANGE, len(points))
+    hits_dust = (draws < fraction) & (dust_distance < distance)  # False for NaN
     points = points.copy()
-    points[met, :3] *= (at[met] / away[met]).astype(np.float32)[:, None]
+    points[hits_dust, :3] *= (dust_distance[hits_dust] / distance[hits_dust]).astype(np.float32)[:, None]
     return points
 
 
@@ -119,13 +119,13 @@ class CorruptedSource:
         self._settings = settings
         self.name, self.notes, self.truth = source.name, source.notes, source.truth
         self.numbers, self.in_order = getattr(source, "numbers", None), getattr(source, "in_order", False)
-        turn, shift = self._rng("extrinsic").normal(size=(2, 3))
-        turn *= np.radians(settings.extrinsic_deg) / np.linalg.norm(turn)
-        shift *= settings.extrinsic_m / np.linalg.norm(shift)
-        self._T_true_wrong = se3.make(Rotation.from_rotvec(turn).as_matrix(), shift)
-        bands = int(np.pi / _BAND) + 1
-        self._dead = self._rng("beams").permutation(bands) < round(settings.beams * bands)
-        self._hit = {name: self._chosen(name, getattr(settings, name)) for name in _OF_FRAMES}
+        rotation, translation = self._rng("extrinsic").normal(size=(2, 3))
+        rotation *= np.radians(settings.extrinsic_deg) / np.linalg.norm(rotation)
+        translation *= settings.extrinsic_m / np.linalg.norm(translation)
+        self._T_true_wrong = se3.make(Rotation.from_rotvec(rotation).as_matrix(), translation)
+        beams = int(np.pi / _BEAM_SPACING) + 1
+        self._dead_beams = self._rng("beams").permutation(beams) < round(settings.beams * beams)
+        self._affected = {name: self._choose_frames(name, getattr(settings, name)) for name in _FRAME_FAILURES}
 
     @property
     def poses(self) -> Array | None:
@@ -140,51 +140,51 @@ class CorruptedSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1; they do not depend on whether the frames before are read."""
-        late = self._settings.time_offset
-        before: deque[Frame] = deque()
-        first = max(0, start - int(np.ceil(late * 20)))  # enough frames for the delay, at up to 20 Hz
+        delay = self._settings.time_offset
+        recent: deque[Frame] = deque()
+        first = max(0, start - int(np.ceil(delay * 20)))  # enough frames for the delay, at up to 20 Hz
         for position, frame in enumerate(self._source.frames(first, stop), first):
-            before.append(frame)
-            while len(before) > 1 and frame.stamp - before[1].stamp >= round(late * 1e9):
-                before.popleft()
-            images = before[0].images if frame.stamp - before[0].stamp >= round(late * 1e9) else ()
+            recent.append(frame)
+            while len(recent) > 1 and frame.stamp - recent[1].stamp >= round(delay * 1e9):
+                recent.popleft()
+            images = recent[0].images if frame.stamp - recent[0].stamp >= round(delay * 1e9) else ()
             if position >= start:
                 yield self._corrupted(replace(frame, images=images), position)
 
-    def _chosen(self, name: str, share: float) -> NDArray[np.bool_]:
+    def _choose_frames(self, name: str, share: float) -> NDArray[np.bool_]:
         """(len,) True for exactly that fraction of the frames."""
         rank = self._rng(name).permutation(len(self._source))
         return rank < round(share * len(rank))
 
     def _rng(self, stream: str, position: int = 0) -> np.random.Generator:
-        return np.random.default_rng([self._settings.seed, _STREAMS.index(stream), position])
+        return np.random.default_rng([self._settings.seed, _RANDOM_STREAMS.index(stream), position])
 
     def _corrupted(self, frame: Frame, position: int) -> Frame:
-        kept = ~self._dead[self._bands(frame.points)]
-        if self._hit["obstruction"][position]:
+        kept = ~self._dead_beams[self._beam_numbers(frame.points)]
+        if self._affected["obstruction"][position]:
             kept &= ~hidden_by(random_box(self._rng("box", position)), frame.points)
         s = self._settings
-        points, seen = in_fog(frame.points, s.dust, s.sight or np.inf, self._rng("dust", position))
-        kept &= seen
+        points, in_sight = in_fog(frame.points, s.dust, s.sight or np.inf, self._rng("dust", position))
+        kept &= in_sight
         offset = None if frame.time_offset is None else frame.time_offset[kept]
-        images = () if self._hit["no_image"][position] else tuple(self._image(i, position) for i in frame.images)
+        images = () if self._affected["no_image"][position] else tuple(self._image(i, position) for i in frame.images)
         return replace(frame, points=points[kept], time_offset=offset, images=images)
 
     @staticmethod
-    def _bands(points: Points) -> NDArray[np.intp]:
+    def _beam_numbers(points: Points) -> NDArray[np.intp]:
         """(N,) number of the beam, by elevation; points that are no measurement count as horizontal."""
         x, y, z = points[:, :3].T
         with np.errstate(invalid="ignore", over="ignore"):
             elevation = np.arctan2(z, np.hypot(x, y))
-        return ((np.nan_to_num(elevation) + np.pi / 2) / _BAND).astype(np.intp)
+        return ((np.nan_to_num(elevation) + np.pi / 2) / _BEAM_SPACING).astype(np.intp)
 
     def _image(self, image: Image, position: int) -> Image:
         pixels, stops = image.pixels, self._settings.stops
-        if self._hit["overexposed"][position]:
+        if self._affected["overexposed"][position]:
             pixels = exposed(pixels, stops)
-        if self._hit["underexposed"][position]:
+        if self._affected["underexposed"][position]:
             pixels = exposed(pixels, -stops)
-        if self._hit["camera"][position]:
+        if self._affected["camera"][position]:
             pixels = np.zeros_like(pixels)
         camera = replace(image.camera, T_lidar_cam=image.camera.T_lidar_cam @ self._T_true_wrong)
         return replace(image, pixels=pixels, camera=camera)

@@ -23,9 +23,9 @@ from dpm2_core.errors import UsageError, printable
 from dpm2_core.frame import NO_POINTS, Array, Camera, Fix, Frame, Image, Inertial, Points, Up
 from dpm2_core.geometry import se3
 
-_MOST_REPORTED = 20  # damaged data may produce any number of different messages
-_LENGTH = 300  # characters of a problem, whatever is in the message
-_SILENT = 2_000_000_000  # ns, by the stamps: after a silence of this length another sensor may use the topic
+_MAX_REPORTS = 20  # damaged data may produce any number of different messages
+_MAX_PROBLEM_LENGTH = 300  # characters of a problem, whatever is in the message
+_MAX_SILENCE = 2_000_000_000  # ns, by the stamps: after a silence of this length another sensor may use the topic
 
 
 @dataclass(eq=False)
@@ -70,7 +70,7 @@ class Calibration:
         """
         known, last = self.heard.get(topic, ("", stamp))
         frame = frame_name(frame) or known
-        if known and frame != known and abs(stamp - last) < _SILENT:
+        if known and frame != known and abs(stamp - last) < _MAX_SILENCE:
             found = f"a message in frame {frame[:80]!r}, the previous ones are in {known!r}"
             raise MessageError(f"{found}: a topic has one sensor")
         self.heard[topic] = frame, stamp
@@ -111,7 +111,7 @@ class FrameBuilder:
         gnss: FixBuffer | None = None,
     ) -> None:
         self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.problems: dict[str, str] = {}
         self.time_problem = ""
         self._imu, self._gnss = imu, gnss
@@ -129,26 +129,26 @@ class FrameBuilder:
             self._check_frame(cloud.header.frame_id)
             points, offset = self._points(cloud)
         except MessageError as error:
-            problem = self._tell(topic, error)
+            problem = self._report(topic, error)
             return Frame(stamp, NO_POINTS, index=index, up=self.up, problem=problem)
         expected = self._settings.time_field is None and not topic.startswith("/kitti/") and len(points)
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
         if (second := beside.get(self._calibration.second_topic)) is not None:
-            points, offset = self._joined(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
-        imu = None if self._imu is None else self._inertial(self._imu, lidar_frame, stamp, offset)
+            points, offset = self._merged(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
+        imu = None if self._imu is None else self._imu_samples(self._imu, lidar_frame, stamp, offset)
         fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
-        taken = [(camera, *beside[camera.topic]) for camera in self._calibration.cameras if camera.topic in beside]
-        found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in taken)
+        associated = [(camera, *beside[camera.topic]) for camera in self._calibration.cameras if camera.topic in beside]
+        found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in associated)
         images = tuple(image for image in found if image is not None)
         return Frame(stamp, points, offset, images, index, up=self.up, imu=imu, fix=fix)
 
     def _check_frame(self, frame: str) -> None:
         """Raise MessageError for a cloud of another LiDAR: poses of two LiDARs would look like the motion of one."""
-        of_drive = self._calibration.lidar_frame
-        if of_drive and frame_name(frame) != frame_name(of_drive):
-            found = f"a cloud in frame {frame[:80]!r}, the drive's are in {of_drive!r}"
+        drive_frame = self._calibration.lidar_frame
+        if drive_frame and frame_name(frame) != frame_name(drive_frame):
+            found = f"a cloud in frame {frame[:80]!r}, the drive's are in {drive_frame!r}"
             raise MessageError(f"{found}: one drive has one LiDAR")
 
     def _points(self, cloud: Any) -> tuple[Points, Points | None]:
@@ -156,21 +156,21 @@ class FrameBuilder:
         settings = self._settings
         return decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
 
-    def _joined(
-        self, points: Points, offset: Points | None, lidar_frame: str, late: float, second: Any
+    def _merged(
+        self, points: Points, offset: Points | None, lidar_frame: str, delay: float, second: Any
     ) -> tuple[Points, Points | None]:
-        """Points (N, 4) and times (N,) merged with those of a second LiDAR, whose stamp is `late` s after the first."""
+        """Points (N, 4) and times (N,) merged with those of a second LiDAR, stamped `delay` s after the first."""
         topic = self._calibration.second_topic
-        with self._or_else(topic, "going on without the second LiDAR"):
+        with self._report_errors(topic, "going on without the second LiDAR"):
             second = self._decode(topic, second)
             others, other_offset = self._points(second)
             T = self._calibration.transforms.between(lidar_frame, second.header.frame_id)
             seen = returned(others)  # once transformed, the zeros of a missing return would look like a point
             others, other_offset = others[seen], None if other_offset is None else other_offset[seen]
-            if offset is not None or other_offset is not None or late:
-                first = np.zeros(len(points), np.float32) if offset is None else offset
-                then = np.zeros(len(others), np.float32) if other_offset is None else other_offset
-                offset = np.concatenate([first, then + np.float32(late)])
+            if offset is not None or other_offset is not None or delay:
+                first_times = np.zeros(len(points), np.float32) if offset is None else offset
+                second_times = np.zeros(len(others), np.float32) if other_offset is None else other_offset
+                offset = np.concatenate([first_times, second_times + np.float32(delay)])
             return np.concatenate([points, se3.transform(T, others)]), offset
         return points, offset
 
@@ -199,16 +199,16 @@ class FrameBuilder:
     @property
     def angle_correction_deg(self) -> float:
         """Degrees added to each elevation: the value set, else the recording's value, else KITTI's for KITTI topics."""
-        known = self._calibration.angle_correction_deg
-        usual = HDL64_CORRECTION_DEG if self._calibration.points_topic.startswith("/kitti/") else 0.0
-        return self._settings.angle_correction(usual if known is None else known)
+        recorded = self._calibration.angle_correction_deg
+        default = HDL64_CORRECTION_DEG if self._calibration.points_topic.startswith("/kitti/") else 0.0
+        return self._settings.angle_correction(default if recorded is None else recorded)
 
-    def _inertial(self, buffer: ImuBuffer, lidar_frame: str, stamp: int, offset: Points | None) -> Inertial | None:
+    def _imu_samples(self, buffer: ImuBuffer, lidar_frame: str, stamp: int, offset: Points | None) -> Inertial | None:
         """The samples up to the last point of a scan, rotated into the LiDAR frame."""
         if buffer.last == -float("inf"):
             return None
         found = buffer.take(stamp, stamp + last_point(offset))
-        with self._or_else(self._calibration.imu_topic, "going on without the IMU"):
+        with self._report_errors(self._calibration.imu_topic, "going on without the IMU"):
             if found is None:
                 raise UsageError("no samples at the time of the scan")
             if not found.rates.any() and np.isnan(found.forces).all():  # no real gyroscope measures exactly 0
@@ -231,36 +231,36 @@ class FrameBuilder:
         """The last fix before a scan, with the position of its antenna."""
         if (fix := buffer.take(stamp)) is None:
             return None
-        with self._or_else(self._calibration.gnss_topic, "the antenna is assumed to be at the LiDAR"):
+        with self._report_errors(self._calibration.gnss_topic, "the antenna is assumed to be at the LiDAR"):
             if frame_name(buffer.frame) != frame_name(lidar_frame):
                 fix = replace(fix, antenna=self._calibration.transforms.lookup(lidar_frame, buffer.frame)[:3, 3])
         return fix
 
-    def _image(self, lidar_frame: str, taken_by: CameraTopic, message: Any, late: float) -> Image | None:
-        with self._or_else(taken_by.topic, "images are left out"):
-            message = self._decode(taken_by.topic, message)
-            camera = self.camera(taken_by, lidar_frame, message.header.frame_id)
+    def _image(self, lidar_frame: str, camera_topic: CameraTopic, message: Any, delay: float) -> Image | None:
+        with self._report_errors(camera_topic.topic, "images are left out"):
+            message = self._decode(camera_topic.topic, message)
+            camera = self.camera(camera_topic, lidar_frame, message.header.frame_id)
             pixels = decode_image(message, camera.size)
-            if is_fisheye(taken_by.info) and pixels.shape[1::-1] == camera.size:
-                pixels = rectified(pixels, taken_by.info)
-            return Image(pixels, camera, late)
+            if is_fisheye(camera_topic.info) and pixels.shape[1::-1] == camera.size:
+                pixels = rectified(pixels, camera_topic.info)
+            return Image(pixels, camera, delay)
         return None
 
     @contextmanager
-    def _or_else(self, topic: str, without: str) -> Iterator[None]:
+    def _report_errors(self, topic: str, consequence: str) -> Iterator[None]:
         """Guards the reading of a sensor other than the LiDAR; an error is stored as its problem, and reported."""
         try:
             yield
         except (UsageError, ValueError) as error:
-            self.problems[topic] = self._tell(topic, error, f"; {without}")
+            self.problems[topic] = self._report(topic, error, f"; {consequence}")
         else:
             self.problems.pop(topic, None)
 
-    def _tell(self, topic: str, error: Exception, more: str = "") -> str:
+    def _report(self, topic: str, error: Exception, suffix: str = "") -> str:
         """Report a problem unless it was reported already; returns it as one line."""
-        problem = printable(str(error)[:_LENGTH])
-        text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{more}"  # errors of damaged messages name the topic too
-        if text not in self._told and len(self._told) < _MOST_REPORTED:
-            self._told.add(text)
+        problem = printable(str(error)[:_MAX_PROBLEM_LENGTH])
+        text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{suffix}"  # errors of damaged messages name the topic too
+        if text not in self._reported and len(self._reported) < _MAX_REPORTS:
+            self._reported.add(text)
             self._complain(text)
         return problem

@@ -14,10 +14,10 @@ from dpm2_core.data.pairing import JUMP
 from dpm2_core.frame import Fix
 
 _NO_FIX = -1  # -2, Jazzy's default, means that the driver sets no status at all
-_MOST = 1000  # fixes kept; bounds memory if no cloud arrives
-_LEAST = 0.01  # m, its square is added to every variance: antenna position and clock are not known better
-_ASSUMED = np.array([5.0, 5.0, 10.0])  # m east, north, up if none is stated: those of a plain receiver, open sky
-_UNKNOWN = 1e4  # m, of an unknown altitude
+_MAX_FIXES = 1000  # fixes kept; bounds memory if no cloud arrives
+_MIN_SIGMA = 0.01  # m, its square is added to every variance: antenna position and clock are not known better
+_DEFAULT_SIGMAS = np.array([5.0, 5.0, 10.0])  # m east, north, up if none is stated: those of a plain receiver, open sky
+_UNKNOWN_ALTITUDE_SIGMA = 1e4  # m, of an unknown altitude
 
 
 def decode_fix(message: Any, stamp: int) -> Fix | None:
@@ -31,18 +31,18 @@ def decode_fix(message: Any, stamp: int) -> Fix | None:
     """
     if message.status.status == _NO_FIX:
         return None
-    place = np.array([message.latitude, message.longitude, message.altitude], np.float64)
-    if not place[:2].any():
+    geodetic = np.array([message.latitude, message.longitude, message.altitude], np.float64)
+    if not geodetic[:2].any():
         raise MessageError("latitude and longitude 0, which receivers send before they have a fix")
     covariance = np.array(message.position_covariance, np.float64).reshape(3, 3)
-    unstated = (np.diag(covariance) == 0) | (message.position_covariance_type == 0)
-    covariance[unstated], covariance[:, unstated] = 0.0, 0.0
-    covariance[unstated, unstated] = _ASSUMED[unstated] ** 2
-    if np.isnan(place[2]):
-        place[2], covariance[2], covariance[:, 2] = 0.0, 0.0, 0.0
-        covariance[2, 2] = _UNKNOWN**2
+    unknown = (np.diag(covariance) == 0) | (message.position_covariance_type == 0)
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = _DEFAULT_SIGMAS[unknown] ** 2
+    if np.isnan(geodetic[2]):
+        geodetic[2], covariance[2], covariance[:, 2] = 0.0, 0.0, 0.0
+        covariance[2, 2] = _UNKNOWN_ALTITUDE_SIGMA**2
     try:
-        return Fix(stamp, place, covariance + _LEAST**2 * np.eye(3), np.zeros(3))
+        return Fix(stamp, geodetic, covariance + _MIN_SIGMA**2 * np.eye(3), np.zeros(3))
     except ValueError as error:
         raise MessageError(str(error)) from None
 
@@ -57,7 +57,7 @@ class FixBuffer:
     def __init__(self) -> None:
         self.frame = ""
         self._lock = threading.Lock()
-        self._fixes: deque[Fix] = deque(maxlen=_MOST)
+        self._fixes: deque[Fix] = deque(maxlen=_MAX_FIXES)
 
     def clear(self) -> None:
         """Remove all fixes."""

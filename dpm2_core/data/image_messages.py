@@ -48,10 +48,10 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2RGB),
 }
 
-_DEPTH = ("16uc1", "32fc1")  # mm, m (REP 118)
-_HALF_COLOR = ("nv12", "nv21")
-_FISHEYE = ("equidistant", "fisheye")
-_FISHEYE_COUNT = 4
+_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # mm, m (REP 118)
+_YUV420_ENCODINGS = ("nv12", "nv21")
+_FISHEYE_MODELS = ("equidistant", "fisheye")
+_FISHEYE_COEFFICIENTS = 4
 
 
 def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -75,7 +75,7 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
     dtype = np.dtype((">" if msg.is_bigendian else "<") + kind)
     height, width, pixel = int(msg.height), int(msg.width), channels * dtype.itemsize
     _check_even(encoding, width, height)
-    if encoding.lower() in _HALF_COLOR:
+    if encoding.lower() in _YUV420_ENCODINGS:
         height += height // 2
     step = int(msg.step) or width * pixel
     need, have = (height - 1) * step + width * pixel, len(msg.data)
@@ -91,8 +91,8 @@ def decode_image(msg: Any, size: tuple[int, int] | None = None) -> NDArray[np.ui
 
 def _check_even(encoding: str, width: int, height: int) -> None:
     """Raise MessageError if an encoding in which neighboring pixels share a color is used with an odd size."""
-    two_rows = encoding.lower() in _HALF_COLOR
-    if (two_rows or "yu" in encoding.lower() or "yv" in encoding.lower()) and (width % 2 or (two_rows and height % 2)):
+    yuv420 = encoding.lower() in _YUV420_ENCODINGS
+    if (yuv420 or "yu" in encoding.lower() or "yv" in encoding.lower()) and (width % 2 or (yuv420 and height % 2)):
         raise MessageError(
             f"image of {width} x {height} {encoding}: pixels share their color in pairs, want even sizes"
         )
@@ -116,8 +116,8 @@ def _decode_compressed(msg: Any, size: tuple[int, int] | None) -> NDArray[np.uin
 
 def is_depth(msg: Any) -> bool:
     """Whether an image contains depth."""
-    named = str(getattr(msg, "encoding", getattr(msg, "format", ""))).lower()  # "16UC1; png compressed "
-    return named.startswith(_DEPTH) or "compresseddepth" in named
+    encoding = str(getattr(msg, "encoding", getattr(msg, "format", ""))).lower()  # "16UC1; png compressed "
+    return encoding.startswith(_DEPTH_ENCODINGS) or "compresseddepth" in encoding
 
 
 def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
@@ -138,20 +138,20 @@ def decode_camera(info: Any, T_lidar_cam: Array, name: str) -> Camera:
     K, P = K.reshape(3, 3), P.reshape(3, 4)
     if not D.any() and not is_fisheye(info):
         D, K = D[:0], P[:, :3].copy() if P[0, 0] else K
-    elif info.distortion_model not in ("plumb_bob", "rational_polynomial", *_FISHEYE):
+    elif info.distortion_model not in ("plumb_bob", "rational_polynomial", *_FISHEYE_MODELS):
         raise MessageError(f"{name}: distortion model {info.distortion_model[:40]!r} is not supported; "
                            "supported: plumb_bob, rational_polynomial, equidistant")  # fmt: skip
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise MessageError(f"{name}: CameraInfo has no focal length (the camera is not calibrated)")
     if (K[2] != (0, 0, 1)).any():
         raise MessageError(f"{name}: the last row of CameraInfo's matrix is {K[2].tolist()}, not 0 0 1")
-    possible = (0, _FISHEYE_COUNT) if info.distortion_model in _FISHEYE else DISTORTIONS
-    if len(D) not in possible or not np.isfinite(D).all():
+    allowed = (0, _FISHEYE_COEFFICIENTS) if info.distortion_model in _FISHEYE_MODELS else DISTORTIONS
+    if len(D) not in allowed or not np.isfinite(D).all():
         raise MessageError(f"{name}: CameraInfo has {len(D)} distortion coefficients, or some that are not finite")
     if not (0 < info.width <= _WIDEST_IMAGE and 0 < info.height <= _WIDEST_IMAGE):
         raise MessageError(f"{name}: CameraInfo has no image size, or one beyond {_WIDEST_IMAGE} pixels")
-    kept = () if is_fisheye(info) else tuple(D.tolist())
-    return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), kept, name)
+    distortion = () if is_fisheye(info) else tuple(D.tolist())
+    return Camera(K, T_lidar_cam, (int(info.width), int(info.height)), distortion, name)
 
 
 def info_of(topic: str, info: Any) -> Any:
@@ -162,10 +162,10 @@ def info_of(topic: str, info: Any) -> Any:
     is_rectified = bool((name.startswith("image_rect") or topic.startswith("/kitti/")) and info.p[0])
     roi, x, y = info.roi, max(info.binning_x, 1), max(info.binning_y, 1)
     size = (roi.width or info.width) // x, (roi.height or info.height) // y  # zeros mean all pixels, and no binning
-    part = np.array([[1 / x, 0, -roi.x_offset / x], [0, 1 / y, -roi.y_offset / y], [0, 0, 1]])
-    if not is_rectified and size == (info.width, info.height) and (part == np.eye(3)).all():
+    T_part_full = np.array([[1 / x, 0, -roi.x_offset / x], [0, 1 / y, -roi.y_offset / y], [0, 0, 1]])
+    if not is_rectified and size == (info.width, info.height) and (T_part_full == np.eye(3)).all():
         return info
-    k, p = ((part @ np.reshape(matrix, (3, -1))).ravel() for matrix in (info.k, info.p))
+    k, p = ((T_part_full @ np.reshape(matrix, (3, -1))).ravel() for matrix in (info.k, info.p))
     return SimpleNamespace(header=info.header, width=size[0], height=size[1], k=k, p=p,
                            d=[] if is_rectified else info.d, distortion_model=info.distortion_model)  # fmt: skip
 
@@ -178,7 +178,7 @@ def info_topic_beside(image_topic: str) -> str:
 
 def is_fisheye(info: Any) -> bool:
     """Whether images of a CameraInfo that `decode_camera` accepts must be `rectified`."""
-    return info.distortion_model in _FISHEYE and len(info.d) == _FISHEYE_COUNT
+    return info.distortion_model in _FISHEYE_MODELS and len(info.d) == _FISHEYE_COEFFICIENTS
 
 
 def rectified(pixels: NDArray[np.uint8], info: Any) -> NDArray[np.uint8]:

@@ -15,9 +15,9 @@ from dpm2_core.frame import Array, Inertial
 
 KEPT = 11_000_000_000
 """ns before a scan in which samples are used: they give the rotation across a pause of up to 10 s."""
-_LARGEST = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any commercial sensor measures
-_CLOSEST = 400_000  # ns: no IMU is faster than 2500 Hz
-_MOST = 10_000  # samples kept; bounds memory if no cloud arrives
+_MAX_VALUES = np.repeat([40.0, 300.0], 3)  # rad/s and m/s2: more than any commercial sensor measures
+_MIN_PERIOD = 400_000  # ns: no IMU is faster than 2500 Hz
+_MAX_SAMPLES = 10_000  # samples kept; bounds memory if no cloud arrives
 
 
 def decode_imu(message: Any) -> tuple[Array, Array]:
@@ -32,8 +32,8 @@ def decode_imu(message: Any) -> tuple[Array, Array]:
         raise MessageError("an IMU without angular velocities")
     if message.linear_acceleration_covariance[0] == -1 or not values[3:].any():
         values[3:] = np.nan  # as defined by REP-145; a gyroscope's driver may send zeros instead
-    wrong = ~(np.abs(values) <= _LARGEST)
-    if wrong[:3].any() or (wrong[3:].any() and not np.isnan(values[3:]).all()):
+    out_of_range = ~(np.abs(values) <= _MAX_VALUES)
+    if out_of_range[:3].any() or (out_of_range[3:].any() and not np.isnan(values[3:]).all()):
         raise MessageError(f"angular velocity {values[:3].tolist()} rad/s, acceleration {values[3:].tolist()} m/s2")
     return values[:3], values[3:]
 
@@ -48,7 +48,7 @@ class ImuBuffer:
     def __init__(self) -> None:
         self.last, self.frame = -float("inf"), ""
         self._lock = threading.Lock()
-        self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST)
+        self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=_MAX_SAMPLES)
         self._set_back = SetBack()
 
     def clear(self) -> None:
@@ -67,7 +67,7 @@ class ImuBuffer:
         rates, forces = decode_imu(message)
         with self._lock:
             step, samples = stamp - self.last, [(stamp, rates, forces)]
-            if -JUMP < step < _CLOSEST:
+            if -JUMP < step < _MIN_PERIOD:
                 samples = self._set_back.add(stamp, samples[0]) if step < 0 else []
                 if not samples:
                     raise MessageError(f"a sample {step * 1e-6:.3f} ms after the one before")

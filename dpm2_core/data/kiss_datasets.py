@@ -20,8 +20,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Array, Frame
 
-_SWEEP = 0.1  # s, one revolution of the LiDAR
-_OWN = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
+_SWEEP_PERIOD = 0.1  # s, one revolution of the LiDAR
+_NATIVE_LOADERS = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
 
 
 class KissSource(IndexedSource):
@@ -39,22 +39,22 @@ class KissSource(IndexedSource):
         kind = self._settings.dataset
         with needs("datasets", f"input.dataset={kind}"):
             from kiss_icp.datasets import available_dataloaders, dataset_factory
-        names = sorted(set(available_dataloaders()).difference(_OWN))
+        names = sorted(set(available_dataloaders()).difference(_NATIVE_LOADERS))
         if kind not in names:
             raise UsageError(f"input.dataset={kind}: there is no such loader; there are {', '.join(names)}")
         arguments = {"data_dir": self.path, "sequence": self._settings.sequence}
-        self._set = self._asked(lambda: dataset_factory(kind, **arguments))
-        super().__init__(self.path.resolve().stem, int(self._asked(lambda: len(self._set))))
+        self._loader = self._call_loader(lambda: dataset_factory(kind, **arguments))
+        super().__init__(self.path.resolve().stem, int(self._call_loader(lambda: len(self._loader))))
         if not self._count:
             raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
-        self.stamps, self.poses = self._times(), self._poses()
+        self.stamps, self.poses = self._read_stamps(), self._poses()
         self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
 
     def frame(self, position: int) -> Frame:
         """See `IndexedSource`."""
         stamp = int(self.stamps[position])
         try:
-            xyz, times = self._asked(lambda: self._set[position])
+            xyz, times = self._call_loader(lambda: self._loader[position])
         except UsageError as error:
             return Frame(stamp, NO_POINTS, index=position, problem=str(error))
         points = np.zeros((len(xyz), 4), np.float32)
@@ -62,21 +62,21 @@ class KissSource(IndexedSource):
         offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
         return Frame(stamp, points, offset, index=position)
 
-    def _asked(self, what: Any) -> Any:
+    def _call_loader(self, call: Any) -> Any:
         """Result of a call of the loader, which prints, exits and asserts if something is missing."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-                answer = what()
+                result = call()
         except (Exception, SystemExit) as error:
-            said = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
-            words = " ".join(said.split()[-30:]) or type(error).__name__
-            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
+            output = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
+            message = " ".join(output.split()[-30:]) or type(error).__name__
+            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {message}") from None
         self._printed = self._printed or printed.getvalue()
-        return answer
+        return result
 
     def _poses(self) -> Array | None:
-        poses = getattr(self._set, "gt_poses", None)
+        poses = getattr(self._loader, "gt_poses", None)
         if poses is None:
             return None
         poses = np.asarray(poses, np.float64)
@@ -85,14 +85,14 @@ class KissSource(IndexedSource):
         self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
         return None
 
-    def _times(self) -> Array:
+    def _read_stamps(self) -> Array:
         """(len,) ns: the loader's times, else the scans' names if they are times, else at constant `input.period`."""
-        known = getattr(self._set, "get_frames_timestamps", None)
-        if known is not None:
-            found = np.asarray(self._asked(known), np.float64).ravel()
-            if len(found) == self._count and np.isfinite(found).all():
-                return np.asarray(np.round(found * 1e9), np.int64)
-        names = [Path(str(file)) for file in getattr(self._set, "scan_files", ())]
+        read_times = getattr(self._loader, "get_frames_timestamps", None)
+        if read_times is not None:
+            times = np.asarray(self._call_loader(read_times), np.float64).ravel()
+            if len(times) == self._count and np.isfinite(times).all():
+                return np.asarray(np.round(times * 1e9), np.int64)
+        names = [Path(str(file)) for file in getattr(self._loader, "scan_files", ())]
         if len(names) == self._count and (named := name_times(names)):
             return np.asarray(named, np.int64)
         why = f"{self.path}: the loader has no times"
@@ -103,4 +103,4 @@ class KissSource(IndexedSource):
         if len(times) != count or not count or np.ptp(times) == 0:
             note_once(self.notes, f"{self.path}: no time field: not de-skewed")
             return None
-        return ((times - times.max()) / np.ptp(times) * _SWEEP).astype(np.float32)
+        return ((times - times.max()) / np.ptp(times) * _SWEEP_PERIOD).astype(np.float32)

@@ -54,25 +54,25 @@ class KittiSource(VelodyneDrive):
         calib = read_calib(self.path / "calib.txt")
         self.T_cam_lidar = calib.get("Tr")
         if self.T_cam_lidar is None:
-            lacks = "has no Tr" if (self.path / "calib.txt").is_file() else "is missing"
-            self.notes.append(f"{self.path / 'calib.txt'} {lacks}: poses are of the LiDAR, not of the left camera")
-        self.stamps = self._stamps()
+            problem = "has no Tr" if (self.path / "calib.txt").is_file() else "is missing"
+            self.notes.append(f"{self.path / 'calib.txt'} {problem}: poses are of the LiDAR, not of the left camera")
+        self.stamps = self._scan_stamps()
         self.poses = self._poses()
         self.camera = self._camera(calib)
-        self.imu, self.R_lidar_imu = self._imu(calib)
-        self.fixes = self._fixes(calib)
+        self.imu, self.R_lidar_imu = self._read_imu(calib)
+        self.fixes = self._read_fixes(calib)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position, with the IMU samples and the fix measured since the frame before."""
-        before, fixes = None, deque(self.fixes)
+        last_stamp, fixes = None, deque(self.fixes)
         for frame in super().frames(start, stop):
-            imu, fix = self._samples(before, frame.stamp), None
+            imu, fix = self._imu_since(last_stamp, frame.stamp), None
             while fixes and fixes[0].stamp <= frame.stamp:
                 fix = fixes.popleft()
-            before = frame.stamp
+            last_stamp = frame.stamp
             yield replace(frame, imu=imu, fix=fix)
 
-    def _imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
+    def _read_imu(self, calib: dict[str, Array]) -> tuple[Inertial | None, Array]:
         """All samples along the IMU's axes (None if there are none to use), and R_lidar_imu (3, 3)."""
         path, R = self.path / "imu.txt", self._settings.imu_rotation()
         rows = read_numbers(path, 7) if self._settings.imu else np.zeros((0, 7))
@@ -86,50 +86,50 @@ class KittiSource(VelodyneDrive):
             raise UsageError(f"{path}:{int(np.argmax(np.diff(rows[:, 0]) <= 0)) + 2}: times do not increase")
         return Inertial(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:]), R
 
-    def _samples(self, before: int | None, stamp: int) -> Inertial | None:
+    def _imu_since(self, last_stamp: int | None, stamp: int) -> Inertial | None:
         """Samples since the scan before (ns), at most those of the last `KEPT`, rotated into the LiDAR frame."""
-        s, R = self.imu, self.R_lidar_imu
-        if s is None:
+        imu, R = self.imu, self.R_lidar_imu
+        if imu is None:
             return None
-        since = stamp - KEPT if before is None else max(before, stamp - KEPT)
-        first, last = np.searchsorted(s.stamps, [since, stamp], "right")
-        return Inertial(s.stamps[first:last], s.rates[first:last] @ R.T, s.forces[first:last] @ R.T)
+        start = stamp - KEPT if last_stamp is None else max(last_stamp, stamp - KEPT)
+        first, last = np.searchsorted(imu.stamps, [start, stamp], "right")
+        return Inertial(imu.stamps[first:last], imu.rates[first:last] @ R.T, imu.forces[first:last] @ R.T)
 
-    def _fixes(self, calib: dict[str, Array]) -> list[Fix]:
+    def _read_fixes(self, calib: dict[str, Array]) -> list[Fix]:
         path, antenna = self.path / "gnss.txt", calib.get("Tr_gnss_to_velo", np.eye(4))[:3, 3]
-        rows, found = read_numbers(path, 7), []
+        rows, fixes = read_numbers(path, 7), []
         for line, (time, *numbers) in enumerate(rows.tolist(), 1):
             try:
                 covariance = np.diag(np.square(numbers[3:]))
-                found.append(Fix(round(time * 1e9), np.array(numbers[:3]), covariance, antenna))
+                fixes.append(Fix(round(time * 1e9), np.array(numbers[:3]), covariance, antenna))
             except ValueError as error:
                 raise UsageError(f"{path}:{line}: {error}") from None
         if rows.size and "Tr_gnss_to_velo" not in calib:
             self.notes.append(f"{path}: the antenna is assumed to be at the LiDAR: no Tr_gnss_to_velo in calib.txt")
-        return sorted(found, key=lambda fix: fix.stamp)
+        return sorted(fixes, key=lambda fix: fix.stamp)
 
     def _known_correction(self) -> float:
-        note = self.path / "dpm2_sim.json"  # the simulated sensor has no such error; this file states it
+        path = self.path / "dpm2_sim.json"  # the simulated sensor has no such error; this file states it
         try:
-            message = float(json.loads(note.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
+            correction = float(json.loads(path.read_text(encoding="utf-8"))["vertical_angle_correction_deg"])
         except FileNotFoundError:
             return super()._known_correction()
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            raise UsageError(f"{note}: no number vertical_angle_correction_deg ({error})") from None
-        return checked_correction(message, str(note))
+            raise UsageError(f"{path}: no number vertical_angle_correction_deg ({error})") from None
+        return checked_correction(correction, str(path))
 
-    def _stamps(self) -> NDArray[np.int64]:
+    def _scan_stamps(self) -> NDArray[np.int64]:
         """(len,) ns from times.txt, continued at a constant rate if it ends early; else from the names of the scans if
         those are times since 1970."""
         path, n = self.path / "times.txt", len(self)
         times = read_numbers(path, 1)
-        seconds = self._of_each_scan(times)[:, 0]
+        seconds = self._rows_of_scans(times)[:, 0]
         known = np.isfinite(seconds)
         if not known.any():
             if named := name_times(self._scans):
                 return np.array(named, np.int64)
-            since = self.numbers - self.numbers[0]
-            return self._settings.steady_stamps(since, f"{path}: missing or too short", self.notes)
+            scan_count = self.numbers - self.numbers[0]
+            return self._settings.steady_stamps(scan_count, f"{path}: missing or too short", self.notes)
         if not known.all():
             last = int(np.flatnonzero(known)[-1])
             step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else self._settings.period
@@ -146,8 +146,8 @@ class KittiSource(VelodyneDrive):
 
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar from poses.txt here or poses/NN.txt of the root; None without either."""
-        beside, above = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
-        requested = {"auto": (beside, above), "kitti": (above,), "semantic_kitti": (beside,)}[
+        in_sequence, in_root = self.path / "poses.txt", self.path.resolve().parent.parent / "poses" / f"{self.name}.txt"
+        requested = {"auto": (in_sequence, in_root), "kitti": (in_root,), "semantic_kitti": (in_sequence,)}[
             self._settings.kitti_poses
         ]
         path = next((file for file in requested if file.is_file()), None)
@@ -159,7 +159,7 @@ class KittiSource(VelodyneDrive):
             self.notes.append(f"{path} has poses of the camera: without Tr they are no ground truth for the LiDAR")
             return None
         self.truth = "/".join(path.parts[-2:])  # poses/04.txt, or SemanticKITTI's 04/poses.txt
-        rows = self._of_each_scan(read_numbers(path, 12))
+        rows = self._rows_of_scans(read_numbers(path, 12))
         known = np.isfinite(rows[:, 0])
         self._note_unposed(path, known)
         rigid = np.array([se3.is_rigid(se3.make(T[:, :3], T[:, 3]), ROUNDED) for T in rows.reshape(-1, 3, 4)], bool)
@@ -174,7 +174,7 @@ class KittiSource(VelodyneDrive):
         T_world_cam[known] = se3.from_rows(rows[known])
         return se3.inverse(self.T_cam_lidar) @ T_world_cam @ self.T_cam_lidar
 
-    def _of_each_scan(self, rows: Array) -> Array:
+    def _rows_of_scans(self, rows: Array) -> Array:
         """The row of each scan, NaN where there is none.
 
         In order if there are as many rows as scans, but not as many as the frame numbers require. Else by frame number
@@ -182,12 +182,12 @@ class KittiSource(VelodyneDrive):
         """
         out = np.full((len(self), rows.shape[1]), np.nan)
         if len(rows) == len(self) <= self.numbers[-1]:
-            at = np.arange(len(self))
+            indices = np.arange(len(self))
         elif len(rows) > self.numbers[-1] or self.numbers[0] == 0:
-            at = self.numbers
+            indices = self.numbers
         else:
             return out
-        out[at < len(rows)] = rows[at[at < len(rows)]]
+        out[indices < len(rows)] = rows[indices[indices < len(rows)]]
         return out
 
     def _camera(self, calib: dict[str, Array]) -> Camera | None:

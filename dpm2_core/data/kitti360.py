@@ -33,7 +33,7 @@ class Kitti360Source(VelodyneDrive):
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         settings = settings or InputSettings()
-        self.root, self.drive = _find(Path(path), settings.sequence)
+        self.root, self.drive = _find_drive(Path(path), settings.sequence)
         scans = self.root / "data_3d_raw" / self.drive / "velodyne_points"
         images = self.root / "data_2d_raw" / self.drive / "image_00" / "data_rect"
         super().__init__(self.drive, scans / "data", images, settings)
@@ -52,24 +52,24 @@ class Kitti360Source(VelodyneDrive):
     def _poses(self) -> Array | None:
         """(len, 4, 4) T_world_lidar, from poses.txt (of the IMU), else cam0_to_world.txt; None without either."""
         folder = self.root / "data_poses" / self.drive
-        of_imu, of_camera = folder / "poses.txt", folder / "cam0_to_world.txt"
-        if of_imu.is_file():
-            file, rows = of_imu, read_numbers(of_imu, 13)
+        imu_poses, camera_poses = folder / "poses.txt", folder / "cam0_to_world.txt"
+        if imu_poses.is_file():
+            file, rows = imu_poses, read_numbers(imu_poses, 13)
             mounting = self.root / "calibration" / "calib_cam_to_pose.txt"
             row = read_keyed(mounting).get("image_00")
             if row is None:
-                raise UsageError(f"{mounting}: no image_00, which {of_imu} needs")
+                raise UsageError(f"{mounting}: no image_00, which {imu_poses} needs")
             T_sensor_lidar = se3.from_rows(row) @ self._T_cam_lidar
-        elif of_camera.is_file():
-            file, rows = of_camera, read_numbers(of_camera, 17)
+        elif camera_poses.is_file():
+            file, rows = camera_poses, read_numbers(camera_poses, 17)
             T_sensor_lidar = self._T_rect_cam @ self._T_cam_lidar
         else:
             return None
         self.truth = "/".join(file.parts[-3:])
         poses = np.full((len(self), 4, 4), np.nan)
-        at = {int(number): k for k, number in enumerate(self.numbers)}
+        position_of = {int(number): k for k, number in enumerate(self.numbers)}
         for row in rows:
-            if (k := at.get(int(row[0]))) is not None:
+            if (k := position_of.get(int(row[0]))) is not None:
                 poses[k] = se3.from_rows(row[1:13]) @ T_sensor_lidar
         self._note_unposed(file, np.isfinite(poses[:, 0, 0]))
         return poses
@@ -90,7 +90,7 @@ def _only_row(path: Path) -> Array:
     return rows[0]
 
 
-def _find(path: Path, sequence: str) -> tuple[Path, str]:
+def _find_drive(path: Path, sequence: str) -> tuple[Path, str]:
     """Root of the dataset and name of the drive."""
     if (path / "velodyne_points").is_dir():
         drive = path.absolute()

@@ -40,7 +40,7 @@ class KittiCarlaSource(IndexedSource):
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self._settings = settings or InputSettings()
-        self.folder = _find(Path(path), self._settings.sequence)
+        self.folder = _generated_folder(Path(path), self._settings.sequence)
         self._sweeps = sorted((self.folder / "frames").glob("frame_*.ply"), key=lambda p: int(p.stem[6:]))
         if not self._sweeps:
             raise UsageError(f"{self.folder}: no sweeps (frames/frame_NNNN.ply) in this folder")
@@ -74,12 +74,12 @@ class KittiCarlaSource(IndexedSource):
         self.truth = path.name
         times = rows[:, 12]
         seconds = times[0] + seconds
-        at = np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
-        near = np.abs(times[at] - seconds) < 0.5 * _PERIOD
+        nearest = np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
+        near = np.abs(times[nearest] - seconds) < 0.5 * _PERIOD
         poses = np.full((len(self), 4, 4), np.nan)
-        poses[near] = se3.from_rows(rows[at[near], :12])
+        poses[near] = se3.from_rows(rows[nearest[near], :12])
         self._note_unposed(path, near)
-        return np.round(np.where(near, times[at], seconds) * 1e9).astype(np.int64), poses
+        return np.round(np.where(near, times[nearest], seconds) * 1e9).astype(np.int64), poses
 
     def _extrinsic(self) -> Array | None:
         """LiDAR to the optical frame of camera 0; None if lidar_to_cam0.txt is missing."""
@@ -105,7 +105,7 @@ class KittiCarlaSource(IndexedSource):
         return self.folder / "images_rgb" / f"{number:04d}_0.png"
 
 
-def _find(path: Path, sequence: str) -> Path:
+def _generated_folder(path: Path, sequence: str) -> Path:
     """The `generated` folder."""
     for folder in (path, path / "generated"):
         if (folder / "frames").is_dir():

@@ -21,9 +21,9 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_EARTH = 6378137.0  # m, the radius of the data set's projection
-_CALIBRATION = "calib_velo_to_cam.txt"
-_OXTS = 30  # numbers in a file of oxts
+_EARTH_RADIUS = 6378137.0  # m, the radius of the data set's projection
+_EXTRINSICS = "calib_velo_to_cam.txt"
+_OXTS_COLUMNS = 30  # numbers in a file of oxts
 
 
 class KittiRawSource(VelodyneDrive):
@@ -38,45 +38,43 @@ class KittiRawSource(VelodyneDrive):
 
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         settings = settings or InputSettings()
-        self.path = _find(Path(path), settings.sequence)
+        self.path = _drive_folder(Path(path), settings.sequence)
         scans = self.path / "velodyne_points"
         super().__init__(self.path.absolute().name, scans / "data", self.path / "image_02" / "data", settings)
         self.vertical_angle_correction_deg = self._correction()
         self.stamps = self._read_stamps(scans / "timestamps.txt")
         folders = (self.path.absolute().parent, self.path.resolve().parent)  # a drive may be a link to another disk
-        date = next((folder for folder in folders if (folder / _CALIBRATION).is_file()), None)
-        if date is None:
-            self.notes.append(
-                f"{folders[0] / _CALIBRATION}: no such file; without calibration only the points are used"
-            )
+        date_folder = next((folder for folder in folders if (folder / _EXTRINSICS).is_file()), None)
+        if date_folder is None:
+            self.notes.append(f"{folders[0] / _EXTRINSICS}: no such file; without calibration only the points are used")
             return
-        cameras = date / "calib_cam_to_cam.txt"
-        intrinsics = read_keyed(cameras)
-        R_rect = se3.make(required(intrinsics, "R_rect_00", 9, cameras).reshape(3, 3), np.zeros(3))
-        self.T_cam_lidar = se3.orthonormalized(R_rect) @ _rigid(date / _CALIBRATION)
+        camera_file = date_folder / "calib_cam_to_cam.txt"
+        intrinsics = read_keyed(camera_file)
+        R_rect = se3.make(required(intrinsics, "R_rect_00", 9, camera_file).reshape(3, 3), np.zeros(3))
+        self.T_cam_lidar = se3.orthonormalized(R_rect) @ _read_rigid(date_folder / _EXTRINSICS)
         if size := self._image_size():
-            P2 = required(intrinsics, "P_rect_02", 12, cameras).reshape(3, 4)
+            P2 = required(intrinsics, "P_rect_02", 12, camera_file).reshape(3, 4)
             self.camera = left_color_camera(P2, self.T_cam_lidar, size)
-        self.poses = self._poses(date / "calib_imu_to_velo.txt")
+        self.poses = self._poses(date_folder / "calib_imu_to_velo.txt")
 
     def _poses(self, mounting: Path) -> Array | None:
         """(len, 4, 4) T_world_lidar, x to the east, z up, origin at the first scan; None without oxts."""
         folder = self.path / "oxts" / "data"
-        rows = [read_numbers(folder / f"{scan.stem}.txt", _OXTS)[:1] for scan in self._scans]
+        rows = [read_numbers(folder / f"{scan.stem}.txt", _OXTS_COLUMNS)[:1] for scan in self._scans]
         known = np.array([len(row) == 1 for row in rows])
         if not known.any():
             return None
         self.truth = f"{self.name}/oxts"
         self._note_unposed(folder, known)
         poses = np.full((len(self), 4, 4), np.nan)
-        poses[known] = _poses_of(np.concatenate(rows)) @ se3.inverse(_rigid(mounting))
+        poses[known] = _mercator_poses(np.concatenate(rows)) @ se3.inverse(_read_rigid(mounting))
         return poses
 
 
-def _poses_of(oxts: Array) -> Array:
+def _mercator_poses(oxts: Array) -> Array:
     """(N, 4, 4) T_world_imu from (N, 30) rows of oxts: a Mercator projection with true scale at the first row."""
     latitude, longitude = np.radians(oxts[:, 0]), np.radians(oxts[:, 1])
-    scale = np.cos(latitude[0]) * _EARTH
+    scale = np.cos(latitude[0]) * _EARTH_RADIUS
     poses = np.tile(np.eye(4), (len(oxts), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("xyz", oxts[:, 3:6]).as_matrix()  # roll, then pitch, then yaw
     poses[:, :3, 3] = np.c_[scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), oxts[:, 2]]
@@ -84,7 +82,7 @@ def _poses_of(oxts: Array) -> Array:
     return poses
 
 
-def _rigid(path: Path) -> Array:
+def _read_rigid(path: Path) -> Array:
     """(4, 4) transform from a file with the lines R and T.
 
     Raises:
@@ -100,7 +98,7 @@ def _rigid(path: Path) -> Array:
     return se3.orthonormalized(T)
 
 
-def _find(path: Path, sequence: str) -> Path:
+def _drive_folder(path: Path, sequence: str) -> Path:
     if (path / "velodyne_points").is_dir():
         return path
     return path / chosen(path, sequence, KITTI_RAW)

@@ -20,7 +20,7 @@ from dpm2_core.data.messages import MessageError
 LIVOX = ("livox_ros_driver2/msg/CustomMsg", "livox_ros_driver/msg/CustomMsg")
 """Message types."""
 
-_POINT, _STEP = 19, 20  # bytes of a point, and from one point to the next as ROS 2 aligns them
+_POINT_BYTES, _POINT_STEP = 19, 20  # bytes of a point, and from one point to the next as ROS 2 aligns them
 _FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7), ("reflectivity", 16, 2), ("tag", 17, 2),
            ("line", 18, 2))  # fmt: skip
 
@@ -44,13 +44,14 @@ def cloud_of_custom(data: bytes | memoryview) -> Any:
     except (struct.error, IndexError, UnicodeDecodeError):
         raise MessageError(f"Livox CustomMsg of {len(data)} bytes ends before its points") from None
     points = body[at + 4 :]
-    if len(points) < count * _STEP - 1:
-        raise MessageError(f"Livox CustomMsg: {len(points)} bytes of points, {count} points of {_STEP} declared")
+    if len(points) < count * _POINT_STEP - 1:
+        raise MessageError(f"Livox CustomMsg: {len(points)} bytes of points, {count} points of {_POINT_STEP} declared")
     fields = [SimpleNamespace(name=name, offset=offset, datatype=kind, count=1) for name, offset, kind in _FIELDS]
     stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
     return SimpleNamespace(
         header=SimpleNamespace(stamp=stamp, frame_id=frame), height=1, width=count, fields=fields,
-        is_bigendian=order == ">", point_step=_STEP, row_step=count * _STEP, data=points + b"\0", is_dense=False,
+        is_bigendian=order == ">", point_step=_POINT_STEP, row_step=count * _POINT_STEP,
+        data=points + b"\0", is_dense=False,
     )  # fmt: skip
 
 
@@ -65,8 +66,8 @@ def custom_of_ros1(data: bytes | memoryview) -> bytes:
     head = struct.pack("<iII", sec, nanosec, len(frame)) + frame
     head += bytes(-len(head) % 8) + bytes(data[at : at + 16])
     (count,) = struct.unpack_from("<I", data, at + 16)
-    if count * _POINT > len(data):
+    if count * _POINT_BYTES > len(data):
         raise ValueError(f"{count} points in {len(data)} bytes")
-    points = np.zeros((count, _STEP), np.uint8)
-    points[:, :_POINT] = np.frombuffer(data, np.uint8, count * _POINT, at + 20).reshape(count, _POINT)
+    points = np.zeros((count, _POINT_STEP), np.uint8)
+    points[:, :_POINT_BYTES] = np.frombuffer(data, np.uint8, count * _POINT_BYTES, at + 20).reshape(count, _POINT_BYTES)
     return b"\0\1\0\0" + head + struct.pack("<I", count) + points.tobytes()

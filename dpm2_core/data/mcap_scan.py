@@ -39,7 +39,7 @@ def scanned_messages(file: Path) -> Iterator[McapMessage]:
     """
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str, bool]] = {}
-    with _WholeReads(FileIO(file)) as stream:
+    with _StrictReader(FileIO(file)) as stream:
         for record in StreamReader(stream, record_size_limit=file.stat().st_size).records:
             if isinstance(record, Schema):
                 schemas[record.id] = record.name
@@ -63,7 +63,7 @@ def by_log_time(messages: Iterable[McapMessage]) -> Iterator[McapMessage]:
         yield heappop(held)[2]
 
 
-class _WholeReads(BufferedReader):
+class _StrictReader(BufferedReader):
     """Raises EOFError for a short read at the end of the file, which the mcap package takes for a whole record."""
 
     def read(self, size: int | None = -1, /) -> bytes:

@@ -100,11 +100,11 @@ def cloud_view(msg: Any, names: Collection[str]) -> NDArray[np.void]:
             continue
         if field.datatype not in _POINT_TYPES:
             raise MessageError(f"PointCloud2 field {field.name}: unknown datatype {field.datatype}")
-        one = np.dtype(order + _POINT_TYPES[field.datatype])
+        scalar = np.dtype(order + _POINT_TYPES[field.datatype])
         count = max(1, int(field.count))  # some drivers leave count at 0
-        if field.offset + count * one.itemsize > step:
+        if field.offset + count * scalar.itemsize > step:
             raise MessageError(f"PointCloud2 field {field.name} ends beyond point_step {step}")
-        layout[field.name] = ((one, (count,)) if count > 1 else one, int(field.offset))
+        layout[field.name] = ((scalar, (count,)) if count > 1 else scalar, int(field.offset))
     dtype = np.dtype(
         {
             "names": list(layout),
@@ -162,15 +162,15 @@ def decode_points(
     available = [field.name for field in msg.fields]
     if time_field and time_field not in available:
         raise MessageError(f"PointCloud2 has no time field {time_field}; fields: {', '.join(available)}")
-    intensity = _usual(available, _INTENSITY_NAMES)
-    time, unit = time_field_of(available) if time_field is None else (time_field, "auto")
+    intensity = _find_field(available, _INTENSITY_NAMES)
+    time_name, unit = time_field_of(available) if time_field is None else (time_field, "auto")
     if time_unit == "auto":
         time_unit = unit
-    view = cloud_view(msg, [name for name in (*_XYZ, intensity, time) if name])
+    view = cloud_view(msg, [name for name in (*_XYZ, intensity, time_name) if name])
     points = _points(view, intensity, intensity_max)
-    if not time:
+    if not time_name:
         return points, None
-    return points, time_offsets(_first(view[time]), returned(points), stamp_ns(msg.header), time_unit)
+    return points, time_offsets(_first_column(view[time_name]), returned(points), stamp_ns(msg.header), time_unit)
 
 
 def why_untimed(msg: Any) -> str:
@@ -178,17 +178,17 @@ def why_untimed(msg: Any) -> str:
     time, _ = time_field_of([field.name for field in msg.fields])
     if time is None:
         return "no time field"
-    values = _first(cloud_view(msg, [time])[time])
+    values = _first_column(cloud_view(msg, [time])[time])
     known = values[np.isfinite(values) & (values != 0)]
     constant = bool((known == known[:1]).all())  # also true if there are none
     return f"all points have the same {time}" if constant else f"{time} is no possible time of most points"
 
 
-def _usual(available: list[str], names: tuple[str, ...]) -> str | None:
+def _find_field(available: list[str], names: tuple[str, ...]) -> str | None:
     return next((field for name in names for field in available if field.lower() == name), None)
 
 
-def _first(column: NDArray[Any]) -> NDArray[Any]:
+def _first_column(column: NDArray[Any]) -> NDArray[Any]:
     """(N,) of a field that may have count > 1."""
     return column if column.ndim == 1 else column[:, 0]
 
@@ -203,7 +203,7 @@ def _points(view: NDArray[np.void], intensity: str | None, intensity_max: float 
         points = np.zeros((len(view), 4), np.float32)
         with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, and an invalid point
             for i, name in enumerate(requested):
-                points[:, i] = _first(view[name])
+                points[:, i] = _first_column(view[name])
     if not intensity:
         return points
     return scale_intensity(points, intensity_max, integer=view.dtype[intensity].base.kind != "f")

@@ -23,10 +23,10 @@ from dpm2_core.frame import NO_POINTS, Array, Frame
 
 # Its dependencies pin rosbags and others to releases that this package cannot use; for reading, none are needed.
 INSTALL = "pip install --no-deps 'ouster-sdk>=1,<2'"
-_RECEIVED = 1  # bit in a column's status
+_RECEIVED_BIT = 1  # bit in a column's status
 _FRAME = "os_sensor"  # frame of the housing
-_PERIOD = 100_000_000  # ns, the longest sweep
-_INTENSITY = ("REFLECTIVITY", "SIGNAL")  # the first one that the recording has
+_MAX_SWEEP = 100_000_000  # ns, the longest sweep
+_INTENSITY_FIELDS = ("REFLECTIVITY", "SIGNAL")  # the first one that the recording has
 
 
 class OusterSource:
@@ -47,12 +47,12 @@ class OusterSource:
     def __init__(self, path: Path | str, settings: InputSettings | None = None) -> None:
         self.path, settings = Path(path), settings or InputSettings()
         self.name, self.notes = self.path.stem, list[str]()
-        self._sensor, self._project, self._sweeps = _opened(self.path, settings.points_topic)
+        self._sensor, self._project, self._sweeps = _open_sensor(self.path, settings.points_topic)
         # An .osf has an index; if one is missing, the package would write it into the file.
         self._count = len(self._sweeps) if self._sweeps.is_indexed else sum(1 for _ in self._sweeps)
         if not self._count:
             raise UsageError(f"{self.path}: no sweep of the sensor that its metadata describes")
-        self._imu, self._reads_imu = ImuBuffer(), settings.imu and self.path.suffix == ".pcap"
+        self._imu, self._has_imu = ImuBuffer(), settings.imu and self.path.suffix == ".pcap"
         calibration = Calibration(self.path.name, imu_topic="IMU")
         self._frames = FrameBuilder(settings, calibration, self.notes.append, imu=self._imu)
 
@@ -61,17 +61,17 @@ class OusterSource:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Frames start..stop-1 by position; the first unreadable one has `problem` set and is the last."""
-        wanted, stamp = range(*slice(start, stop).indices(self._count)), 0
+        indices, stamp = range(*slice(start, stop).indices(self._count)), 0
         # With its index, the package (1.0) finds the first sweep of an .osf in place of its last.
-        upcoming = islice(self._sweeps, wanted.start, wanted.stop)
-        samples = _samples(self.path, self._sensor) if self._reads_imu else iter(())
+        upcoming = islice(self._sweeps, indices.start, indices.stop)
+        samples = _imu_samples(self.path, self._sensor) if self._has_imu else iter(())
         self._imu.clear()
-        for index in wanted:
+        for index in indices:
             try:
                 if (sweep := next(upcoming, None)) is None:
                     raise UsageError("its data are not there")
                 columns, stamp = self._columns(sweep[0], stamp)
-                self._fill(samples, stamp + _PERIOD)
+                self._add_imu_samples(samples, stamp + _MAX_SWEEP)
             except Exception as error:  # the package raises several error types of its own for damaged files
                 problem = f"{self.path}: sweep {index}: {_reason(error)}"
                 self.notes.append(problem)
@@ -79,7 +79,7 @@ class OusterSource:
                 return
             yield self._frames.frame(stamp, point_cloud(columns, stamp, _FRAME), index)
 
-    def _fill(self, samples: Iterator[tuple[int, Any]], until: int) -> None:
+    def _add_imu_samples(self, samples: Iterator[tuple[int, Any]], until: int) -> None:
         """Add samples of the IMU up to the first one after a time, ns."""
         try:
             for stamp, message in samples:
@@ -92,7 +92,7 @@ class OusterSource:
 
     def _columns(self, sweep: Any, last: int) -> tuple[dict[str, NDArray[Any]], int]:
         """PointCloud2 fields of the returned points, and the stamp, ns; the stamp `last` if no column was received."""
-        received = (sweep.status & _RECEIVED).astype(bool)
+        received = (sweep.status & _RECEIVED_BIT).astype(bool)
         times = sweep.timestamp.astype(np.int64)
         stamp = int(times[received][0]) if received.any() else last
         ranges = sweep.field("RANGE")
@@ -100,19 +100,19 @@ class OusterSource:
         xyz = self._project(ranges)[returned].astype(np.float32)
         columns: dict[str, NDArray[Any]] = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
         columns["time_ns"] = np.broadcast_to((times - stamp).astype(np.float64), ranges.shape)[returned]
-        known = next((name for name in _INTENSITY if sweep.has_field(name)), None)
-        if known is not None:
-            columns["intensity"] = sweep.field(known)[returned]
+        intensity_field = next((name for name in _INTENSITY_FIELDS if sweep.has_field(name)), None)
+        if intensity_field is not None:
+            columns["intensity"] = sweep.field(intensity_field)[returned]
         return columns, stamp
 
 
-def _samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
+def _imu_samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
     """Stamp, ns, and sensor_msgs/Imu along the axes of the housing, for each sample of a sensor's IMU."""
     from ouster.sdk import core, open_packet_source
 
     packets = open_packet_source(str(path))
     R = packets.sensor_info[sensor].imu_to_sensor_transform[:3, :3]
-    header, known = SimpleNamespace(frame_id=_FRAME), np.zeros(9)  # covariances
+    header, no_covariance = SimpleNamespace(frame_id=_FRAME), np.zeros(9)  # covariances
     for index, packet in packets:
         if index == sensor and isinstance(packet, core.ImuPacket):
             rates, forces = np.reshape(packet.gyro(), (-1, 3)) @ R.T, np.reshape(packet.accel(), (-1, 3)) @ R.T
@@ -120,11 +120,11 @@ def _samples(path: Path, sensor: int) -> Iterator[tuple[int, Any]]:
                 rate, force = (SimpleNamespace(**dict(zip("xyz", xyz, strict=True))) for xyz in (rate, force))
                 yield stamp, SimpleNamespace(
                     header=header, angular_velocity=rate, linear_acceleration=force,
-                    angular_velocity_covariance=known, linear_acceleration_covariance=known,
+                    angular_velocity_covariance=no_covariance, linear_acceleration_covariance=no_covariance,
                 )  # fmt: skip
 
 
-def _opened(path: Path, sensor: str) -> tuple[int, Callable[[NDArray[Any]], Array], Any]:
+def _open_sensor(path: Path, sensor: str) -> tuple[int, Callable[[NDArray[Any]], Array], Any]:
     """The sensor with that serial number, or the only one: its position in the file, the function from ranges (H, W) to
     points (H, W, 3) m, and its sweeps."""
     try:

@@ -19,7 +19,7 @@ from dpm2_core.frame import Array, Camera, Image
 
 QUANTUM = 0.002  # m; 60 m fit in 16 bits, and the LiDAR's noise is ten times larger
 FORMAT = 1
-_VIEWS = ("pixels", "K", "T_lidar_cam")  # files of a drive with images
+_IMAGE_FILES = ("pixels", "K", "T_lidar_cam")  # files of a drive with images
 
 
 class Sample(NamedTuple):
@@ -153,50 +153,52 @@ class PackedDrive:
             self.poses: Array = np.load(folder / "poses.npy", allow_pickle=False)
             self.offsets = np.load(folder / "offsets.npy", allow_pickle=False)
             self.has_images = (folder / "pixels.npy").exists()
-            clouds, *views = [_mapped(folder, name).shape for name in ("clouds", *(_VIEWS if self.has_images else ()))]
+            clouds_shape, *image_shapes = [
+                _memory_mapped(folder, name).shape for name in ("clouds", *(_IMAGE_FILES if self.has_images else ()))
+            ]
         except (EOFError, MemoryError, OSError, RecursionError, TypeError, ValueError) as error:
             raise UsageError(f"{folder}: no packed drive: {error}") from None
         format = self.about.get("format") if isinstance(self.about, dict) else None
         if format != FORMAT:
             raise UsageError(f"{folder}: packed format {format}, want {FORMAT}: pack it again")
         frames = len(self.poses)
-        fit = self.poses.shape[1:] == (4, 4) and self.offsets.shape == (frames + 1,)
-        if not fit or clouds != (self.offsets[-1], 3) or np.any(np.diff(self.offsets) < 0):
+        shapes_match = self.poses.shape[1:] == (4, 4) and self.offsets.shape == (frames + 1,)
+        if not shapes_match or clouds_shape != (self.offsets[-1], 3) or np.any(np.diff(self.offsets) < 0):
             raise UsageError(f"{folder}: poses, offsets and clouds do not fit each other: pack it again")
-        if any(shape[0] != frames for shape in views):
+        if any(shape[0] != frames for shape in image_shapes):
             raise UsageError(f"{folder}: poses, images and their calibration do not fit each other: pack it again")
         if not np.isfinite(self.poses).all():
             raise UsageError(f"{folder}: a pose is not finite: pack it again")
-        self.image_size: tuple[int, int] | None = views[0][2:4] if views else None
+        self.image_size: tuple[int, int] | None = image_shapes[0][2:4] if image_shapes else None
         self.folder = folder
         self.preset = str(self.about.get("preset", ""))
         self.name = folder.name
-        self._maps: dict[str, NDArray] = {}
+        self._arrays: dict[str, NDArray] = {}
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def __getitem__(self, index: int) -> Sample:
         start, end = self.offsets[index : index + 2]
-        cloud = self._map("clouds")[start:end].astype(np.float32) * np.float32(QUANTUM)
+        cloud = self._array("clouds")[start:end].astype(np.float32) * np.float32(QUANTUM)
         return Sample(cloud, self.poses[index], self._images(index))
 
-    def _map(self, name: str) -> NDArray:
-        if name not in self._maps:
-            self._maps[name] = _mapped(self.folder, name)
-        return self._maps[name]
+    def _array(self, name: str) -> NDArray:
+        if name not in self._arrays:
+            self._arrays[name] = _memory_mapped(self.folder, name)
+        return self._arrays[name]
 
     def _images(self, index: int) -> tuple[Image, ...]:
         if not self.has_images:
             return ()
-        pixels, K, T = (self._map(name)[index] for name in _VIEWS)
+        pixels, K, T = (self._array(name)[index] for name in _IMAGE_FILES)
         return tuple(
             Image(np.array(p), Camera(np.array(k), np.array(t), (p.shape[1], p.shape[0])))
             for p, k, t in zip(pixels, K, T, strict=True)
         )
 
 
-def _mapped(folder: Path, name: str) -> NDArray:
+def _memory_mapped(folder: Path, name: str) -> NDArray:
     return np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
 
 

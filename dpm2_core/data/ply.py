@@ -45,7 +45,7 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-_CODINGS = ("binary_little_endian", "binary_big_endian", "ascii")
+_FORMATS = ("binary_little_endian", "binary_big_endian", "ascii")
 
 
 def read_ply(path: Path | str, names: Sequence[str]) -> Array:
@@ -74,7 +74,7 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
     start = data.find(b"\n", end) + 1
     header = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     coding = next((line[1] for line in header if line[:1] == ["format"] and line[2:] == ["1.0"]), "")
-    if ["ply"] not in header[:1] or coding not in _CODINGS or not start:
+    if ["ply"] not in header[:1] or coding not in _FORMATS or not start:
         raise UsageError(f"{path}: no PLY of version 1.0, binary or ASCII")
     elements = [i for i, line in enumerate(header) if line[:1] == ["element"]]
     try:
@@ -84,16 +84,16 @@ def read_vertices(path: Path | str) -> dict[str, NDArray[Any]]:
     except (IndexError, ValueError, KeyError) as error:
         raise UsageError(f"{path}: header of the PLY is damaged ({error})") from None
     names = layout.names or ()
-    least = len(names) if coding == "ascii" else layout.itemsize  # bytes per vertex
-    if count < 0 or len(data) - start < count * least:
+    min_bytes = len(names) if coding == "ascii" else layout.itemsize  # bytes per vertex
+    if count < 0 or len(data) - start < count * min_bytes:
         raise UsageError(f"{path}: ends before its {count} points do")
     if not count or not names:
         return {name: np.empty(0, layout[name]) for name in names}
     if coding == "ascii":
         vertices = _from_text(path, data[start:], layout, count)
     else:
-        stored = layout.newbyteorder(">") if coding == "binary_big_endian" else layout
-        vertices = np.frombuffer(data, stored, count, start).astype(layout, copy=False)
+        stored_layout = layout.newbyteorder(">") if coding == "binary_big_endian" else layout
+        vertices = np.frombuffer(data, stored_layout, count, start).astype(layout, copy=False)
     return {name: vertices[name] for name in names}
 
 

@@ -32,7 +32,7 @@ _TIME_NAMES = (
     "timestamps",
 )
 _TIME_NAME = re.compile(r"(?P<name>[a-z_]+?)(?:_?(?P<unit>ns|us|ms|s)|_(?P<long>nsec|usec|msec|sec))?")
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # No sweep is longer, no usable one a thousand times shorter: so exactly one unit puts the span of a scan in this range.
 _LONGEST_SCAN = 2.0
 
@@ -68,17 +68,18 @@ def time_offsets(time: NDArray[Any], returned: NDArray[np.bool_], stamp: int, un
         first, last = min(first, 0.0), max(last, 0.0)
     if first == last:
         return None
-    scale = _SECONDS[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
+    scale = _SECONDS_PER_UNIT[unit] if unit != "auto" else _time_scale(first, last, time.dtype.kind == "f")
     origin, clock = 0.0, stamp * 1e-9 / scale
     # If the clock started less than 2 s ago, as in a simulation, absolute times look like relative ones.
-    by_clock = _away(first, last, clock) + (last - first) / 10 < _away(first, last, 0.0)
+    by_clock = _distance_to_interval(first, last, clock) + (last - first) / 10 < _distance_to_interval(first, last, 0.0)
     if by_clock or max(abs(first), abs(last)) * scale > _LONGEST_SCAN:
         origin = clock
         if max(abs(first - origin), abs(last - origin)) * scale > _LONGEST_SCAN:
             # The sensor's clock differs from the clock of the stamps: only times since the first point are known.
-            known = value[seen]
-            middle = np.partition(known, len(known) // 2)[len(known) // 2]  # unlike a median always one of the values
-            origin = known[np.abs(known - middle) * scale <= _LONGEST_SCAN].min()
+            measured = value[seen]
+            # Unlike numpy's median it is always one of the values.
+            median = np.partition(measured, len(measured) // 2)[len(measured) // 2]
+            origin = measured[np.abs(measured - median) * scale <= _LONGEST_SCAN].min()
     with np.errstate(invalid="ignore", over="ignore"):
         offset = (value - origin) * scale
     valid = seen & (np.abs(offset) <= _LONGEST_SCAN)  # others are invalid
@@ -90,24 +91,24 @@ def last_point(offset: Points | None) -> int:
     return 0 if offset is None else round(float(offset.max(initial=0.0)) * 1e9)
 
 
-def _away(first: float, last: float, time: float) -> float:
+def _distance_to_interval(first: float, last: float, time: float) -> float:
     """Distance of a time from the interval first..last of a scan."""
     return max(first - time, time - last, 0.0)
 
 
 def _span(times: NDArray[np.float64]) -> tuple[float, float]:
     """The earliest and the latest of times (N,), without one percent at either end, which may be outliers."""
-    few = len(times) // 100
-    ordered = np.partition(times, (few, len(times) - 1 - few))
-    return float(ordered[few]), float(ordered[-1 - few])
+    trimmed = len(times) // 100
+    ordered = np.partition(times, (trimmed, len(times) - 1 - trimmed))
+    return float(ordered[trimmed]), float(ordered[-1 - trimmed])
 
 
 def _time_scale(first: float, last: float, floating: bool) -> float:
     """Seconds per unit: from the span, else (very few points) from the size as an epoch time, else from the type."""
-    for scale in [_SECONDS[unit] for unit in (("s", "ms") if floating else ()) + ("us", "ns")]:
+    for scale in [_SECONDS_PER_UNIT[unit] for unit in (("s", "ms") if floating else ()) + ("us", "ns")]:
         if _LONGEST_SCAN / 1000 < (last - first) * scale <= _LONGEST_SCAN:
             return scale
-    for scale in _SECONDS.values():
+    for scale in _SECONDS_PER_UNIT.values():
         if 1e8 < abs(last) * scale < 1e11:  # 1973 to 5138
             return scale
     return 1.0 if floating else 1e-9

@@ -35,12 +35,12 @@ def read_scan(path: Path) -> tuple[Points, str | None]:
     if size % 20 == 0 and _are_rings(values[4::5]) and not _are_rings(values[::5]):
         return NO_POINTS, f"{path}: 5 numbers per point, the last a ring, as in nuScenes; want 4"
     points = values.reshape(-1, 4)
-    if _are_none(points):
+    if _are_implausible(points):
         return NO_POINTS, f"{path}: not the points of a LiDAR; want 4 float32 per point: x, y, z in m, and intensity"
     return points, None
 
 
-def _are_none(points: Points) -> bool:
+def _are_implausible(points: Points) -> bool:
     """Whether most of (N, 4) points are no plausible measurements, such as integers that are read as floats."""
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.abs(points[::16, :3]).max(1, initial=0)  # all of 120,000 would take 4 ms per scan
@@ -49,8 +49,8 @@ def _are_none(points: Points) -> bool:
 
 def _are_rings(values: NDArray[np.float32]) -> bool:
     """Whether all values are integers, not all equal, in the range of a LiDAR's beam numbers."""
-    whole = (values >= 0) & (values < 256) & (values == np.floor(values))
-    return len(values) > 0 and bool(whole.all()) and bool(np.ptp(values) > 0)
+    are_integers = (values >= 0) & (values < 256) & (values == np.floor(values))
+    return len(values) > 0 and bool(are_integers.all()) and bool(np.ptp(values) > 0)
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:
@@ -92,8 +92,8 @@ def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tup
 
 def drives_below(path: Path, layout: str) -> list[str]:
     """Names of the drives below `path` with that layout, sorted."""
-    place = layout.partition("*")[0].count("/")
-    return sorted(found.relative_to(path).parts[place] for found in path.glob(layout) if found.is_dir())
+    depth = layout.partition("*")[0].count("/")
+    return sorted(found.relative_to(path).parts[depth] for found in path.glob(layout) if found.is_dir())
 
 
 def chosen(path: Path, sequence: str, layout: str) -> str:
@@ -107,5 +107,5 @@ def chosen(path: Path, sequence: str, layout: str) -> str:
     matching = [name for name in found if sequence in ("", name, name.removesuffix("_sync")[-4:])]
     if sequence in found or len(matching) == 1:
         return sequence if sequence in found else matching[0]
-    asked = f"no sequence {sequence}" if sequence else "several sequences"
-    raise UsageError(f"{path}: {asked}; choose one with input.sequence: {', '.join(found)}")
+    problem = f"no sequence {sequence}" if sequence else "several sequences"
+    raise UsageError(f"{path}: {problem}; choose one with input.sequence: {', '.join(found)}")

@@ -108,8 +108,8 @@ class InputSettings(Settings):
 
     def extrinsic(self) -> Array | None:
         """T_lidar_cam as (4, 4); None if it is not set."""
-        place = self.T_lidar_cam
-        return None if place is None else se3.make(Rotation.from_quat(place[3:]).as_matrix(), place[:3])
+        pose = self.T_lidar_cam
+        return None if pose is None else se3.make(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
     def steady_stamps(self, numbers: NDArray[np.integer], why: str, notes: list[str]) -> NDArray[np.int64]:
         """(N,) ns of scans without time stamps, from their numbers (N,); adds a note that begins with `why`."""
@@ -126,7 +126,7 @@ class InputSettings(Settings):
         return None if self.q_lidar_imu is None else np.asarray(Rotation.from_quat(self.q_lidar_imu).as_matrix())
 
 
-class _OfInput(Settings):
+class _InputOnly(Settings):
     input: InputSettings = InputSettings()
 
 
@@ -136,4 +136,4 @@ def input_settings(overrides: Sequence[str]) -> InputSettings:
     Raises:
         UsageError: a key or value is not allowed.
     """
-    return load_settings(_OfInput, None, overrides).input
+    return load_settings(_InputOnly, None, overrides).input

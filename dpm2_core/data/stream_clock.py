@@ -9,12 +9,12 @@ from dpm2_core.data.pairing import JUMP
 
 NOMINAL = 0.1
 """Period assumed for a stream of unknown period, s."""
-_FASTEST = 0.005  # s: shortest period of any stream; frames that were stamped on arrival, together, can be closer
+_MIN_PERIOD = 0.005  # s: shortest period of any stream; frames that were stamped on arrival, together, can be closer
 SLOWEST = 2.0
 """Longest period of any stream, s."""
 DOUBTED = 0.8, 1.25
 """Bounds, in usual periods: a period outside may be due to stamps taken on arrival."""
-_RHYTHM = 9  # periods that show the usual intervals of the stream, of which quartiles are taken
+_N_PERIODS = 9  # periods that show the usual intervals of the stream, of which quartiles are taken
 
 
 class StreamClock:
@@ -31,8 +31,8 @@ class StreamClock:
         self.now = 0.0
         self.went_back = False
         self._jumped_from: int | None = None
-        self._counted = NOMINAL  # s, period counted for the jump
-        self._periods: deque[float] = deque(maxlen=_RHYTHM)
+        self._assumed_period = NOMINAL  # s, period counted for the jump
+        self._periods: deque[float] = deque(maxlen=_N_PERIODS)
 
     def advance(self, stamp: int) -> float:
         """Seconds since the frame before; stamps that repeat or jump back count as one usual period.
@@ -41,11 +41,11 @@ class StreamClock:
         """
         dt = 0.0 if self.stamp is None else (stamp - self.stamp) * 1e-9
         if self._jumped_from is not None and stamp > self._jumped_from:
-            dt = (stamp - self._jumped_from) * 1e-9 - self._counted
+            dt = (stamp - self._jumped_from) * 1e-9 - self._assumed_period
         self._jumped_from = self.stamp if self.stamp is not None and stamp < self.stamp else None
         self.went_back |= dt < -JUMP * 1e-9
-        if dt < _FASTEST:
-            dt = self._counted = self.usual or NOMINAL
+        if dt < _MIN_PERIOD:
+            dt = self._assumed_period = self.usual or NOMINAL
         if self.stamp is not None:
             self.now += dt
             self._periods.append(dt)
@@ -71,5 +71,5 @@ class StreamClock:
             return max(least, 1.5 * self._quartile(3))
         return SLOWEST  # it is not known yet whether that is a pause or normal for the stream
 
-    def _quartile(self, which: int) -> float:
-        return sorted(self._periods)[(len(self._periods) - 1) * which // 4]
+    def _quartile(self, number: int) -> float:
+        return sorted(self._periods)[(len(self._periods) - 1) * number // 4]

@@ -15,10 +15,10 @@ import numpy as np
 
 from dpm2_core.frame import Frame, Image, Inertial
 
-_PART = 0.025
+_MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
 """
-_ADJACENT = 1.5  # of the period: a cloud that spans more overlaps the one before, as clouds do that arrive in a burst
+_MAX_SPAN = 1.5  # of the period: a cloud that spans more overlaps the one before, as clouds do that arrive in a burst
 SWEEP = 0.1
 """s that a joined cloud spans."""
 
@@ -31,7 +31,7 @@ class SweepParts:
 
     def __init__(self) -> None:
         self._parts = deque[Frame]()
-        self._joins = False  # whether clouds have been recognized as parts
+        self._has_parts = False  # whether clouds have been recognized as parts
 
     def join(self, frame: Frame) -> Frame | None:
         """The sweep that this frame completes, with its stamp and index; the frame itself unless it is a part; None
@@ -42,35 +42,35 @@ class SweepParts:
         """
         if frame.problem is not None:
             return frame
-        if not len(frame.points) and self._joins:  # a part may look at the sky
+        if not len(frame.points) and self._has_parts:  # a part may look at the sky
             return None
-        start, end = _times(frame)
-        if not 0 < end - start < _PART:
+        start, end = _time_range(frame)
+        if not 0 < end - start < _MAX_PART_SPAN:
             self._parts.clear()
-            self._joins = False
+            self._has_parts = False
             return frame
         step = (frame.stamp - self._parts[-1].stamp) * 1e-9 if self._parts else 0.0
-        self._joins |= 0 < step < _PART and end - start < _ADJACENT * step
+        self._has_parts |= 0 < step < _MAX_PART_SPAN and end - start < _MAX_SPAN * step
         if step < 0:
             self._parts.clear()
         self._parts.append(_copied(frame))
-        while self._spanned(end) > 2 * SWEEP:  # the parts before a pause
+        while self._span(end) > 2 * SWEEP:  # the parts before a pause
             self._parts.popleft()
-        if not self._joins:
+        if not self._has_parts:
             return frame
-        if self._spanned(end) < SWEEP - (end - start) / 2:
+        if self._span(end) < SWEEP - (end - start) / 2:
             return None
         sweep = _joined(list(self._parts))
         self._parts.clear()
         return sweep
 
-    def _spanned(self, end: float) -> float:
+    def _span(self, end: float) -> float:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
-        return (last.stamp - first.stamp) * 1e-9 + end - _times(first)[0]
+        return (last.stamp - first.stamp) * 1e-9 + end - _time_range(first)[0]
 
 
-def _times(frame: Frame) -> tuple[float, float]:
+def _time_range(frame: Frame) -> tuple[float, float]:
     """The first and the last time of its points, s after its stamp; zeros without times."""
     offset = frame.time_offset
     return (0.0, 0.0) if offset is None or not len(offset) else (float(offset.min()), float(offset.max()))

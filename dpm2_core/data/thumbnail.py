@@ -16,10 +16,10 @@ from dpm2_core.frame import Array, Camera, Image
 
 PLACE_WIDTH = 320
 """Width of an image for place recognition, pixels: 6 to 10 kB."""
-_START, _COMMENT = b"\xff\xd8", b"\xff\xfe"
+_START_OF_IMAGE, _COMMENT = b"\xff\xd8", b"\xff\xfe"
 _QUALITY = 80
-_KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
-_LARGEST = 4096  # pixels of width and height
+_CAMERA_KEYS = {"K", "T_lidar_cam", "size", "distortion", "name"}
+_MAX_SIDE = 4096  # pixels of width and height
 
 
 def thumbnail(image: Image, width: int) -> bytes:
@@ -46,7 +46,7 @@ def within(jpeg: bytes, most: int) -> bytes | None:
 def moved_thumbnail(jpeg: bytes, T_new_old: Array) -> bytes:
     """A `thumbnail` whose camera pose is changed from the LiDAR frame to another frame, by (4, 4) T_new_old."""
     (length,) = struct.unpack_from(">H", jpeg, 4)
-    camera = _camera(json.loads(jpeg[6 : 4 + length]))
+    camera = _decode_camera(json.loads(jpeg[6 : 4 + length]))
     return _with_camera(replace(camera, T_lidar_cam=T_new_old @ camera.T_lidar_cam), jpeg[4 + length :])
 
 
@@ -54,7 +54,7 @@ def _with_camera(camera: Camera, rest: bytes) -> bytes:
     """A JPEG with the camera in a comment before the rest of it."""
     fields = {key: np.asarray(value).tolist() for key, value in vars(camera).items()}
     comment = json.dumps(fields).encode()
-    return _START + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + rest
+    return _START_OF_IMAGE + _COMMENT + struct.pack(">H", len(comment) + 2) + comment + rest
 
 
 def image_of(jpeg: bytes) -> Image | None:
@@ -63,17 +63,17 @@ def image_of(jpeg: bytes) -> Image | None:
     Raises:
         ValueError: it is damaged, or its camera is invalid.
     """
-    if jpeg[:4] != _START + _COMMENT or len(jpeg) < 6:
+    if jpeg[:4] != _START_OF_IMAGE + _COMMENT or len(jpeg) < 6:
         return None
     (length,) = struct.unpack_from(">H", jpeg, 4)
     try:
         fields = json.loads(jpeg[6 : 4 + length])
     except (ValueError, RecursionError):
         return None
-    if not isinstance(fields, dict) or fields.keys() != _KEYS:
+    if not isinstance(fields, dict) or fields.keys() != _CAMERA_KEYS:
         return None
     try:
-        camera = _camera(fields)
+        camera = _decode_camera(fields)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"thumbnail: its camera is invalid: {error}") from None
     return Image(decode_compressed(jpeg, camera.size), camera)
@@ -87,9 +87,9 @@ def usable_image(jpeg: bytes | None) -> Image | None:
         return None
 
 
-def _camera(fields: dict[str, object]) -> Camera:
+def _decode_camera(fields: dict[str, object]) -> Camera:
     K, T, size, distortion = (np.asarray(fields[key], np.float64) for key in ("K", "T_lidar_cam", "size", "distortion"))
-    if size.shape != (2,) or not ((size >= 1) & (size <= _LARGEST)).all():
+    if size.shape != (2,) or not ((size >= 1) & (size <= _MAX_SIDE)).all():
         raise ValueError(f"size of {size.tolist()} pixels")
     if distortion.ndim != 1 or len(distortion) not in DISTORTIONS or not np.isfinite(distortion).all():
         raise ValueError("distortion is not 4, 5, 8, 12 or 14 finite numbers")

@@ -20,7 +20,7 @@ from dpm2_core.frame import Array, Frame
 
 Item = TypeVar("Item")
 
-_AROUND = 2 * FEW + 1  # clouds on either side that show which stamps are wrong: more than can be wrong
+_HALF_WINDOW = 2 * FEW + 1  # clouds on either side that show which stamps are wrong: more than can be wrong
 
 
 def out_of_order(times: Array) -> NDArray[np.bool_]:
@@ -28,9 +28,9 @@ def out_of_order(times: Array) -> NDArray[np.bool_]:
     order. For example, a stamp that is 1 s off at 10 Hz is after some later stamps, or before some earlier ones."""
     ordered = np.zeros(len(times), bool)
     ordered[_longest_increasing(times)] = True
-    ends = np.flatnonzero(ordered)
+    kept = np.flatnonzero(ordered)
     off = np.zeros(len(times), bool)
-    for before, after in pairwise(ends):
+    for before, after in pairwise(kept):
         off[before + 1 : after] = after - before <= FEW + 1
     return off
 
@@ -48,16 +48,16 @@ def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[in
     def stamp_of(message: RawMessage) -> int | None:
         return serialized_stamp(message[2], message[1]) if message[0] == topic else None
 
-    return _in_order(messages, stamp_of, lambda m, stamp: (m[0], m[1], restamped(m[2], stamp)), corrected)
+    return _items_in_order(messages, stamp_of, lambda m, stamp: (m[0], m[1], restamped(m[2], stamp)), corrected)
 
 
 def frames_in_order(source: Source, start: int, stop: int, corrected: Callable[[int, int], None]) -> Iterator[Frame]:
     """The same for frames start..stop-1 of a drive, also using the frames around them; a bag is corrected already."""
     if getattr(source, "in_order", False):
         return source.frames(start, stop)
-    first = max(start - _AROUND, 0)
-    frames = _in_order(
-        source.frames(first, stop + _AROUND),
+    first = max(start - _HALF_WINDOW, 0)
+    frames = _items_in_order(
+        source.frames(first, stop + _HALF_WINDOW),
         lambda frame: frame.stamp,
         lambda frame, stamp: replace(frame, stamp=stamp),
         lambda number, stamp: corrected(first + number, stamp) if first + number >= start else None,
@@ -71,7 +71,7 @@ def note_corrected(notes: list[str], number: int, stamp: int, whose: str = "") -
     note_once(notes, what, f"the first at frame {number}: {stamp * 1e-9:.3f} s")
 
 
-def _in_order(
+def _items_in_order(
     items: Iterable[Item],
     stamp_of: Callable[[Item], int | None],
     restamp: Callable[[Item, int], Item],
@@ -80,58 +80,58 @@ def _in_order(
     """`stamp_of`: ns, or None for items that are not clouds."""
     held, stamps, decided, number = deque[tuple[Item, int | None]](), deque[int](), 0, 0
 
-    def decide() -> Iterator[Item]:
+    def release_next() -> Iterator[Item]:
         """Release all items up to the first cloud that is held."""
         nonlocal decided, number
         while held[0][1] is None:
             yield held.popleft()[0]
-        item, stamp = held.popleft()[0], _in_place(stamps, decided)
+        item, stamp = held.popleft()[0], _corrected_stamp(stamps, decided)
         if stamp != stamps[decided]:
             corrected(number, stamps[decided])
             stamps[decided], item = stamp, restamp(item, stamp)
         yield item
         decided, number = decided + 1, number + 1
-        if decided > _AROUND:
+        if decided > _HALF_WINDOW:
             stamps.popleft()
             decided -= 1
 
     for item in items:
-        if (said := stamp_of(item)) is None and not held:
+        if (new_stamp := stamp_of(item)) is None and not held:
             yield item
             continue
-        held.append((item, said))
-        if said is not None:
-            stamps.append(said)
-            if len(stamps) - decided > _AROUND:
-                yield from decide()
+        held.append((item, new_stamp))
+        if new_stamp is not None:
+            stamps.append(new_stamp)
+            if len(stamps) - decided > _HALF_WINDOW:
+                yield from release_next()
     while decided < len(stamps):
-        yield from decide()
+        yield from release_next()
     yield from (item for item, _ in held)
 
 
-def _in_place(stamps: Sequence[int], which: int) -> int:
+def _corrected_stamp(stamps: Sequence[int], index: int) -> int:
     """The stamp (ns) of one of several consecutive clouds, interpolated from its neighbors if it is wrong."""
-    near = list(stamps)
-    increase = [before < after for before, after in pairwise(near)]
-    repeated = near[which] in near[max(which - 1, 0) : which] + near[which + 1 : which + 2]
+    window = list(stamps)
+    increase = [before < after for before, after in pairwise(window)]
+    repeated = window[index] in window[max(index - 1, 0) : index] + window[index + 1 : index + 2]
     if all(increase) or repeated:
-        return near[which]
-    since = np.array([stamp - near[0] for stamp in near], np.float64)  # differences may exceed 64 bits
-    off = out_of_order(since)
+        return window[index]
+    relative = np.array([stamp - window[0] for stamp in window], np.float64)  # differences may exceed 64 bits
+    off = out_of_order(relative)
     known = np.flatnonzero(~off)
-    stamp = near[0] + round(np.interp(which, known, since[known]))
-    return stamp if off[which] and stamp < STAMP_END else near[which]
+    stamp = window[0] + round(np.interp(index, known, relative[known]))
+    return stamp if off[index] and stamp < STAMP_END else window[index]
 
 
 def _longest_increasing(times: Array) -> list[int]:
     """Indices of the longest increasing subsequence of the times (N,), by patience sorting."""
-    smallest, places, before = list[float](), list[int](), list[int]()
+    tails, tail_indices, predecessors = list[float](), list[int](), list[int]()
     for i, time in enumerate(times.tolist()):
-        length = bisect_left(smallest, time)
-        before.append(places[length - 1] if length else -1)
-        smallest[length : length + 1], places[length : length + 1] = [time], [i]
-    found, i = list[int](), places[-1] if places else -1
+        length = bisect_left(tails, time)
+        predecessors.append(tail_indices[length - 1] if length else -1)
+        tails[length : length + 1], tail_indices[length : length + 1] = [time], [i]
+    found, i = list[int](), tail_indices[-1] if tail_indices else -1
     while i >= 0:
         found.append(i)
-        i = before[i]
+        i = predecessors[i]
     return found[::-1]

@@ -21,11 +21,11 @@ from dpm2_core.geometry import se3
 Keys = NDArray[np.int64]
 
 _TUM, _KITTI, _KITTI_INDEXED, _KITTI_360 = 8, 12, 13, 17  # numbers per line
-_GAP = 1_000_000_000  # ns between two poses beyond which no pose is interpolated
+_MAX_GAP = 1_000_000_000  # ns between two poses beyond which no pose is interpolated
 FRAME_PERIOD = 0.1
 """Period of KITTI's scans, s."""
-_SAME_TIME = 100_000  # ns between the stamps of one frame in two files: a stamp with four decimals; 3 mm at 30 m/s
-_CLEARLY = 0.75  # ratio of two periods; below it the rates differ by more than single lost frames and jitter
+_MAX_STAMP_ERROR = 100_000  # ns between the stamps of a frame in two files: stamps of four decimals; 3 mm at 30 m/s
+_LOWER_RATE_RATIO = 0.75  # ratio of two periods; below it the rates differ by more than single lost frames and jitter
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,22 +93,22 @@ def read_trajectory(path: Path | str, allow_empty: bool = False) -> Trajectory:
             raise UsageError(f"{path}:{number}: {len(fields)} numbers where the lines before have {columns}")
         try:
             rows.append([float(field) for field in fields])
-            keys.append(_key(fields[0], columns) if columns != _KITTI else len(keys))
+            keys.append(_parse_key(fields[0], columns) if columns != _KITTI else len(keys))
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
     numbers = np.array(rows)
     if columns == _KITTI_360:  # the frame number and all 16 numbers of a 4 x 4 matrix
         numbers, columns = numbers[:, :_KITTI_INDEXED], _KITTI_INDEXED
-    poses, good = _poses(numbers, columns)
-    if not good.all():
-        raise UsageError(f"{path}:{lines[int(np.argmin(good))][0]}: not a finite rigid transform")
+    poses, valid = _poses(numbers, columns)
+    if not valid.all():
+        raise UsageError(f"{path}:{lines[int(np.argmin(valid))][0]}: not a finite rigid transform")
     if columns == _KITTI_INDEXED and len(set(keys)) < len(keys):
         raise UsageError(f"{path}: the frame numbers of its first column repeat")
     kind = {_TUM: "tum", _KITTI: "kitti", _KITTI_INDEXED: "kitti-indexed"}[columns]
     return Trajectory(poses, np.array(keys, np.int64), kind)
 
 
-def _key(field: str, columns: int) -> int:
+def _parse_key(field: str, columns: int) -> int:
     """A TUM stamp in ns, exact where a float would lose the last digits, or a frame number."""
     value = Decimal(field) * (10**9 if columns == _TUM else 1)
     if not value.is_finite() or abs(value) > 2**62 or (columns != _TUM and value != int(value)):
@@ -122,9 +122,9 @@ def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     rows = np.where(finite[:, None], rows, 0.0)
     if columns == _TUM:
         quaternions = rows[:, 4:8]
-        good = finite & (np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 0.01)
-        quaternions = np.where(good[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
-        return se3.make(Rotation.from_quat(quaternions).as_matrix(), rows[:, 1:4]), good
+        valid = finite & (np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 0.01)
+        quaternions = np.where(valid[:, None], quaternions, [0.0, 0.0, 0.0, 1.0])
+        return se3.make(Rotation.from_quat(quaternions).as_matrix(), rows[:, 1:4]), valid
     matrices = rows[:, -12:].reshape(-1, 3, 4)
     R = matrices[:, :, :3]
     # Published files have 5 to 7 digits; 0.01 separates rounding from a matrix that is no rotation.
@@ -157,7 +157,7 @@ def matched(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
             " stamps do, as for the trajectory.tum of `dpm2 run` against a drive (`dpm2 eval --gt DRIVE`) or a TUM file"
         )
     gt, est = _ordered(gt), _ordered(est)
-    if stamped and not (same_stamps(gt.keys, est.keys) and gt.period >= _CLEARLY * est.period):
+    if stamped and not (same_stamps(gt.keys, est.keys) and gt.period >= _LOWER_RATE_RATIO * est.period):
         return _interpolated(gt, est)
     est_poses = placed(est, gt.keys)
     if not np.isfinite(est_poses).any():
@@ -170,25 +170,26 @@ def placed(trajectory: Trajectory, keys: Keys) -> Array:
     """Poses (N, 4, 4) at `keys` (N,); NaN if there is none with that frame number, or with a stamp within a quarter of
     a period. A pose whose stamp differs by more than rounding, as from another clock, is moved along the trajectory."""
     trajectory = _ordered(trajectory)
-    rows, apart = _nearest(trajectory.keys, keys)
-    near = apart <= (_SAME_TIME if trajectory.kind == "tum" else 0)
+    rows, difference = _nearest(trajectory.keys, keys)
+    near = difference <= (_MAX_STAMP_ERROR if trajectory.kind == "tum" else 0)
     poses = np.full((len(keys), 4, 4), np.nan)
     poses[near] = trajectory.poses[rows[near]]
     if trajectory.kind == "tum" and len(trajectory) > 1:
-        beside = ~near & (apart < 0.25e9 * min(trajectory.period, frame_period(np.sort(keys))))
-        left = np.clip(np.searchsorted(trajectory.keys, keys[beside]) - 1, 0, len(trajectory) - 2)
-        gap = trajectory.keys[left + 1] - trajectory.keys[left] > _GAP  # next to a gap: use the segment before or after
-        left = np.where(gap, np.clip(2 * rows[beside] - left - 1, 0, len(trajectory) - 2), left)
+        nearby = ~near & (difference < 0.25e9 * min(trajectory.period, frame_period(np.sort(keys))))
+        left = np.clip(np.searchsorted(trajectory.keys, keys[nearby]) - 1, 0, len(trajectory) - 2)
+        # Next to a gap, the segment before or after is used.
+        gap = trajectory.keys[left + 1] - trajectory.keys[left] > _MAX_GAP
+        left = np.where(gap, np.clip(2 * rows[nearby] - left - 1, 0, len(trajectory) - 2), left)
         begin, end = trajectory.keys[left], trajectory.keys[left + 1]
-        part = (keys[beside] - begin) / (end - begin)
-        poses[beside] = se3.interpolated(trajectory.poses[left], trajectory.poses[left + 1], part)
+        fraction = (keys[nearby] - begin) / (end - begin)
+        poses[nearby] = se3.interpolated(trajectory.poses[left], trajectory.poses[left + 1], fraction)
     return poses
 
 
 def same_stamps(a: Keys, b: Keys) -> bool:
     """Whether (N,) and (M,) stamps, ns, are of the same frames: most of the smaller set are also in the other."""
-    few, many = sorted((np.unique(a), np.unique(b)), key=len)
-    return bool(2 * np.count_nonzero(_nearest(many, few)[1] <= _SAME_TIME) > len(few))
+    smaller, larger = sorted((np.unique(a), np.unique(b)), key=len)
+    return bool(2 * np.count_nonzero(_nearest(larger, smaller)[1] <= _MAX_STAMP_ERROR) > len(smaller))
 
 
 def _ordered(trajectory: Trajectory) -> Trajectory:
@@ -200,7 +201,7 @@ def _ordered(trajectory: Trajectory) -> Trajectory:
 def _interpolated(gt: Trajectory, est: Trajectory) -> tuple[Array, Array, Keys]:
     """Both at the stamps of the estimate, or of the ground truth if that has a clearly lower rate: interpolating across
     a second of a curve would be inaccurate."""
-    at = gt.keys if est.period < _CLEARLY * gt.period else est.keys
+    at = gt.keys if est.period < _LOWER_RATE_RATIO * gt.period else est.keys
     true, estimated = (interpolate(each.keys, each.poses, at) for each in (gt, est))
     if not np.isfinite(true + estimated).any():
         raise UsageError(
@@ -223,9 +224,9 @@ def interpolate(stamps: Keys, poses: Array, at: Keys) -> Array:
     gap = stamps[right] - stamps[left]
     known = stamps[left] == at
     out[known] = poses[left[known]]
-    between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _GAP)
-    part = (at - stamps[left])[between] / gap[between]
-    out[between] = se3.interpolated(poses[left[between]], poses[right[between]], part)
+    between = ~known & (at > stamps[left]) & (at < stamps[right]) & (gap <= _MAX_GAP)
+    fraction = (at - stamps[left])[between] / gap[between]
+    out[between] = se3.interpolated(poses[left[between]], poses[right[between]], fraction)
     return out
 
 

@@ -16,7 +16,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_LISTED = 20  # largest number of frames named in an error
+_MAX_LISTED = 20  # largest number of frames named in an error
 
 
 def transform_matrix(transform: Any) -> Array:
@@ -74,8 +74,8 @@ class TransformTree:
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None or (target == source and target not in self.frames):
             frames = self.frames
-            more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
-            known = (", ".join(frames[:_LISTED]) or "none") + more
+            more = f" and {len(frames) - _MAX_LISTED} more" if len(frames) > _MAX_LISTED else ""
+            known = (", ".join(frames[:_MAX_LISTED]) or "none") + more
             raise UsageError(f"no transform from {source_frame!r} to {target_frame!r}; frames known: {known}")
         return se3.inverse(up_target[common]) @ up_source[common]
 

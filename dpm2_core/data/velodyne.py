@@ -44,8 +44,8 @@ class VelodyneDrive(IndexedSource):
         """
         self._scans, self._images, self._settings = numbered_scans(scans), images, settings
         if not self._scans:
-            wanted = ": want a drive that is `_sync`" if self.swept else ""
-            raise UsageError(f"{scans.parent}: no scans ({scans.name}/NNNNNN.bin) in this folder{wanted}")
+            hint = ": want a drive that is `_sync`" if self.swept else ""
+            raise UsageError(f"{scans.parent}: no scans ({scans.name}/NNNNNN.bin) in this folder{hint}")
         super().__init__(name, len(self._scans))
         self.numbers = np.array([int(scan.stem) for scan in self._scans])
 

@@ -11,18 +11,18 @@ from dpm2_core.frame import Points
 HDL64_CORRECTION_DEG = 0.205
 """Elevation error of KITTI's scans, from its HDL-64's intrinsic calibration (J.-E. Deschaud, "IMLS-SLAM", 2018)."""
 
-_HIGHEST = 5.0  # degrees above horizontal: 1.7 more than any point beyond _FAR...
-_FAR = 10.0  # ...m, in the drives 00 and 04
-_FEW = 100, 0.005  # largest number, and largest share of the far points, above _HIGHEST
+_MAX_ELEVATION = 5.0  # degrees above horizontal: 1.7 more than any point beyond _MIN_DISTANCE...
+_MIN_DISTANCE = 10.0  # ...m, in the drives 00 and 04
+_MAX_HIGH_POINTS = 100, 0.005  # largest number, and largest share of the far points, above _MAX_ELEVATION
 
 
 def may_be_hdl64(points: Points) -> bool:
     """Whether (N, 4) points can be of KITTI's LiDAR, whose highest beam is 2 degrees above horizontal. Most other
     LiDARs have beams at 10 degrees or more."""
-    level = np.hypot(points[:, 0], points[:, 1])
-    far = level > _FAR  # False for NaN
-    high = points[far, 2] > level[far] * np.float32(np.tan(np.radians(_HIGHEST)))
-    return bool(high.sum() <= max(_FEW[0], _FEW[1] * len(high)))
+    distance = np.hypot(points[:, 0], points[:, 1])
+    far = distance > _MIN_DISTANCE  # False for NaN
+    high = points[far, 2] > distance[far] * np.float32(np.tan(np.radians(_MAX_ELEVATION)))
+    return bool(high.sum() <= max(_MAX_HIGH_POINTS[0], _MAX_HIGH_POINTS[1] * len(high)))
 
 
 def checked_correction(value: float, where: str) -> float:
