@@ -18,9 +18,9 @@ from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_AXES = 0.006
+_AXES_SIGMA = 0.006
 """Standard deviation of each coordinate per distance: a third of a degree of the axes, or 0.6 % of the ranges."""
-_SWEEP = 0.015
+_SWEEP_SIGMA = 0.015
 """Standard deviation of the rotation, rad, per sine of the angle between the scans: at 36 deg/s a sweep of 0.1 s covers
 1 % more than a revolution, and without de-skewing it is taken for exactly one. At a revisit in the same or the opposite
 direction, where the sine is 0, the sensor is not turning."""
@@ -33,5 +33,5 @@ def with_calibration(result: Registration, T_near_source: Array) -> Registration
         T_near_source: (4, 4) pose of the source in the nearest scan of the target.
     """
     meters, degrees = se3.magnitude(T_near_source)
-    floor = _SWEEP * float(np.sin(np.radians(degrees))), _AXES * meters
+    floor = _SWEEP_SIGMA * float(np.sin(np.radians(degrees))), _AXES_SIGMA * meters
     return replace(result, covariance=result.covariance + isotropic(*floor), floor=floor)

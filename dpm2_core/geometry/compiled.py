@@ -28,13 +28,13 @@ def compiled(signature: object) -> Callable[[F], F]:
         try:
             return numba.njit(signature, cache=True, nogil=True, error_model="numpy")(function)
         except RuntimeError:  # "cannot cache function: no locator available"
-            _say_that_it_takes_time()
+            _warn_no_cache()
             return numba.njit(signature, nogil=True, error_model="numpy")(function)
 
     return decorate
 
 
 @functools.cache  # once
-def _say_that_it_takes_time() -> None:
+def _warn_no_cache() -> None:
     text = "no folder for machine code can be written, so every start compiles it anew: let NUMBA_CACHE_DIR name one"
     print(f"dpm2: {text}", file=sys.stderr)

@@ -15,8 +15,8 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.compiled import READ_F4, READ_F8, compiled
 
-_STEPS = 32  # poses along a sweep, linearly interpolated: an error of 0.03 mm at 3 rad/s, 20 m away
-_FITTED = 11  # number of times
+_N_INTERVALS = 32  # poses along a sweep, linearly interpolated: an error of 0.03 mm at 3 rad/s, 20 m away
+_N_FIT_TIMES = 11  # number of times
 Cloud = TypeVar("Cloud", NDArray[np.float32], Array)
 
 
@@ -27,11 +27,11 @@ def poses(times: ArrayLike, motion: Array) -> Array:
         motion: (K, 6) the twist at 0 [rad/s, m/s] and its time derivatives; a single twist (6,) is constant.
     """
     t = np.asarray(times, np.float64)[..., None]
-    way, part = np.zeros(1), np.ones(1)
+    xi, factor = np.zeros(1), np.ones(1)
     for k, derivative in enumerate(np.atleast_2d(motion), 1):
-        part = part * t / k
-        way = way + part * derivative
-    return se3.exp(way)
+        factor = factor * t / k
+        xi = xi + factor * derivative
+    return se3.exp(xi)
 
 
 def beyond(time: float, half: float, motion: Array) -> Array:
@@ -48,7 +48,7 @@ def fitted(turn: Callable[[Array], Array | None], half: float) -> Array | None:
     """Derivatives at 0 (3, 3) of a rotation, as rotation vectors [rad/s, rad/s2, rad/s3], fitted from -half to half s.
 
     `turn` returns the rotations (M, 3, 3) at times (M,), or None; the result is None then."""
-    times = np.linspace(-half, half, _FITTED)
+    times = np.linspace(-half, half, _N_FIT_TIMES)
     R = turn(times)
     if R is None:
         return None
@@ -65,8 +65,8 @@ def moved(points: Cloud, times: NDArray[np.floating], along: Callable[[Array], A
     if len(points) == 0:
         return points
     start, end = float(times.min()), float(times.max())
-    step = (times.astype(np.float64) - start) * (_STEPS / max(end - start, 1e-9))
-    return _moved(points, step, np.ascontiguousarray(along(np.linspace(start, end, _STEPS + 1))))
+    step = (times.astype(np.float64) - start) * (_N_INTERVALS / max(end - start, 1e-9))
+    return _transform_points(points, step, np.ascontiguousarray(along(np.linspace(start, end, _N_INTERVALS + 1))))
 
 
 @compiled(
@@ -75,16 +75,16 @@ def moved(points: Cloud, times: NDArray[np.floating], along: Callable[[Array], A
         float64[:, ::1](READ_F8, float64[::1], float64[:, :, ::1]),
     ]
 )
-def _moved(points: Cloud, step: Array, T: Array) -> Cloud:
+def _transform_points(points: Cloud, step: Array, T: Array) -> Cloud:
     """`step` (N,): time of each point in units of the pose interval of T (M, 4, 4), with fractions."""
     out = points.copy()
     for n in range(len(points)):
         i = min(int(step[n]), len(T) - 2)
-        after = step[n] - i
+        fraction = step[n] - i
         for row in range(3):
             value = 0.0
             for column in range(4):
-                weight = (1 - after) * T[i, row, column] + after * T[i + 1, row, column]
+                weight = (1 - fraction) * T[i, row, column] + fraction * T[i + 1, row, column]
                 value += weight * points[n, column] if column < 3 else weight
             out[n, row] = value
     return out

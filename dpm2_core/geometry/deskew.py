@@ -36,7 +36,7 @@ def deskew(
 def way(times: Array, motion: Array, turn: Turn | None) -> Array:
     """Poses (M, 4, 4) at increasing times (M,) s of a sensor with that motion; arguments as in `deskew`."""
     R = None if turn is None or motion.ndim == 2 else turn(times)
-    return curve.poses(times, motion) if R is None else _along(times, R, motion[3:])
+    return curve.poses(times, motion) if R is None else _integrate_velocity(times, R, motion[3:])
 
 
 def measured_turn(frame: Frame) -> Turn | None:
@@ -54,12 +54,12 @@ def placed(image: Image, seconds: float, twist: Array) -> Image:
     return replace(image, camera=replace(image.camera, T_lidar_cam=T_lidar_cam))
 
 
-def _along(times: Array, R: Array, velocity: Array) -> Array:
+def _integrate_velocity(times: Array, R: Array, velocity: Array) -> Array:
     """Poses (M, 4, 4) at times (M,) s with rotations R (M, 3, 3), at a constant velocity (3,) in the sensor's axes."""
-    ways = R @ velocity
-    way = np.concatenate([np.zeros((1, 3)), np.cumsum((ways[1:] + ways[:-1]) / 2 * np.diff(times)[:, None], 0)])
-    here = [np.interp(0.0, times, way[:, i]) for i in range(3)] if times[0] <= 0 <= times[-1] else None
-    if here is None:  # the stamp is outside the sweep: continue from the nearest end
+    v = R @ velocity
+    positions = np.concatenate([np.zeros((1, 3)), np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(times)[:, None], 0)])
+    origin = [np.interp(0.0, times, positions[:, i]) for i in range(3)] if times[0] <= 0 <= times[-1] else None
+    if origin is None:  # the stamp is outside the sweep: continue from the nearest end
         nearest = 0 if times[0] > 0 else -1
-        here = (way[nearest] - ways[nearest] * times[nearest]).tolist()
-    return se3.make(R, way - np.array(here))
+        origin = (positions[nearest] - v[nearest] * times[nearest]).tolist()
+    return se3.make(R, positions - np.array(origin))

@@ -15,11 +15,11 @@ from dpm2_core.geometry.voxel import voxel_first
 SPACING = 0.9  # m between two edges: those of one pole are HEIGHT apart
 HEIGHT = 1.0  # m; edges lie at multiples of it: at arbitrary heights, two scans' points on a pole would not coincide
 _NEIGHBOURS, _RADIUS = 16, 1.5  # m
-_LENGTH = 1.0  # m, smallest vertical extent of the neighborhood of an edge
-_GAP = 0.5  # m, largest gap between measured heights of an edge: with sparser beams its position is uncertain
-_SCORE = 0.2  # smallest score of an edge: that of an upright patch five points high and four wide
+_MIN_LENGTH = 1.0  # m, smallest vertical extent of the neighborhood of an edge
+_MAX_GAP = 0.5  # m, largest gap between measured heights of an edge: with sparser beams its position is uncertain
+_MIN_SCORE = 0.2  # smallest score of an edge: that of an upright patch five points high and four wide
 _CELL = 0.45  # m, of the columns that may contain an edge, and of the grid that thins the many candidates of an edge
-_KEPT = 16  # best candidates per requested edge: more than there are within the spacing of one
+_CANDIDATES_PER_EDGE = 16  # best candidates per requested edge: more than there are within the spacing of one
 
 
 def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
@@ -38,25 +38,25 @@ def vertical_edges(cloud: Points, grid: PointGrid, most: int) -> Points:
         return np.zeros((0, 3), np.float32)
     index = neighbours(grid, candidates, _NEIGHBOURS, _RADIUS)
     height = np.sort(cloud[index, 2], 1)
-    known = (height[:, -1] - height[:, 0] >= _LENGTH) & (np.diff(height, axis=1).max(1) <= _GAP)
-    around = cloud[index[known]] - candidates[known, None]
-    mean = around.mean(1)
-    around -= mean[:, None]
-    score = verticality(around)
-    order = np.argsort(-score, kind="stable")[: _KEPT * most]
-    order = order[score[order] >= _SCORE]
-    at = _at_multiples_of_height((candidates[known] + mean)[order], around[order])
-    return at[spaced(at, SPACING, most)]
+    is_upright = (height[:, -1] - height[:, 0] >= _MIN_LENGTH) & (np.diff(height, axis=1).max(1) <= _MAX_GAP)
+    neighborhoods = cloud[index[is_upright]] - candidates[is_upright, None]
+    mean = neighborhoods.mean(1)
+    neighborhoods -= mean[:, None]
+    score = verticality(neighborhoods)
+    order = np.argsort(-score, kind="stable")[: _CANDIDATES_PER_EDGE * most]
+    order = order[score[order] >= _MIN_SCORE]
+    edges = _at_multiples_of_height((candidates[is_upright] + mean)[order], neighborhoods[order])
+    return edges[spaced(edges, SPACING, most)]
 
 
 def _at_multiples_of_height(mean: Points, centered: NDArray[np.floating]) -> Points:
     """The (N, 3) means of (N, k, 3) neighborhoods, moved to a multiple of `HEIGHT` along the line fitted over height.
 
-    The shift is at most half of `HEIGHT`, which a neighborhood of `_LENGTH` spans to either side."""
+    The shift is at most half of `HEIGHT`, which a neighborhood of `_MIN_LENGTH` spans to either side."""
     height = centered[..., 2:]
-    per_height = (centered[..., :2] * height).sum(1) / (height * height).sum(1)
+    slope = (centered[..., :2] * height).sum(1) / (height * height).sum(1)
     z = np.round(mean[:, 2:] / HEIGHT) * HEIGHT
-    return np.hstack([mean[:, :2] + per_height * (z - mean[:, 2:]), z]).astype(np.float32)
+    return np.hstack([mean[:, :2] + slope * (z - mean[:, 2:]), z]).astype(np.float32)
 
 
 def verticality(centered: NDArray[np.floating]) -> Array:
@@ -85,27 +85,27 @@ def verticality(centered: NDArray[np.floating]) -> Array:
 def spaced(points: Points, spacing: float, most: int) -> Index:
     """Ascending indices of the first `most` of the (N, 3) points that remain if each kept point, in order, removes
     those within `spacing` m of it."""
-    return _spaced(points.astype(np.float64), spacing * spacing, most)
+    return _select_spaced(points.astype(np.float64), spacing * spacing, most)
 
 
 @compiled("i8[::1](f8[:, ::1], f8, i8)")
-def _spaced(points: Array, squared: float, most: int) -> Index:
+def _select_spaced(points: Array, squared: float, most: int) -> Index:
     """Compares each point with the kept ones, which are few."""
-    stays, count = np.empty(min(most, len(points)), np.int64), 0
+    kept, count = np.empty(min(most, len(points)), np.int64), 0
     for i in range(len(points)):
-        if count == len(stays):
+        if count == len(kept):
             break
         free = True
         for j in range(count):
-            k = stays[j]
+            k = kept[j]
             x, y, z = points[i, 0] - points[k, 0], points[i, 1] - points[k, 1], points[i, 2] - points[k, 2]
             if x * x + y * y + z * z <= squared:
                 free = False
                 break
         if free:
-            stays[count] = i
+            kept[count] = i
             count += 1
-    return stays[:count].copy()
+    return kept[:count].copy()
 
 
 def _in_tall_columns(cloud: Points) -> NDArray[np.bool_]:
@@ -118,4 +118,4 @@ def _in_tall_columns(cloud: Points) -> NDArray[np.bool_]:
     high = -low
     np.minimum.at(low, column, cloud[:, 2])
     np.maximum.at(high, column, cloud[:, 2])
-    return (high - low >= _LENGTH)[column]
+    return (high - low >= _MIN_LENGTH)[column]

@@ -23,10 +23,10 @@ def ecef(geodetic: ArrayLike) -> Array:
     """(..., 3) latitude and longitude in degrees, altitude in m above the ellipsoid, to (..., 3) m."""
     degrees = np.asarray(geodetic, np.float64)
     latitude, longitude, altitude = np.radians(degrees[..., 0]), np.radians(degrees[..., 1]), degrees[..., 2]
-    normal = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
-    across = (normal + altitude) * np.cos(latitude)
-    z = (normal * (1 - _E2) + altitude) * np.sin(latitude)
-    return np.stack([across * np.cos(longitude), across * np.sin(longitude), z], -1)
+    normal_radius = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+    axis_distance = (normal_radius + altitude) * np.cos(latitude)
+    z = (normal_radius * (1 - _E2) + altitude) * np.sin(latitude)
+    return np.stack([axis_distance * np.cos(longitude), axis_distance * np.sin(longitude), z], -1)
 
 
 def geodetic(ecef: ArrayLike) -> Array:
@@ -35,8 +35,8 @@ def geodetic(ecef: ArrayLike) -> Array:
     p = np.hypot(x, y)
     r = np.hypot(p, z)
     reduced = np.arctan2(_B * z * (1 + _E2 / (1 - _E2) * _B / r), _A * p)
-    upper = z + _E2 / (1 - _E2) * _B * np.sin(reduced) ** 3
-    latitude = np.arctan2(upper, p - _E2 * _A * np.cos(reduced) ** 3)
+    numerator = z + _E2 / (1 - _E2) * _B * np.sin(reduced) ** 3
+    latitude = np.arctan2(numerator, p - _E2 * _A * np.cos(reduced) ** 3)
     altitude = p * np.cos(latitude) + z * np.sin(latitude) - _A * np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], -1)
 
@@ -44,10 +44,10 @@ def geodetic(ecef: ArrayLike) -> Array:
 def enu_frame(origin: ArrayLike) -> Array:
     """T_ecef_enu (4, 4) of the frame east, north, up at a geodetic position (3,)."""
     latitude, longitude, _ = np.asarray(origin, np.float64)
-    (sin_a, sin_o), (cos_a, cos_o) = (
+    (sin_lat, sin_lon), (cos_lat, cos_lon) = (
         np.sin(np.radians([latitude, longitude])),
         np.cos(np.radians([latitude, longitude])),
     )
-    east, north = [-sin_o, cos_o, 0.0], [-sin_a * cos_o, -sin_a * sin_o, cos_a]
-    up = [cos_a * cos_o, cos_a * sin_o, sin_a]
+    east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
     return se3.make(np.column_stack([east, north, up]), ecef(origin))

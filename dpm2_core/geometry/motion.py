@@ -11,16 +11,16 @@ from dpm2_core.geometry import se3
 OPEN = 0.9
 """Standard deviation of a registered position, m, from which a direction is open: the scene does not constrain it. The
 largest value is 1 m."""
-_TURNED = 0.12**2
+_NORMAL_NOISE = 0.12**2
 """Share of a scene's information that is noise of its normals, as for its covariance. It rotates the open direction, by
 that many rad, towards a direction with all other information. On a road seen for 10 m it was 20 to 70 deg per scan."""
-_FREE = 0.05  # m: shorter translations do not show a period
+_MIN_TRANSLATION = 0.05  # m: shorter translations do not show a period
 _HORIZON = 10.0  # s: motion is not extrapolated farther
-_LONGEST = 3600.0  # s: after that time the covariance grows no further
+_MAX_GROWTH_TIME = 3600.0  # s: after that time the covariance grows no further
 _STEPS = 10  # integration steps of a changing motion
-_TURN = 0.3  # rad/s, standard deviation of the yaw rate in traffic
-_TILT = 0.1  # roll and pitch relative to the heading: slopes
-_ANY_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of an unknown heading
+_YAW_RATE_SIGMA = 0.3  # rad/s, standard deviation of the yaw rate in traffic
+_TILT_RATIO = 0.1  # roll and pitch relative to the heading: slopes
+_UNKNOWN_HEADING_SIGMA = np.pi / np.sqrt(3)  # rad, standard deviation of an unknown heading
 
 
 def predicted(T: Array, twist: Array, seconds: float, turns: Array | None = None) -> Array:
@@ -38,13 +38,13 @@ def between(T: Array, before: Array, after: Array, seconds: float, turns: Array 
             end. With them only the velocities of the twists are used.
     """
     if turns is not None:
-        parts = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
-        way = np.einsum("kij,kj->ki", turns[:-1], (1 - parts) * before[3:] + parts * after[3:]).mean(0) * seconds
-        return T @ se3.make(turns[-1], way)
+        fractions = (np.arange(len(turns) - 1)[:, None] + 0.5) / (len(turns) - 1)
+        t = np.einsum("kij,kj->ki", turns[:-1], (1 - fractions) * before[3:] + fractions * after[3:]).mean(0) * seconds
+        return T @ se3.make(turns[-1], t)
     step = seconds / _STEPS
     for i in range(_STEPS):
-        part = (i + 0.5) / _STEPS
-        T = T @ se3.exp(((1 - part) * before + part * after) * step)
+        fraction = (i + 0.5) / _STEPS
+        T = T @ se3.exp(((1 - fraction) * before + fraction * after) * step)
     return T
 
 
@@ -61,10 +61,10 @@ def period_by_motion(T: Array, stamped: tuple[float, Array], usual: tuple[float,
         steadiness: standard deviation of the acceleration, m/s2.
     """
     dt, T_stamped = stamped
-    off, way = ((se3.inverse(T_stamped) @ end)[:3, 3] for end in (T, usual[1]))
-    if min(np.linalg.norm(off), np.linalg.norm(way)) <= _FREE + 0.5 * steadiness * dt * dt:
+    to_estimate, to_usual = ((se3.inverse(T_stamped) @ end)[:3, 3] for end in (T, usual[1]))
+    if min(np.linalg.norm(to_estimate), np.linalg.norm(to_usual)) <= _MIN_TRANSLATION + 0.5 * steadiness * dt * dt:
         return dt
-    return dt + float(np.clip(off @ way / (way @ way), 0.0, 1.0)) * (usual[0] - dt)
+    return dt + float(np.clip(to_estimate @ to_usual / (to_usual @ to_usual), 0.0, 1.0)) * (usual[0] - dt)
 
 
 def covariance(
@@ -79,11 +79,11 @@ def covariance(
     (3, 3) [m/s] and an error of the angular rate of `turn`, rad/s, about any axis. The heading's deviation is at most
     that of an unknown heading, and the time at most an hour. If the rotation was measured, `of_turn` (3, 3) [rad] is
     its covariance."""
-    seconds = min(seconds, _LONGEST)
+    seconds = min(seconds, _MAX_GROWTH_TIME)
     meters = 0.5 * seconds * velocity_change(speed, seconds, acceleration)
-    swing, heading = (min(rate * seconds, _ANY_TURN) for rate in (turn, _TURN))
-    result = np.diag([_TILT * heading, _TILT * heading, heading, meters, meters, meters]) ** 2
-    result[:3, :3] += swing**2 * np.eye(3)
+    drift, heading = (min(rate * seconds, _UNKNOWN_HEADING_SIGMA) for rate in (turn, _YAW_RATE_SIGMA))
+    result = np.diag([_TILT_RATIO * heading, _TILT_RATIO * heading, heading, meters, meters, meters]) ** 2
+    result[:3, :3] += drift**2 * np.eye(3)
     result[3:, 3:] += of_velocity * seconds**2
     if of_turn is not None:
         result[:3, :3] = of_turn
@@ -107,8 +107,8 @@ def spread(sigma: float, seconds: float, of_velocity: Array) -> Array:
 def combined(of_scene: Array, of_prediction: Array) -> Array:
     """Covariance (3, 3) [m] of a position fused from scene and prediction; 1 m of the scene is no information."""
     information, axes = np.linalg.eigh(np.linalg.inv(of_scene))
-    shown = (axes * np.maximum(information - 1, 0)) @ axes.T
-    return np.asarray(np.linalg.inv(shown + np.linalg.inv(of_prediction)))
+    scene_information = (axes * np.maximum(information - 1, 0)) @ axes.T
+    return np.asarray(np.linalg.inv(scene_information + np.linalg.inv(of_prediction)))
 
 
 def turned_open(of_scene: Array, of_prediction: Array) -> Array:
@@ -118,17 +118,17 @@ def turned_open(of_scene: Array, of_prediction: Array) -> Array:
     Otherwise the small changes of the open direction from scan to scan would seem to measure the motion along it.
     """
     variances, axes = np.linalg.eigh(of_scene)
-    left = variances >= OPEN**2
-    if not left.any():
+    is_open = variances >= OPEN**2
+    if not is_open.any():
         return of_scene
-    unknown = float(np.linalg.eigvalsh(axes[:, left].T @ of_prediction @ axes[:, left])[-1])
-    turn = np.minimum(_TURNED * (1 / variances).sum() * variances, 1.0)
-    variances = np.where(left, variances, np.minimum(variances + turn**2 * unknown, 1.0))
+    open_variance = float(np.linalg.eigvalsh(axes[:, is_open].T @ of_prediction @ axes[:, is_open])[-1])
+    rotation = np.minimum(_NORMAL_NOISE * (1 / variances).sum() * variances, 1.0)
+    variances = np.where(is_open, variances, np.minimum(variances + rotation**2 * open_variance, 1.0))
     return np.asarray((axes * variances) @ axes.T)
 
 
 def along_open(of_scene: Array, other: Array) -> Array:
     """The part of a covariance `other` (3, 3) along the directions that are open in a scene, of_scene (3, 3) [m]."""
     variances, axes = np.linalg.eigh(of_scene)
-    left = axes[:, variances >= OPEN**2]
-    return np.asarray(left @ (left.T @ other @ left) @ left.T)
+    open_axes = axes[:, variances >= OPEN**2]
+    return np.asarray(open_axes @ (open_axes.T @ other @ open_axes) @ open_axes.T)

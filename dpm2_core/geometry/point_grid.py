@@ -14,10 +14,10 @@ _Grid = tuple[Array, Array, Index, Index]
 _GRID = "Tuple((f8[:, ::1], f8[::1], i4[:, :, ::1], i4[::1]))"
 
 _SIDE = 4  # cells along the edge of a block
-_VOLUME = _SIDE**3
-_BLOCKS = 1 << 20  # largest number; clouds of larger extent have larger cells
+_BLOCK_CELLS = _SIDE**3
+_MAX_BLOCKS = 1 << 20  # largest number; clouds of larger extent have larger cells
 _ROUNDING = 1e-9  # m, of the borders of cells
-_FIRST = 0.8  # cells: first search distance of `neighbors`
+_FIRST_REACH = 0.8  # cells: first search distance of `neighbors`
 
 
 class PointGrid:
@@ -33,11 +33,11 @@ class PointGrid:
         """`cell` is the edge of the cells, m: about the distance of the neighbors that will be queried."""
         low = points.min(0) if len(points) else np.zeros(3)
         extent = points.max(0) - low if len(points) else np.zeros(3)
-        while np.prod(blocks := np.floor(extent / (_SIDE * cell)) + 1) > _BLOCKS:
+        while np.prod(blocks := np.floor(extent / (_SIDE * cell)) + 1) > _MAX_BLOCKS:
             cell *= 2
         corner = np.append(low, cell)
         block = np.full(blocks.astype(np.int64), -1, np.int32)
-        start, self.order = _sorted_into(points, corner, block)
+        start, self.order = _sort_into_blocks(points, corner, block)
         self.points: Array = points[self.order]
         self._grid = self.points, corner, block, start
 
@@ -60,7 +60,7 @@ class PointGrid:
 
 
 @compiled("Tuple((i4[::1], i4[::1]))(f8[:, ::1], f8[::1], i4[:, :, ::1])")
-def _sorted_into(points: Array, corner: Array, block: Index) -> tuple[Index, Index]:
+def _sort_into_blocks(points: Array, corner: Array, block: Index) -> tuple[Index, Index]:
     """Number the occupied blocks in `block`; returns the start of each of their cells, and the order of the points."""
     m, scale, occupied = len(points), 1 / corner[3], 0
     nx, ny, nz = block.shape
@@ -73,17 +73,17 @@ def _sorted_into(points: Array, corner: Array, block: Index) -> tuple[Index, Ind
         if at < 0:
             at = block[x // _SIDE, y // _SIDE, z // _SIDE] = occupied
             occupied += 1
-        cell[i] = at * _VOLUME + ((x % _SIDE) * _SIDE + y % _SIDE) * _SIDE + z % _SIDE
-    start = np.zeros(occupied * _VOLUME + 1, np.int32)
+        cell[i] = at * _BLOCK_CELLS + ((x % _SIDE) * _SIDE + y % _SIDE) * _SIDE + z % _SIDE
+    start = np.zeros(occupied * _BLOCK_CELLS + 1, np.int32)
     for i in range(m):
         start[cell[i] + 1] += 1
-    for c in range(occupied * _VOLUME):
+    for c in range(occupied * _BLOCK_CELLS):
         start[c + 1] += start[c]
-    following = start[:-1].copy()
+    next_free = start[:-1].copy()
     order = np.empty(m, np.int32)
     for i in range(m):
-        order[following[cell[i]]] = i
-        following[cell[i]] += 1
+        order[next_free[cell[i]]] = i
+        next_free[cell[i]] += 1
     return start, order
 
 
@@ -94,14 +94,14 @@ def _clipped(x: float, size: int) -> int:
 
 
 @compiled("f8(f8, f8, f8)")
-def _outside(x: float, low: float, edge: float) -> float:
+def _squared_gap(x: float, low: float, edge: float) -> float:
     """Squared distance of x from the interval low..low + edge."""
     d = max(low - x, x - low - edge, 0.0)
     return d * d
 
 
 @compiled(f"Tuple((i8, f8))(f8[::1], f8, f8, {_GRID})")
-def _closest(query: Array, reach: float, best: float, grid: _Grid) -> tuple[int, float]:
+def _nearest_within(query: Array, reach: float, best: float, grid: _Grid) -> tuple[int, float]:
     """The nearest point in cells within `reach` m and its squared distance; -1 if that is not below `best`, m2."""
     points, corner, block, start = grid
     found, cell, r = -1, corner[3], reach + _ROUNDING
@@ -111,16 +111,16 @@ def _closest(query: Array, reach: float, best: float, grid: _Grid) -> tuple[int,
         return found, best
     z_first, z_last = _clipped((z - r) / cell, nz), _clipped((z + r) / cell, nz)
     for cx in range(_clipped((x - r) / cell, nx), _clipped((x + r) / cell, nx) + 1):
-        off_x = _outside(x, cx * cell, cell) - _ROUNDING
+        off_x = _squared_gap(x, cx * cell, cell) - _ROUNDING
         for cy in range(_clipped((y - r) / cell, ny), _clipped((y + r) / cell, ny) + 1):
-            off_xy = off_x + _outside(y, cy * cell, cell)
+            off_xy = off_x + _squared_gap(y, cy * cell, cell)
             if off_xy > best:
                 continue
             for cz in range(z_first, z_last + 1):
                 at = block[cx // _SIDE, cy // _SIDE, cz // _SIDE]
-                if at < 0 or off_xy + _outside(z, cz * cell, cell) > best:
+                if at < 0 or off_xy + _squared_gap(z, cz * cell, cell) > best:
                     continue
-                c = at * _VOLUME + ((cx % _SIDE) * _SIDE + cy % _SIDE) * _SIDE + cz % _SIDE
+                c = at * _BLOCK_CELLS + ((cx % _SIDE) * _SIDE + cy % _SIDE) * _SIDE + cz % _SIDE
                 for i in range(start[c], start[c + 1]):
                     dx, dy, dz = points[i, 0] - query[0], points[i, 1] - query[1], points[i, 2] - query[2]
                     squared = dx * dx + dy * dy + dz * dz
@@ -140,9 +140,9 @@ def _nearest(queries: Array, radius: float, grid: _Grid) -> Index:
             continue
         found, best, reach = -1, radius * radius, min(radius, grid[1][3] / 2)
         while True:
-            nearer, best = _closest(query, reach, best, grid)
-            if nearer >= 0:
-                found = nearer
+            closer, best = _nearest_within(query, reach, best, grid)
+            if closer >= 0:
+                found = closer
             if reach >= radius or (found >= 0 and best <= (reach + _ROUNDING) ** 2):
                 break
             reach = min(radius, np.sqrt(best) if found >= 0 else 2 * reach)
@@ -151,7 +151,7 @@ def _nearest(queries: Array, radius: float, grid: _Grid) -> Index:
 
 
 @compiled(f"i8(f8[::1], f8, {_GRID}, f8[::1], i4[::1])")
-def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Index) -> int:
+def _all_within(query: Array, reach: float, grid: _Grid, squared: Array, index: Index) -> int:
     """Number of points within `reach` m; their squared distances and indices are written."""
     points, corner, block, start = grid
     found, limit, r = 0, reach * reach, reach + _ROUNDING
@@ -161,9 +161,9 @@ def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Inde
     x, y, z = query[0] - corner[0], query[1] - corner[1], query[2] - corner[2]
     z_first, z_last = _clipped((z - r) / edge, nz), _clipped((z + r) / edge, nz)
     for cx in range(_clipped((x - r) / edge, nx), _clipped((x + r) / edge, nx) + 1):
-        off_x = _outside(x, cx * edge, edge) - _ROUNDING
+        off_x = _squared_gap(x, cx * edge, edge) - _ROUNDING
         for cy in range(_clipped((y - r) / edge, ny), _clipped((y + r) / edge, ny) + 1):
-            off_xy = off_x + _outside(y, cy * edge, edge)
+            off_xy = off_x + _squared_gap(y, cy * edge, edge)
             if off_xy > limit:
                 continue
             row = ((cx % _SIDE) * _SIDE + cy % _SIDE) * _SIDE
@@ -171,7 +171,7 @@ def _within(query: Array, reach: float, grid: _Grid, squared: Array, index: Inde
                 at = block[cx // cells, cy // cells, bz]
                 if at < 0:
                     continue
-                c, end = at * _VOLUME, (at + 1) * _VOLUME
+                c, end = at * _BLOCK_CELLS, (at + 1) * _BLOCK_CELLS
                 if side == 1:  # the cells of a row, whose points are consecutive
                     end = c + row + min(z_last - bz * _SIDE, _SIDE - 1) + 1
                     c += row + max(z_first - bz * _SIDE, 0)
@@ -206,11 +206,11 @@ def _select(squared: Array, index: Index, count: int, k: int) -> None:
         else:
             break
     for i in range(1, k):  # insertion sort
-        s, of_s, j = squared[i], index[i], i
+        s, index_of_s, j = squared[i], index[i], i
         while j > 0 and squared[j - 1] > s:
             squared[j], index[j] = squared[j - 1], index[j - 1]
             j -= 1
-        squared[j], index[j] = s, of_s
+        squared[j], index[j] = s, index_of_s
 
 
 @compiled(f"i4[:, ::1](f8[:, ::1], i8, f8, {_GRID})")
@@ -220,11 +220,11 @@ def _neighbors(queries: Array, k: int, radius: float, grid: _Grid) -> Index:
     squared, index = np.empty(len(grid[0]) + 1), np.empty(len(grid[0]) + 1, np.int32)
     wanted = min(k, len(grid[0]))
     for q in range(len(queries)):
-        reach = min(_FIRST * grid[1][3], radius)
-        found = _within(queries[q], reach, grid, squared, index)
+        reach = min(_FIRST_REACH * grid[1][3], radius)
+        found = _all_within(queries[q], reach, grid, squared, index)
         while found == 0 or (found < wanted and reach < radius):
             reach = 2 * reach if found == 0 else min(min(2.0, 1.2 * np.sqrt(wanted / found)) * reach, radius)
-            found = _within(queries[q], reach, grid, squared, index)
+            found = _all_within(queries[q], reach, grid, squared, index)
         _select(squared, index, found, min(wanted, found))
         for j in range(k):
             out[q, j] = index[j] if j < found and squared[j] <= radius * radius else index[0]

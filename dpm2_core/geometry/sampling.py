@@ -33,13 +33,13 @@ def farthest_points(points: Points, count: int, grid: PointGrid) -> Index:
     count = min(count, len(points))
     if count <= 1:
         return np.arange(count)
-    start = _in_the_corner(points.copy(), np.arange(len(points)))
+    start = _start_point(points.copy(), np.arange(len(points)))
     order = grid.order
     return order[_farthest(points[order], int(np.flatnonzero(order == start)[0]), count)].astype(np.int64)
 
 
 @compiled("i8(f4[:, ::1], i8[::1])")
-def _in_the_corner(points: Points, index: Index) -> int:
+def _start_point(points: Points, index: Index) -> int:
     """The first point of the lowest cell when the cloud is repeatedly halved at the mean of its widest axis.
 
     Samplings in training started at this point. Both arrays are reordered.
@@ -69,7 +69,9 @@ def _in_the_corner(points: Points, index: Index) -> int:
 
 
 @compiled("void(f4, f4, f4, f4[:, ::1], f4[:, ::1], f4[::1])")
-def _from_boxes(x: float, y: float, z: float, low: Points, high: Points, squared: NDArray[np.float32]) -> None:
+def _squared_box_distances(
+    x: float, y: float, z: float, low: Points, high: Points, squared: NDArray[np.float32]
+) -> None:
     """Squared distances (M,) of a point from boxes, given by their corners (3, M)."""
     low_x, low_y, low_z, high_x, high_y, high_z = low[0], low[1], low[2], high[0], high[1], high[2]
     zero = np.float32(0)
@@ -98,25 +100,25 @@ def _farthest(points: Points, start: int, count: int) -> Index:
                 low[a, c], high[a, c] = min(low[a, c], value), max(high[a, c], value)
     squared, farthest = np.full((chunks, _CHUNK), np.float32(np.inf)), np.full(chunks, np.float32(np.inf))
     bits, farthest_bits = squared.view(np.int32), farthest.view(np.int32)
-    bound, chosen, at = np.empty(chunks, np.float32), np.empty(count, np.int64), start
+    bound, chosen, current = np.empty(chunks, np.float32), np.empty(count, np.int64), start
     for sample in range(count):
-        chosen[sample] = at
-        x, y, z = points[at, 0], points[at, 1], points[at, 2]
-        _from_boxes(x, y, z, low, high, bound)
+        chosen[sample] = current
+        x, y, z = points[current, 0], points[current, 1], points[current, 2]
+        _squared_box_distances(x, y, z, low, high, bound)
         for c in range(chunks):
             if bound[c] < farthest[c]:
-                of_chunk, its_bits, xs, ys, zs = squared[c], bits[c], xyz[c, 0], xyz[c, 1], xyz[c, 2]
+                chunk_squared, chunk_bits, xs, ys, zs = squared[c], bits[c], xyz[c, 0], xyz[c, 1], xyz[c, 2]
                 for i in range(_CHUNK):
                     dx, dy, dz = xs[i] - x, ys[i] - y, zs[i] - z
                     s = dx * dx + dy * dy + dz * dz
-                    of_chunk[i] = s if s < of_chunk[i] else of_chunk[i]
-                farthest_bits[c] = its_bits.max()
-        most, c, at = farthest_bits.max(), 0, 0
+                    chunk_squared[i] = s if s < chunk_squared[i] else chunk_squared[i]
+                farthest_bits[c] = chunk_bits.max()
+        most, c, current = farthest_bits.max(), 0, 0
         while farthest_bits[c] != most:
             c += 1
-        while bits[c, at] != most:
-            at += 1
-        at = min(c * _CHUNK + at, n - 1)
+        while bits[c, current] != most:
+            current += 1
+        current = min(c * _CHUNK + current, n - 1)
     return chosen
 
 
@@ -126,10 +128,10 @@ def interleaved(points: Points, special: Points, first: int) -> Points:
     Any prefix within `first` has both in the same ratio. k is at most `first` and N.
     """
     out = np.empty_like(points)
-    slot = np.zeros(len(points), bool)
-    every = min(first, len(points)) / max(len(special), 1)
-    slot[((np.arange(len(special)) + 0.5) * every).astype(np.int64)] = True
-    out[slot], out[~slot] = special, points[: len(points) - len(special)]
+    is_special = np.zeros(len(points), bool)
+    spacing = min(first, len(points)) / max(len(special), 1)
+    is_special[((np.arange(len(special)) + 0.5) * spacing).astype(np.int64)] = True
+    out[is_special], out[~is_special] = special, points[: len(points) - len(special)]
     return out
 
 

@@ -16,18 +16,18 @@ from dpm2_core.geometry.scatter import scattered
 from dpm2_core.geometry.voxel import voxel_first
 
 _CELL = 0.5  # m: surface in one cell counts once, however many beams hit it
-_FEW = 20_000  # points are enough
-_NEAREST = 0.3  # m
+_MAX_POINTS = 20_000  # points are enough
+_MIN_RANGE = 0.3  # m
 # Number of visible cells, and the distance of three quarters of them, m. Measured: rooms and offices 130 to 530 cells
 # within 8 m; streets, tunnels, highways and car parks, also with 16 beams, 1,900 to 11,000 within 14 m and more. A hall
 # shows 740 to 925 within 10 m with 16 beams; a yard of 18 by 20 m, seen by a LiDAR 70 degrees wide, 2,300 and more.
 _ROOM = (800, 18.0)
-_HALL = 10.0
+_HALL_DISTANCE = 10.0
 _OPEN = (1300, 25.0)
-_ENCLOSED = 2.0  # m: working rooms are larger than this in all directions
+_MAX_ENCLOSED_RANGE = 2.0  # m: working rooms are larger than this in all directions
 _SECTORS = 6  # per half revolution: a LiDAR that looks only ahead cannot show what is behind it
-_FEWER = 2000  # points
-_LEAST = 30  # cells: fewer are not enough to decide
+_ENCLOSED_POINTS = 2000  # points
+_MIN_CELLS = 30  # cells: fewer are not enough to decide
 ROOM_SCALE = 5.0
 """Scale of indoor scans. Measured, 16 beams, share of pairs up to 1 / 1 to 2 m apart registered to 0.3 m and 3 degrees:
 67 to 100 / 20 to 47 % unscaled, 100 / 73 to 93 % enlarged, with a fifth of the error; 4 to 8 give the same."""
@@ -46,25 +46,25 @@ def is_room(points: Points) -> bool | None:
 
 def look(points: Points) -> tuple[bool | None, int]:
     """Like `is_room`; also the approximate number of points that are not airborne particles."""
-    step = max(1, len(points) // _FEW)
-    some = points[::step]
-    away = np.linalg.norm(some[:, :3], axis=1)
-    valid = (away > _NEAREST) & (away < 1e4)  # False for NaN
-    some, away = some[valid], away[valid]
-    fixed = ~scattered(some)
-    some, away = some[fixed], away[fixed]
-    cells = voxel_first(some, _CELL) if len(some) else np.zeros(0, int)
-    return _room_of(away[cells]), len(some) * step
+    step = max(1, len(points) // _MAX_POINTS)
+    sample = points[::step]
+    ranges = np.linalg.norm(sample[:, :3], axis=1)
+    valid = (ranges > _MIN_RANGE) & (ranges < 1e4)  # False for NaN
+    sample, ranges = sample[valid], ranges[valid]
+    is_solid = ~scattered(sample)
+    sample, ranges = sample[is_solid], ranges[is_solid]
+    cells = voxel_first(sample, _CELL) if len(sample) else np.zeros(0, int)
+    return _classify(ranges[cells]), len(sample) * step
 
 
-def _room_of(away: Array) -> bool | None:
-    """See `is_room`; `away` (C,): distances of the visible cells, m."""
-    if len(away) < _LEAST:
+def _classify(ranges: Array) -> bool | None:
+    """See `is_room`; `ranges` (C,): distances of the visible cells, m."""
+    if len(ranges) < _MIN_CELLS:
         return None
-    reach = float(np.percentile(away, 75))
-    if len(away) >= _OPEN[0] or reach >= _OPEN[1]:
+    distance = float(np.percentile(ranges, 75))
+    if len(ranges) >= _OPEN[0] or distance >= _OPEN[1]:
         return False
-    return True if reach <= _HALL or (len(away) <= _ROOM[0] and reach <= _ROOM[1]) else None
+    return True if distance <= _HALL_DISTANCE or (len(ranges) <= _ROOM[0] and distance <= _ROOM[1]) else None
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ def scale_of(points: Points) -> float:
 
 def is_enclosed(points: Points) -> bool:
     """Whether a scan (N, 4) shows only close surfaces, all around: an elevator car, which may move with the sensor."""
-    some = points[:: max(1, len(points) // _FEWER)]
-    away = np.linalg.norm(some[:, :3], axis=1)
-    valid = away > 0  # False for NaN
-    if valid.sum() < _FEWER // 4 or np.percentile(away[valid], 99) > _ENCLOSED:
+    sample = points[:: max(1, len(points) // _ENCLOSED_POINTS)]
+    ranges = np.linalg.norm(sample[:, :3], axis=1)
+    valid = ranges > 0  # False for NaN
+    if valid.sum() < _ENCLOSED_POINTS // 4 or np.percentile(ranges[valid], 99) > _MAX_ENCLOSED_RANGE:
         return False
-    heading = np.arctan2(some[valid, 1], some[valid, 0])
+    heading = np.arctan2(sample[valid, 1], sample[valid, 0])
     return len(np.unique(np.floor(heading / (np.pi / _SECTORS)))) >= 2 * _SECTORS

@@ -98,14 +98,14 @@ def _exp(xi: Array, T: Array) -> None:
             second = 2 * (sin(angle / 2) / angle) ** 2
         # W is the cross-product matrix of x, y, z; W W is w w^T - squared I.
         W = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
-        w, moved = (x, y, z), xi[n, 3:]
+        w, rho = (x, y, z), xi[n, 3:]
         for a in range(3):
             T[n, a, 3] = T[n, 3, a] = 0.0
             for b in range(3):
-                same = 1.0 if a == b else 0.0
-                double = w[a] * w[b] - squared * same
-                T[n, a, b] = same + first * W[a][b] + second * double
-                T[n, a, 3] += (same + second * W[a][b] + third * double) * moved[b]
+                delta = 1.0 if a == b else 0.0
+                W_squared = w[a] * w[b] - squared * delta
+                T[n, a, b] = delta + first * W[a][b] + second * W_squared
+                T[n, a, 3] += (delta + second * W[a][b] + third * W_squared) * rho[b]
         T[n, 3, 3] = 1.0
 
 

@@ -18,10 +18,11 @@ from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import curve, se3
 from dpm2_core.geometry.deskew import measured_turn
 
-_CENTERED = 0.1  # of a sweep: a stamp this close to the middle counts as the middle
-_WHOLE = 1.2  # a sweep is partial if another one is this many times as long
-_LATELY, _OFTEN = 50, 5  # times are wrong if _OFTEN of _LATELY clouds contradict them; raw ones hardly ever do
-_WRONG = (
+_CENTER_TOLERANCE = 0.1  # of a sweep: a stamp this close to the middle counts as the middle
+_WHOLE_RATIO = 1.2  # a sweep is partial if another one is this many times as long
+# Times are wrong if _MIN_CONTRADICTED of _N_RECENT clouds contradict them; raw ones hardly ever do.
+_N_RECENT, _MIN_CONTRADICTED = 50, 5
+_WRONG_TIMES = (
     "the point times are not used, because the motion contradicts them; if the clouds are de-skewed already, set "
     "slam.preprocess.deskew: false"
 )
@@ -38,20 +39,20 @@ class Sweep:
     def __init__(self) -> None:
         self.middle = self.span = 0.0
         self.problem = ""
-        self._contradicted = deque[bool](maxlen=_LATELY)
+        self._contradicted = deque[bool](maxlen=_N_RECENT)
 
     def judge(self, contradicted: bool) -> None:
         """Record whether the motion contradicts the times of the last cloud; if it does often, the times are wrong."""
         self._contradicted.append(contradicted)
-        if sum(self._contradicted) >= _OFTEN:
-            self.problem = _WRONG
+        if sum(self._contradicted) >= _MIN_CONTRADICTED:
+            self.problem = _WRONG_TIMES
 
     def look(self, frame: Frame) -> float:
         """Time from the frame's stamp to the middle of its sweep, s."""
         if frame.time_offset is not None and len(frame.time_offset):
             start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
             middle, self.span = (start + end) / 2, end - start
-            self.middle = middle if abs(middle) > _CENTERED * self.span else 0.0
+            self.middle = middle if abs(middle) > _CENTER_TOLERANCE * self.span else 0.0
         return self.middle
 
     def centered(self, frame: Frame) -> Frame:
@@ -63,7 +64,7 @@ class Sweep:
 
     def is_part(self, span: float) -> bool:
         """Whether another sweep, of `span` s, was only a part of a sweep like this one."""
-        return self.span > _WHOLE * span
+        return self.span > _WHOLE_RATIO * span
 
     def to_stamp(self, frame: Frame, motion: Array | None) -> Array:
         """T_scan_lidar (4, 4): pose of the LiDAR at the stamp relative to its pose in the middle of the sweep.
@@ -81,5 +82,5 @@ class Sweep:
 
     def covariance(self, change: Array) -> Array:
         """(6, 6) [rad, m] of that transform if the twist changes by `change` (6,) from one scan to the next."""
-        off = self.middle * change
-        return isotropic(float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])))
+        error = self.middle * change
+        return isotropic(float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:])))

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_LONGEST = 0.1  # s between two samples, across which the rate is assumed to change linearly
-_BEYOND = 0.05  # s before the first sample or after the last, for which its rate is assumed to continue
-_SLOWEST = 0.11  # s between the samples of the slowest IMU: at 10 Hz, as from kitti2bag, it is 0.104 s
-_UNEVEN = 1.25  # largest gap between samples of a slow IMU, in usual periods
+_MAX_GAP = 0.1  # s between two samples, across which the rate is assumed to change linearly
+_MAX_EXTRAPOLATION = 0.05  # s before the first sample or after the last, for which its rate is assumed to continue
+_MAX_PERIOD = 0.11  # s between the samples of the slowest IMU: at 10 Hz, as from kitti2bag, it is 0.104 s
+_MAX_GAP_PERIODS = 1.25  # largest gap between samples of a slow IMU, in usual periods
 
 
 def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array | None:
@@ -29,30 +29,30 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
     """
     at = np.asarray(at, np.float64)
     low, high = min(0.0, float(at.min())), max(0.0, float(at.max()))
-    longest, beyond = _limits(seconds)
-    near = (seconds > low - longest) & (seconds < high + longest)
+    max_gap, max_extrapolation = _limits(seconds)
+    near = (seconds > low - max_gap) & (seconds < high + max_gap)
     seconds, rates = seconds[near], rates[near]
     if len(seconds) > 1 and seconds[1] <= low:  # of the samples before, only the last one is needed
         first = int(np.searchsorted(seconds, low, "right")) - 1
         seconds, rates = seconds[first:], rates[first:]
-    if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > longest:
+    if len(seconds) > 1 and seconds[0] < low and seconds[1] - seconds[0] > max_gap:
         seconds, rates = seconds[1:], rates[1:]  # the IMU paused before `low`
     last = int(np.searchsorted(seconds, high)) + 1
     seconds, rates = seconds[:last], rates[:last]
-    if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > longest:
+    if len(seconds) > 1 and seconds[-1] > high and seconds[-1] - seconds[-2] > max_gap:
         seconds, rates = seconds[:-1], rates[:-1]
-    if not len(seconds) or seconds[0] > low + beyond or seconds[-1] < high - beyond:
+    if not len(seconds) or seconds[0] > low + max_extrapolation or seconds[-1] < high - max_extrapolation:
         return None
-    if len(seconds) > 1 and np.diff(seconds).max() > longest:
+    if len(seconds) > 1 and np.diff(seconds).max() > max_gap:
         return None
     before, after = min(low, float(seconds[0])), max(high, float(seconds[-1]))
     seconds = np.concatenate([[before - 1e-9], seconds, [after + 1e-9]])
     rates = np.concatenate([rates[:1], rates, rates[-1:]])
     steps = np.diff(seconds)
-    whole = se3.rotation((rates[1:] + rates[:-1]) / 2 * steps[:, None])
+    step_rotations = se3.rotation((rates[1:] + rates[:-1]) / 2 * steps[:, None])
     nodes = np.empty((len(seconds), 3, 3))
     nodes[0] = np.eye(3)
-    for k, R in enumerate(whole):
+    for k, R in enumerate(step_rotations):
         nodes[k + 1] = nodes[k] @ R
 
     def rotation(times: Array) -> Array:
@@ -67,8 +67,8 @@ def turned(seconds: NDArray[np.floating], rates: Array, at: ArrayLike) -> Array 
 def _limits(seconds: NDArray[np.floating]) -> tuple[float, float]:
     """Largest s between two samples, and beyond the first and last one, from the usual distance of the samples (K,)."""
     usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-    allowed = _UNEVEN * usual if usual < _SLOWEST else 0.0
-    return max(_LONGEST, allowed), max(_BEYOND, allowed)
+    allowed = _MAX_GAP_PERIODS * usual if usual < _MAX_PERIOD else 0.0
+    return max(_MAX_GAP, allowed), max(_MAX_EXTRAPOLATION, allowed)
 
 
 def leveled(up: ArrayLike, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Array:

@@ -210,8 +210,8 @@ def test_a_topic_without_odometry_of_use_is_named(
 
 
 def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot: Callable[..., Robot]) -> None:
-    """With 1000 m2 per cloud it is reported as left out. Previously, "outweighed: 0.00 m, 0.0 deg from the motion of the
-    scans" was reported of a correct odometry."""
+    """With 1000 m2 per cloud it is reported as left out. Previously, "outweighed: 0.00 m, 0.0 deg from the motion of
+    the scans" was reported of a correct odometry."""
     r = robot("topic")
     r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
     r.go(*range(5))
