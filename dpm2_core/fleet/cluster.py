@@ -30,10 +30,12 @@ ATTEMPTS = 3
 """Workers that may die while they work on one part."""
 MEMORY = 2 * 10**9
 """Bytes that a part declares; 1.2 GB were measured for a drive with the network, the rest is a margin."""
-_POLL = 0.5  # s between two polls, and between two reports of a part
-_PATIENCE = 5.0  # s for an address to answer
-_STORE = 100 * 2**20  # bytes of shared memory of a cluster on this machine: parts exchange little
-_LONGEST = 20  # characters of the folder for temporary files, in which Ray makes sockets with names of up to 107
+_POLL_INTERVAL = 0.5  # s between two polls, and between two reports of a part
+_CONNECT_TIMEOUT = 5.0  # s for an address to answer
+_OBJECT_STORE_BYTES = 100 * 2**20  # shared memory of a cluster on this machine: parts exchange little
+_MAX_FOLDER_LENGTH = (
+    20  # characters of the folder for temporary files, in which Ray makes sockets with names of up to 107
+)
 
 
 class Status(NamedTuple):
@@ -84,7 +86,7 @@ class Cluster:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: hardly any time next to other programs
-        with _loopback(self._address is None), needs("fleet", "a fleet"):
+        with _loopback_only(self._address is None), needs("fleet", "a fleet"):
             import ray
         self._ray = ray
         if not ray.is_initialized():
@@ -94,7 +96,7 @@ class Cluster:
                 self.__exit__()
                 where = "Ray" if self._address is None else f"--ray {self._address}"
                 raise UsageError(f"{where}: {one_line(error)}") from None
-        self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Board).remote()
+        self._board = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_ProgressBoard).remote()
 
     def _connect(self, ray: Any, cores: int) -> None:
         _keep_private(Path.home() / ".ray")
@@ -105,11 +107,11 @@ class Cluster:
             ray.init(self._address, **quiet)
             return
         temporary = tempfile.gettempdir()
-        self._folder = part_beside(Path(temporary if len(temporary) < _LONGEST else "/tmp") / "ray")
+        self._folder = part_beside(Path(temporary if len(temporary) < _MAX_FOLDER_LENGTH else "/tmp") / "ray")
         self._folder.mkdir(mode=0o700)
         workers = self._workers or max(processors() // cores, 1)
         ray.init(
-            "local", num_cpus=workers * cores, include_dashboard=False, object_store_memory=_STORE,
+            "local", num_cpus=workers * cores, include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES,
             _temp_dir=str(self._folder), **quiet,
         )  # fmt: skip
 
@@ -133,15 +135,15 @@ class Cluster:
             return
         self.start(max(part.cores for part in waiting))
         ray = self._ray
-        most = self._limits(ray)
+        limits = self._limits(ray)
         running: dict[Any, str] = {}
         while waiting or running:
-            while waiting and len(running) < (self._workers or most["window"]):
+            while waiting and len(running) < (self._workers or limits["window"]):
                 part = waiting.popleft()
-                running[self._submit(ray, part, out, most)] = part.name
-            ended, _ = ray.wait(list(running), timeout=_POLL)
+                running[self._submit(ray, part, out, limits)] = part.name
+            ended, _ = ray.wait(list(running), timeout=_POLL_INTERVAL)
             for reference in ended:
-                yield _ended(ray, running.pop(reference), reference)
+                yield _outcome(ray, running.pop(reference), reference)
             watch(self._status(ray))
 
     def _limits(self, ray: Any) -> dict[str, float]:
@@ -152,10 +154,10 @@ class Cluster:
             raise UsageError(f"--ray {self._address}: no node of that cluster has a processor to work with")
         return {"CPU": max(cpus), "memory": max(node.get("memory", 0) for node in nodes), "window": 4 * sum(cpus)}
 
-    def _submit(self, ray: Any, part: Part, out: Path, most: Mapping[str, float]) -> Any:
+    def _submit(self, ray: Any, part: Part, out: Path, limits: Mapping[str, float]) -> Any:
         remote = ray.remote(_attempt).options(
-            num_cpus=min(part.cores, most["CPU"]),
-            memory=min(MEMORY, most["memory"]),
+            num_cpus=min(part.cores, limits["CPU"]),
+            memory=min(MEMORY, limits["memory"]),
             max_retries=ATTEMPTS - 1,
             name=part.name,
         )
@@ -163,26 +165,26 @@ class Cluster:
 
     def _status(self, ray: Any) -> Mapping[str, Status]:
         try:
-            status: Mapping[str, Status] = ray.get(self._board.all.remote(), timeout=_POLL)
+            status: Mapping[str, Status] = ray.get(self._board.all.remote(), timeout=_POLL_INTERVAL)
         except ray.exceptions.RayError:  # it is only for display, and is restarted
             return {}
         return status
 
 
 @contextmanager
-def _loopback(wanted: bool) -> Iterator[None]:
+def _loopback_only(enabled: bool) -> Iterator[None]:
     """Make Ray listen only on 127.0.0.1, by a variable that is set while Ray is imported: there are no other machines.
 
     The variable is named after systems on which that is the default; it works on Linux, too. It is read once.
     """
     name = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-    ours = wanted and name not in os.environ
-    if ours:
+    set_here = enabled and name not in os.environ
+    if set_here:
         os.environ[name] = "0"
     try:
         yield
     finally:
-        if ours:
+        if set_here:
             del os.environ[name]
 
 
@@ -199,12 +201,12 @@ def _check_address(address: str) -> None:
     if not colon or not port.isdecimal():
         return  # "auto", and other names that Ray supports
     try:
-        socket.create_connection((host, int(port)), _PATIENCE).close()
+        socket.create_connection((host, int(port)), _CONNECT_TIMEOUT).close()
     except (OSError, OverflowError) as error:
         raise ConnectionError(f"nobody answers there: {error}") from None
 
 
-class _Board:
+class _ProgressBoard:
     """Progress of the parts, reported by them: an actor of Ray, in its own process."""
 
     def __init__(self) -> None:
@@ -214,7 +216,7 @@ class _Board:
         before = self._status.get(name, Status(0))
         self._status[name] = Status(before.attempts + 1, where=where)
 
-    def tell(self, name: str, done: int, total: int) -> None:
+    def report(self, name: str, done: int, total: int) -> None:
         self._status[name] = self._status.get(name, Status(1))._replace(done=done, total=total)
 
     def all(self) -> dict[str, Status]:
@@ -224,13 +226,13 @@ class _Board:
 def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
     """Do a part in the worker: an exception of the work is a result; only the death of the worker is tried again."""
     board.begin.remote(part.name, f"{socket.gethostname()}:{os.getpid()}")
-    told = 0.0
+    last_report = 0.0
 
     def advance(done: int, total: int) -> None:
-        nonlocal told
-        if done == total or time.monotonic() - told >= _POLL:
-            told = time.monotonic()
-            board.tell.remote(part.name, done, total)
+        nonlocal last_report
+        if done == total or time.monotonic() - last_report >= _POLL_INTERVAL:
+            last_report = time.monotonic()
+            board.report.remote(part.name, done, total)
 
     try:
         if version != __version__:
@@ -240,13 +242,13 @@ def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
         return Outcome(part.name, "failed", reason=str(error))
     except Exception as error:  # a bug ends its own part, not the others
         last = traceback.extract_tb(error.__traceback__)[-1]
-        why = f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
-        return Outcome(part.name, "failed", reason=why)
+        reason = f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
+        return Outcome(part.name, "failed", reason=reason)
 
 
-def _ended(ray: Any, name: str, reference: Any) -> Outcome:
+def _outcome(ray: Any, name: str, reference: Any) -> Outcome:
     try:
-        ended: Outcome = ray.get(reference)
+        outcome: Outcome = ray.get(reference)
     except ray.exceptions.OutOfMemoryError:
         return Outcome(name, "failed", reason="its worker was killed: the machine ran out of memory")
     except ray.exceptions.RayTaskError as error:
@@ -254,4 +256,4 @@ def _ended(ray: Any, name: str, reference: Any) -> Outcome:
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return Outcome(name, "failed", reason=f"{ATTEMPTS} workers died while processing it: {lines[0]}")
-    return ended
+    return outcome

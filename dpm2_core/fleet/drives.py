@@ -26,7 +26,7 @@ from dpm2_core.slam.store.map_file import SUFFIX
 MAP = f"drive{SUFFIX}"
 """The map file in the folder of a drive."""
 _WORK = "dpm2_core.fleet.drives:run_drive"
-_MANIFEST = (".yaml", ".yml")
+_MANIFEST_SUFFIXES = (".yaml", ".yml")
 
 
 class ManifestDrive(Settings):
@@ -58,17 +58,17 @@ def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
     """
     drives = [ManifestDrive(path=str(path)) for path in given]
     root = Path()
-    if len(given) == 1 and given[0].suffix in _MANIFEST:
+    if len(given) == 1 and given[0].suffix in _MANIFEST_SUFFIXES:
         drives, root = settings_from(Manifest, read_yaml(given[0]), default=str(given[0])).drives, given[0].parent
-    named = [_named(drive, root.resolve()) for drive in drives]
-    twice = [name for name, count in Counter(drive.name for drive in named).items() if count > 1]
-    if twice:
-        paths = " and ".join(drive.path for drive in named if drive.name == twice[0])
-        raise UsageError(f"{paths}: both would be called {twice[0]}; a list (docs/fleet.md) can give them names")
-    return named
+    resolved = [_resolved(drive, root.resolve()) for drive in drives]
+    duplicates = [name for name, count in Counter(drive.name for drive in resolved).items() if count > 1]
+    if duplicates:
+        paths = " and ".join(drive.path for drive in resolved if drive.name == duplicates[0])
+        raise UsageError(f"{paths}: both would be called {duplicates[0]}; a list (docs/fleet.md) can give them names")
+    return resolved
 
 
-def _named(drive: ManifestDrive, root: Path) -> ManifestDrive:
+def _resolved(drive: ManifestDrive, root: Path) -> ManifestDrive:
     path = (root / drive.path).resolve()
     name = drive.name or (path.stem if path.is_file() else path.name)
     if not name or name.startswith(".") or "/" in name:
@@ -93,7 +93,7 @@ def parts_of(
 
 
 def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
-    slam, inputs = _from_any_folder(config.slam)
+    slam, inputs = _with_absolute_paths(config.slam)
     arguments = {
         "path": drive.path,
         "frames": parse_range(drive.frames),
@@ -105,7 +105,7 @@ def _part(drive: ManifestDrive, config: Config, prefix: str) -> Part:
     return Part(prefix + drive.name, _WORK, arguments, inputs, fresh=True, cores=slam.threads)
 
 
-def _from_any_folder(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
+def _with_absolute_paths(slam: SlamSettings) -> tuple[SlamSettings, list[Path]]:
     """The settings with absolute paths of weights, as a worker has another working directory; and these files."""
     files, changes = [], dict[str, Any]()
     if slam.uses_descriptors:

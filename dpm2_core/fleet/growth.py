@@ -21,7 +21,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge
 from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.regions import Join, first_nodes, owners, sizes_of
-from dpm2_core.fleet.search import affirmed, component
+from dpm2_core.fleet.search import accepted_and_rejected, component
 from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.graph.graph_data import loop_errors, mahalanobis
 from dpm2_core.slam.graph.pose_graph import PoseGraph
@@ -33,8 +33,8 @@ from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import edge_of, pose_of
 from dpm2_core.slam.store.writer import STILL
 
-_STRAINED = 2.0  # standard deviations by which the loops to a drive are strained, in total
-_TOGETHER = 200  # spans of nodes in one query
+_MAX_STRAIN = 2.0  # standard deviations by which the loops to a drive are strained, in total
+_SPANS_PER_QUERY = 200  # spans of nodes in one query
 
 
 def spans_of(sizes: Mapping[str, int]) -> dict[str, range]:
@@ -72,10 +72,10 @@ def add_drives(store: MapStore, inside: Mapping[str, int], growth: Growth, refus
         append_map(store, _renamed(name, data))
     first = first_nodes({**inside, **sizes_of(growth.maps)})
     loops = [join.loop_at(first) for join in (*growth.joins, *refused) if {join.one, join.other} <= first.keys()]
-    known = None
+    georeference = None
     if next(store.rows("georeference"), None) is None:
-        known = next(filter(None, map(_georeference, growth.maps.values())), None)
-    store.write(Change(edges=loops, judged=growth.judged, poses=growth.moved, georeference=known))
+        georeference = next(filter(None, map(_georeference, growth.maps.values())), None)
+    store.write(Change(edges=loops, judged=growth.judged, poses=growth.moved, georeference=georeference))
 
 
 def joins_of(loops: Collection[Edge], inside: Mapping[str, int]) -> list[Join]:
@@ -119,19 +119,19 @@ class Standing:
     def between(self, names: Collection[str]) -> set[str]:
         """These drives, and those on the shortest paths from the first of them to the others."""
         order = list(self.sizes)
-        number = {name: at for at, name in enumerate(order)}
-        rows, columns = np.array([[number[one], number[other]] for one, other in self.ties]).reshape(-1, 2).T
+        number_of = {name: number for number, name in enumerate(order)}
+        rows, columns = np.array([[number_of[one], number_of[other]] for one, other in self.ties]).reshape(-1, 2).T
         graph = coo_array((np.ones(len(rows)), (rows, columns)), (len(order), len(order))).tocsr()
-        ends = sorted(number[name] for name in names)
-        before = breadth_first_order(graph, ends[0], directed=False)[1] if ends else []
+        ends = sorted(number_of[name] for name in names)
+        predecessors = breadth_first_order(graph, ends[0], directed=False)[1] if ends else []
         found = set(ends)
         for end in ends:
-            while (end := int(before[end])) >= 0:
+            while (end := int(predecessors[end])) >= 0:
                 found.add(end)
-        return {order[at] for at in found}
+        return {order[number] for number in found}
 
 
-def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
+def grown(existing: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
     """Poses of new drives in an existing map, the verdicts on their joins, and the changes of what they touch.
 
     Args:
@@ -146,18 +146,18 @@ def grown(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -
     refused: list[Join] = []
     maps, joins = dict(maps), list(joins)
     while maps:
-        part = _solved(there, _nearest_first(there.sizes, maps, joins), joins)
-        if part is None:
+        growth = _solve_touched(existing, _nearest_first(existing.sizes, maps, joins), joins)
+        if growth is None:
             return None
-        joins, contradicted = affirmed(part.joins)
+        joins, contradicted = accepted_and_rejected(growth.joins)
         refused += contradicted
-        sizes = {**there.sizes, **sizes_of(maps)}
-        together = component(sizes, joins, there.sizes)
-        if not set(there.sizes) <= set(together):
+        sizes = {**existing.sizes, **sizes_of(maps)}
+        connected = component(sizes, joins, existing.sizes)
+        if not set(existing.sizes) <= set(connected):
             return None
-        if not any(join.loop.ok for join in contradicted) and len(together) == len(sizes):
-            return replace(part, joins=[*joins, *refused])
-        maps = {name: maps[name] for name in maps if name in together}
+        if not any(join.loop.ok for join in contradicted) and len(connected) == len(sizes):
+            return replace(growth, joins=[*joins, *refused])
+        maps = {name: maps[name] for name in maps if name in connected}
     return Growth({}, refused)
 
 
@@ -165,25 +165,27 @@ def _nearest_first(inside: Collection[str], maps: Mapping[str, MapData], joins: 
     """New drives, in the order in which they are reached from the map by their joins."""
     order: dict[str, MapData] = {}
     while True:
-        there = {*inside, *order}
-        near = {end for join in joins if (join.one in there) != (join.other in there) for end in (join.one, join.other)}
-        if not near - there:
+        reached = {*inside, *order}
+        ends = {
+            end for join in joins if (join.one in reached) != (join.other in reached) for end in (join.one, join.other)
+        }
+        if not ends - reached:
             return {**order, **{name: maps[name] for name in maps if name not in order}}
-        order |= {name: maps[name] for name in maps if name in near - there}
+        order |= {name: maps[name] for name in maps if name in ends - reached}
 
 
-def _solved(there: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
+def _solve_touched(existing: Standing, maps: Mapping[str, MapData], joins: Sequence[Join]) -> Growth | None:
     """Solve for new drives and the drives that they touch, and for more of the map while its borders are strained."""
-    sizes, spans, first = there.sizes, spans_of(there.sizes), first_nodes(there.sizes)
-    active = there.between({end for join in joins for end in (join.one, join.other) if end in sizes})
-    while sum(map(len, maps.values())) + sum(sizes[name] for name in active) <= there.largest:
-        region = _Region(there.store, [spans[name] for name in sizes if name in active], there.settings)
+    sizes, spans, first = existing.sizes, spans_of(existing.sizes), first_nodes(existing.sizes)
+    active = existing.between({end for join in joins for end in (join.one, join.other) if end in sizes})
+    while sum(map(len, maps.values())) + sum(sizes[name] for name in active) <= existing.largest:
+        region = _Region(existing.store, [spans[name] for name in sizes if name in active], existing.settings)
         growth = region.with_drives(maps, joins, {name: first[name] for name in active})
         further = region.strained(first)
-        if any(join.loop.ok for join in affirmed(growth.joins)[1]) and len(active) < len(sizes):
+        if any(join.loop.ok for join in accepted_and_rejected(growth.joins)[1]) and len(active) < len(sizes):
             further = set(sizes)  # the fixed ones may be wrong
         if not further:
-            return growth if region.holds(sizes) else None
+            return growth if region.keeps_joins(sizes) else None
         active |= further
     return None
 
@@ -204,92 +206,94 @@ class _Region:
             raise Dpm2Error(f"{store.path}: {error}; see dpm2 map check") from None
 
     def _read(self, store: MapStore, spans: Sequence[range], settings: RobustSettings) -> None:
-        own = [node for span in spans for node in span]
+        inner_nodes = [node for span in spans for node in span]
         edges = _rows(store, "edges", spans, "from_node", "to_node")
-        read = sorted({int(row[0]): edge_of(row) for row in edges}.items())
-        chain = odometry_by_node(edge for _, edge in read)
-        self._loops = {number: edge for number, edge in read if edge.ok and chain.get(edge.to_node) is not edge}
-        known = set(own)
-        self._outer = sorted({end for loop in self._loops.values() for end in (loop.from_node, loop.to_node)} - known)
-        nodes = [*spans, *(range(node, node + 1) for node in self._outer)]
+        numbered = sorted({int(row[0]): edge_of(row) for row in edges}.items())
+        odometry = odometry_by_node(edge for _, edge in numbered)
+        self._loops = {number: edge for number, edge in numbered if edge.ok and odometry.get(edge.to_node) is not edge}
+        inner = set(inner_nodes)
+        self._border = sorted({end for loop in self._loops.values() for end in (loop.from_node, loop.to_node)} - inner)
+        nodes = [*spans, *(range(node, node + 1) for node in self._border)]
         self._poses = {row[0]: pose_of(row[1]) for row in _rows(store, "poses", nodes, "node")}
-        self._graph, self._at = PoseGraph(settings), dict[int, int]()
-        self._add(own, self._poses, chain)
-        self._add(self._outer, self._poses, {})
+        self._graph, self._graph_node = PoseGraph(settings), dict[int, int]()
+        self._add(inner_nodes, self._poses, odometry)
+        self._add(self._border, self._poses, {})
         for loop in self._loops.values():
-            self._graph.add_loop(_between(loop, self._at))
-        self._own = own
+            self._graph.add_loop(_reindexed(loop, self._graph_node))
+        self._inner = inner_nodes
 
-    def _add(self, nodes: Iterable[int], poses: Mapping[int, Array], chain: Mapping[int, Edge]) -> None:
+    def _add(self, nodes: Iterable[int], poses: Mapping[int, Array], odometry: Mapping[int, Edge]) -> None:
         for node in nodes:
-            self._at[node] = len(self._graph)
-            self._graph.add_node(poses[node], _between(chain[node], self._at) if node in chain else None)
+            self._graph_node[node] = len(self._graph)
+            self._graph.add_node(
+                poses[node], _reindexed(odometry[node], self._graph_node) if node in odometry else None
+            )
 
     def with_drives(self, maps: Mapping[str, MapData], joins: Sequence[Join], first: Mapping[str, int]) -> Growth:
         """Solve with new drives; `first`: the first node in the file of each drive of the region."""
-        graph, begins = self._graph, {name: self._at[node] for name, node in first.items()}
+        graph, first_graph_node = self._graph, {name: self._graph_node[node] for name, node in first.items()}
         for name, data in maps.items():
-            begins[name] = len(graph)
+            first_graph_node[name] = len(graph)
             restore(graph, data)
         loops = len(graph.loops)
         for join in joins:
-            graph.add_loop(join.loop_at(begins))
-        for node in self._own:  # the first loop between two parts has moved one of them
-            graph.place(self._at[node], self._poses[node])
-        for node in self._outer:
-            graph.hold(self._at[node], self._poses[node])
+            graph.add_loop(join.loop_at(first_graph_node))
+        for node in self._inner:  # the first loop between two parts has moved one of them
+            graph.place(self._graph_node[node], self._poses[node])
+        for node in self._border:
+            graph.hold(self._graph_node[node], self._poses[node])
         graph.optimize()
         checked = [join.judged(loop.registration) for join, loop in zip(joins, graph.loops[loops:], strict=True)]
         solved = graph.poses
-        moved = {node: solved[self._at[node]] for node in self._own}
+        moved = {node: solved[self._graph_node[node]] for node in self._inner}
         return Growth(
-            {name: replace(data, poses=solved[begins[name] :][: len(data)]) for name, data in maps.items()},
+            {name: replace(data, poses=solved[first_graph_node[name] :][: len(data)]) for name, data in maps.items()},
             checked,
             {node: T for node, T in moved.items() if np.abs(T - self._poses[node]).max() > STILL},
-            {number: loop for number, loop in self._judged().items() if not loop.ok},
+            {number: loop for number, loop in self._judged_loops().items() if not loop.ok},
         )
 
-    def _judged(self) -> dict[int, Edge]:
+    def _judged_loops(self) -> dict[int, Edge]:
         """The loops of the file as the graph has them now, by number."""
-        return {number: replace(loop, registration=now.registration)
-                for (number, loop), now in zip(self._loops.items(), self._graph.loops, strict=False)}  # fmt: skip
+        return {number: replace(loop, registration=judged.registration)
+                for (number, loop), judged in zip(self._loops.items(), self._graph.loops, strict=False)}  # fmt: skip
 
     def strained(self, first: Mapping[str, int]) -> set[str]:
         """The drives outside the region whose loops to it are strained by the new poses; `first`: of all drives."""
-        outer = set(self._outer)
+        outer = set(self._border)
         border = [loop for loop in self._loops.values() if {loop.from_node, loop.to_node} & outer]
         if not border:
             return set()
         before, after = (self._errors(border, moved) for moved in (False, True))
         chi2 = mahalanobis(after - before, np.array([loop.covariance for loop in border]))
-        beside = owners([end for loop in border for end in {loop.from_node, loop.to_node} & outer], first)
-        return {name for name in beside if chi2[np.array(beside) == name].sum() > _STRAINED**2}
+        neighbors = owners([end for loop in border for end in {loop.from_node, loop.to_node} & outer], first)
+        return {name for name in neighbors if chi2[np.array(neighbors) == name].sum() > _MAX_STRAIN**2}
 
     def _errors(self, loops: Sequence[Edge], moved: bool) -> Array:
         """(E, 6) of loops, with the poses of the file or those that were solved for."""
         nodes = sorted({end for loop in loops for end in (loop.from_node, loop.to_node)})
-        poses = np.array([self._graph.pose(self._at[node]) if moved else self._poses[node] for node in nodes])
+        poses = np.array([self._graph.pose(self._graph_node[node]) if moved else self._poses[node] for node in nodes])
         ends = np.searchsorted(nodes, [(loop.from_node, loop.to_node) for loop in loops])
         return loop_errors(poses, ends, np.array([loop.T_from_to for loop in loops]))
 
-    def holds(self, inside: Mapping[str, int]) -> bool:
+    def keeps_joins(self, inside: Mapping[str, int]) -> bool:
         """Whether all drives that were joined are still joined by enough loops."""
-        left: dict[tuple[str, str], set[int]] = defaultdict(set)
-        for join in joins_of(self._judged().values(), inside):
-            left[join.one, join.other] |= {join.loop.to_node} if join.loop.ok else set()
-        return all(len(nodes) >= ENOUGH for (one, other), nodes in left.items() if one != other)
+        remaining: dict[tuple[str, str], set[int]] = defaultdict(set)
+        for join in joins_of(self._judged_loops().values(), inside):
+            remaining[join.one, join.other] |= {join.loop.to_node} if join.loop.ok else set()
+        return all(len(nodes) >= ENOUGH for (one, other), nodes in remaining.items() if one != other)
 
 
-def _within(spans: Sequence[range], *columns: str) -> str:
+def _span_condition(spans: Sequence[range], *columns: str) -> str:
     """The SQL condition that a column of a table is a node in these spans."""
     return " OR ".join(f"{column} BETWEEN {s.start} AND {s.stop - 1}" for s in spans for column in columns) or "FALSE"
 
 
 def _rows(store: MapStore, table: str, spans: Sequence[range], *columns: str) -> Iterator[tuple[Any, ...]]:
     """Rows of a table in which a column is a node in these spans; some occur more than once."""
-    for first in range(0, len(spans), _TOGETHER):  # SQLite limits the depth of an expression
-        yield from store.rows(table, where=_within(spans[first : first + _TOGETHER], *columns))
+    for first in range(0, len(spans), _SPANS_PER_QUERY):  # SQLite limits the depth of an expression
+        yield from store.rows(table, where=_span_condition(spans[first : first + _SPANS_PER_QUERY], *columns))
 
 
-def _between(edge: Edge, at: Mapping[int, int]) -> Edge:
-    return edge.between(at[edge.from_node], at[edge.to_node])
+def _reindexed(edge: Edge, index: Mapping[int, int]) -> Edge:
+    return edge.between(index[edge.from_node], index[edge.to_node])

@@ -25,9 +25,9 @@ from dpm2_core.slam.store.map_store import MapStore
 ENOUGH = 3
 """Loops that a join of two drives needs: two can be wrong in the same way if houses look alike."""
 _WORK = "dpm2_core.fleet.joins:verify"
-_GAP = 8  # keyframes without a candidate, over which a stretch continues
-_LONGEST = 40  # keyframes of a stretch: a task of a minute
-_AROUND = 6  # keyframes before and after a candidate that are used with it: 22 m of surroundings and more
+_MAX_GAP = 8  # keyframes without a candidate, over which a stretch continues
+_MAX_STRETCH = 40  # keyframes of a stretch: a task of a minute
+_CONTEXT = 6  # keyframes before and after a candidate that are used with it: 22 m of surroundings and more
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ def stretches(one: str, other: str, pairs: NDArray[np.int64]) -> Iterator[Stretc
     begins = [0]
     for row in range(1, len(pairs)):
         node = pairs[row, 1]
-        if node - pairs[row - 1, 1] > _GAP or node - pairs[begins[-1], 1] >= _LONGEST:
+        if node - pairs[row - 1, 1] > _MAX_GAP or node - pairs[begins[-1], 1] >= _MAX_STRETCH:
             begins.append(row)
     for begin, end in zip(begins, [*begins[1:], len(pairs)], strict=True):
         group = pairs[begin:end]
         if len(np.unique(group[:, 1])) >= ENOUGH:
-            near = {int(node) + step for node in group[:, 0] for step in range(-_AROUND, _AROUND + 1)}
+            one_nodes = {int(node) + step for node in group[:, 0] for step in range(-_CONTEXT, _CONTEXT + 1)}
             last = int(group[-1, 1])
-            yield Stretch(one, other, tuple(sorted(near)), tuple(range(int(group[0, 1]), last + 1)))
+            yield Stretch(one, other, tuple(sorted(one_nodes)), tuple(range(int(group[0, 1]), last + 1)))
 
 
 def join_part(number: int, stretch: Stretch, maps: Mapping[str, Mapping[str, Any]], slam: SlamSettings) -> Part:
@@ -81,9 +81,9 @@ def verify(
         Dpm2Error: a map cannot be read.
     """
     del folder
-    closer = make_loops(slam)
+    loop_closure = make_loops(slam)
     with MapStore.open(one["path"]) as a, MapStore.open(other["path"]) as b:
-        first, second = _excerpt(a, nodes[0], "one"), _excerpt(b, nodes[1], "other")
+        first, second = _read_excerpt(a, nodes[0], "one"), _read_excerpt(b, nodes[1], "other")
         clouds = _Clouds([first, second])
         keyframes, poses = list(first.keyframes), np.concatenate([first.poses, second.poses])
         parts = np.concatenate([first.parts, second.parts + len(first.data)])  # the two have no part in common
@@ -92,7 +92,7 @@ def verify(
         for count, keyframe in enumerate(second.keyframes, 1):
             keyframes.append(keyframe)
             end = len(keyframes)
-            for loop in closer.close(keyframes, clouds, poses[:end], parts[:end], own[:end]):
+            for loop in loop_closure.close(keyframes, clouds, poses[:end], parts[:end], own[:end]):
                 if loop.from_node < len(first.nodes) <= loop.to_node:
                     ends = first.nodes[loop.from_node], second.nodes[loop.to_node - len(first.nodes)]
                     tried[ends] = loop.between(*ends)  # a later result: confirmed by another loop
@@ -113,18 +113,18 @@ class _Excerpt:
     data: MapData
 
 
-def _excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
+def _read_excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt:
     data = load_map(store, descriptors=False)
     chosen = [node for node in nodes if 0 <= node < len(data)]
     keyframes: list[Keyframe] = []
     for node in chosen:
         loan = data.clouds.loan(node)
         owner = node if loan is None else loan.lender
-        lent = replace(data.keyframes[owner], descriptors=data.describe(owner))
-        keyframe = lent if loan is None else borrowing(data.keyframes[node], {owner: lent}, loan)  # type: ignore[arg-type]
-        follows = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
+        owner_keyframe = replace(data.keyframes[owner], descriptors=data.describe(owner))
+        keyframe = owner_keyframe if loan is None else borrowing(data.keyframes[node], {owner: owner_keyframe}, loan)  # type: ignore[arg-type]
+        continues = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
         # Separate names keep the odometry of the two apart; a gap begins another stretch of odometry.
-        keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if follows else None))
+        keyframes.append(replace(keyframe, robot=robot, edge=keyframe.edge if continues else None))
     return _Excerpt(chosen, keyframes, data.poses[chosen], parts_of(data)[chosen], data.clouds.own[chosen], data)
 
 
@@ -132,14 +132,14 @@ class _Clouds(LazySequence[Points]):
     """The clouds of excerpts, one after the other, read on demand."""
 
     def __init__(self, excerpts: Sequence[_Excerpt]) -> None:
-        self._where = [(excerpt.data, node) for excerpt in excerpts for node in excerpt.nodes]
+        self._sources = [(excerpt.data, node) for excerpt in excerpts for node in excerpt.nodes]
 
     def __len__(self) -> int:
-        return len(self._where)
+        return len(self._sources)
 
     def item(self, index: int) -> Points:
         """(M, 4)."""
-        data, node = self._where[index]
+        data, node = self._sources[index]
         return data.clouds[node]
 
 

@@ -26,7 +26,7 @@ from dpm2_core.fleet.joins import ENOUGH
 from dpm2_core.fleet.part import Figures, Part
 from dpm2_core.fleet.regions import LARGEST, Join, solve
 from dpm2_core.fleet.run import View
-from dpm2_core.fleet.search import Search, affirmed, component
+from dpm2_core.fleet.search import Search, accepted_and_rejected, component
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.slam.store.map_data import MapData, load_map
 from dpm2_core.slam.store.map_file import check_new, move_map, remove_map
@@ -70,7 +70,7 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         KeyboardInterrupt: it was stopped before all drives were examined; the map stays as it is.
     """
     folder, left_out = folder.resolve(), dict[str, str]()
-    before = _record(out, folder)
+    before = _read_record(out, folder)
     with cluster:
         search = Search(folder, settings, cluster, view or View())
         parts = search.drives(left_out)
@@ -79,28 +79,30 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         places = search.places(parts, left_out)
         parts = {name: parts[name] for name in places}
         index = search.index(parts)
-        made = _made_from(folder, settings, parts)
+        inputs = _map_inputs(folder, settings, parts)
         merged = None
-        if before is not None and _stands(before, out, made):
+        if before is not None and _is_up_to_date(before, out, inputs):
             joins = search.joins(parts, index, before.drives)
-            merged = _added(before, out, search, _sizes(places), joins, largest)
+            merged = _extend_map(before, out, search, _keyframe_counts(places), joins, largest)
         if merged is None:
-            merged = _anew(out, search, _sizes(places), search.joins(parts, index), largest)
-        others = [name for name in places if name not in merged.drives]
-        merged.left_out |= left_out | {name: f"no place in common with {next(iter(merged.drives))}" for name in others}
-        merged.made = {**made, "versions": {name: made["versions"][name] for name in merged.drives}}
-        write_json(_beside(out), asdict(merged))  # before Ray ends, which takes seconds
+            merged = _build_map(out, search, _keyframe_counts(places), search.joins(parts, index), largest)
+        unconnected = [name for name in places if name not in merged.drives]
+        merged.left_out |= left_out | {
+            name: f"no place in common with {next(iter(merged.drives))}" for name in unconnected
+        }
+        merged.made = {**inputs, "versions": {name: inputs["versions"][name] for name in merged.drives}}
+        write_json(_record_path(out), asdict(merged))  # before Ray ends, which takes seconds
     return merged
 
 
-def _beside(out: Path) -> Path:
+def _record_path(out: Path) -> Path:
     return out.with_name(f"{out.name}.json")
 
 
-def _record(out: Path, folder: Path) -> Merged | None:
+def _read_record(out: Path, folder: Path) -> Merged | None:
     """The record of the existing map. Only a map that a merge wrote may be changed, no other file."""
     try:
-        merged = TypeAdapter(Merged).validate_json(_beside(out).read_bytes())
+        merged = TypeAdapter(Merged).validate_json(_record_path(out).read_bytes())
     except (OSError, ValueError):
         merged = None
     if not out.exists():
@@ -116,7 +118,7 @@ def _record(out: Path, folder: Path) -> Merged | None:
     return merged
 
 
-def _made_from(folder: Path, settings: SlamSettings, parts: Mapping[str, Part]) -> dict[str, Any]:
+def _map_inputs(folder: Path, settings: SlamSettings, parts: Mapping[str, Part]) -> dict[str, Any]:
     """Everything that a map depends on."""
     text = json.dumps(settings.model_dump(mode="json"), sort_keys=True)
     return {
@@ -126,7 +128,7 @@ def _made_from(folder: Path, settings: SlamSettings, parts: Mapping[str, Part]) 
     }
 
 
-def _stands(before: Merged, out: Path, made: Mapping[str, Any]) -> bool:
+def _is_up_to_date(before: Merged, out: Path, inputs: Mapping[str, Any]) -> bool:
     """Whether the existing map contains exactly the recorded drives, made from the same inputs as now."""
     try:
         with MapStore.open(out, read_only=False) as store:  # this recovers the file after a killed merge
@@ -135,70 +137,72 @@ def _stands(before: Merged, out: Path, made: Mapping[str, Any]) -> bool:
         return False
     if size != sum(before.drives.values()):  # the map was written, but not its record
         return False
-    versions, old = made["versions"], before.made.get("versions", {})
+    versions, old = inputs["versions"], before.made.get("versions", {})
     if any(versions.get(name) != old.get(name) for name in before.drives):
         return False
-    return all(before.made.get(key) == made[key] for key in ("folder", "settings"))
+    return all(before.made.get(key) == inputs[key] for key in ("folder", "settings"))
 
 
-def _sizes(places: Mapping[str, Figures]) -> dict[str, int]:
+def _keyframe_counts(places: Mapping[str, Figures]) -> dict[str, int]:
     return {name: int(figures["keyframes"]) for name, figures in places.items()}
 
 
-def _added(before: Merged, out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join],
+def _extend_map(before: Merged, out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join],
            largest: int) -> Merged | None:  # fmt: skip
     """The map with the drives that are connected to it; None: it must be made again."""
     inside, rows = before.drives, {(row["drives"][0], row["drives"][1]): row for row in before.joins}
-    enough, refused = affirmed(_untried(before, joins))
-    together = component(sizes, enough, inside)
-    if not set(inside) <= set(together):
+    accepted, refused = accepted_and_rejected(_reject_contradicted(before, joins))
+    connected = component(sizes, accepted, inside)
+    if not set(inside) <= set(connected):
         return None
-    new = [name for name in together if name not in inside]
-    between = [join for join in enough if join.one in together]
+    new = [name for name in connected if name not in inside]
+    connected_joins = [join for join in accepted if join.one in connected]
     with ExitStack() as stack:
-        maps = _maps(new, search.folder, stack)
+        maps = _open_maps(new, search.folder, stack)
         store = stack.enter_context(MapStore.open(out, read_only=False))
         ties = [pair for pair, row in rows.items() if row["accepted"] and set(pair) <= set(inside)]
-        growth = grown(Standing(store, inside, ties, search.settings.pose_graph, largest), maps, between)
+        growth = grown(Standing(store, inside, ties, search.settings.pose_graph, largest), maps, connected_joins)
         if growth is None:
             return None
         if growth.maps:
             with store.together():
                 add_drives(store, inside, growth, refused)
     lost = joins_of(growth.judged.values(), inside)
-    elsewhere = [join for join in enough if join.one not in together]
-    found = _rows([*growth.joins, *refused, *elsewhere])
-    kept = [_less(row, lost) for pair, row in rows.items() if set(pair) <= set(inside)]
+    unconnected_joins = [join for join in accepted if join.one not in connected]
+    found = _rows([*growth.joins, *refused, *unconnected_joins])
+    kept = [_without_loops(row, lost) for pair, row in rows.items() if set(pair) <= set(inside)]
     drives = {**inside, **{name: sizes[name] for name in growth.maps}}
     return Merged(drives, {}, sorted([*kept, *found], key=lambda row: row["drives"]))
 
 
-def _anew(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join], largest: int) -> Merged:
+def _build_map(out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join], largest: int) -> Merged:
     """The map of the connected drives that have the most keyframes."""
-    enough, refused = affirmed(joins)
+    accepted, refused = accepted_and_rejected(joins)
     with ExitStack() as stack:
-        maps = _maps(sizes, search.folder, stack)
+        maps = _open_maps(sizes, search.folder, stack)
         while True:
-            region = solve(maps, enough, search.settings.pose_graph, largest)
-            enough, contradicted = affirmed(region.joins)
+            region = solve(maps, accepted, search.settings.pose_graph, largest)
+            accepted, contradicted = accepted_and_rejected(region.joins)
             refused += contradicted
             if not any(join.loop.ok for join in contradicted):  # else these drives would be tied by too few
                 break
-        together = component(sizes, enough)
-        moved = {name: replace(maps[name], poses=region.poses[name]) for name in together}
-        fresh = part_beside(out)
+        connected = component(sizes, accepted)
+        moved = {name: replace(maps[name], poses=region.poses[name]) for name in connected}
+        new_file = part_beside(out)
         try:
-            with named(out, fresh), MapStore.create(fresh) as store:
-                add_drives(store, {}, Growth(moved, enough), refused)
-            if not _beside(out).exists():  # without it the map would be taken for another program's, if this ends here
-                write_json(_beside(out), asdict(Merged({}, {})))
-            move_map(fresh, out)
+            with named(out, new_file), MapStore.create(new_file) as store:
+                add_drives(store, {}, Growth(moved, accepted), refused)
+            if not _record_path(
+                out
+            ).exists():  # without it the map would be taken for another program's, if this ends here
+                write_json(_record_path(out), asdict(Merged({}, {})))
+            move_map(new_file, out)
         finally:
-            remove_map(fresh)
-    return Merged({name: sizes[name] for name in together}, {}, _rows([*enough, *refused]))
+            remove_map(new_file)
+    return Merged({name: sizes[name] for name in connected}, {}, _rows([*accepted, *refused]))
 
 
-def _untried(before: Merged, joins: Sequence[Join]) -> list[Join]:
+def _reject_contradicted(before: Merged, joins: Sequence[Join]) -> list[Join]:
     """The joins, rejected if the existing map has contradicted those of the two drives."""
     refused = {(row["drives"][0], row["drives"][1]) for row in before.joins if row["accepted"] < ENOUGH}
     return [
@@ -209,7 +213,7 @@ def _untried(before: Merged, joins: Sequence[Join]) -> list[Join]:
     ]
 
 
-def _maps(names: Iterable[str], folder: Path, stack: ExitStack) -> dict[str, MapData]:
+def _open_maps(names: Iterable[str], folder: Path, stack: ExitStack) -> dict[str, MapData]:
     """The maps of drives, which stay open for their clouds; descriptors are read on demand."""
     stores = {name: stack.enter_context(MapStore.open(folder / name / MAP)) for name in names}
     return {name: load_map(store, descriptors=False) for name, store in stores.items()}
@@ -220,8 +224,10 @@ def _rows(joins: Sequence[Join]) -> list[dict[str, Any]]:
     for join in joins:
         pairs[join.one, join.other].append(join)
     return [
-        _row(pair, sum(join.loop.ok for join in both), Counter(_reason(join) for join in both if not join.loop.ok))
-        for pair, both in sorted(pairs.items())
+        _row(
+            pair, sum(join.loop.ok for join in of_pair), Counter(_reason(join) for join in of_pair if not join.loop.ok)
+        )
+        for pair, of_pair in sorted(pairs.items())
     ]
 
 
@@ -234,7 +240,9 @@ def _reason(join: Join) -> str:
     return "".join(c for c in join.loop.registration.reason if not c.isdigit())
 
 
-def _less(row: dict[str, Any], lost: Sequence[Join]) -> dict[str, Any]:
+def _without_loops(row: dict[str, Any], lost: Sequence[Join]) -> dict[str, Any]:
     """A row, updated after loops of its two drives turned out to be wrong."""
-    own = [join for join in lost if [join.one, join.other] == row["drives"]]
-    return _row(row["drives"], row["accepted"] - len(own), Counter(row["reasons"]) + Counter(map(_reason, own)))
+    lost_here = [join for join in lost if [join.one, join.other] == row["drives"]]
+    return _row(
+        row["drives"], row["accepted"] - len(lost_here), Counter(row["reasons"]) + Counter(map(_reason, lost_here))
+    )

@@ -93,29 +93,29 @@ def run_parts(
     progress = progress or Progress()
     found = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
     missing = [part for part in parts if part.name not in found]
-    for name, figures in _fresh(missing, out, workers, progress):
+    for name, figures in _do_missing(missing, out, workers, progress):
         found[name] = figures
         progress.part(name, len(found), len(parts))
     return {part.name: found[part.name] for part in parts}
 
 
-def _fresh(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -> Iterator[tuple[str, Figures]]:
+def _do_missing(parts: Sequence[Part], out: Path, workers: int, progress: Progress) -> Iterator[tuple[str, Figures]]:
     """Do the parts, and yield the figures of each as it ends."""
     if workers < 2 or len(parts) < 2:
         for part in parts:
-            yield part.name, _named(part, out, partial(progress.frame, part.name))
+            yield part.name, _do_with_named_errors(part, out, partial(progress.frame, part.name))
         return
     context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads only partly
     pool = ProcessPoolExecutor(workers, mp_context=context)
     try:
-        running = {pool.submit(_named, part, out): part.name for part in parts}
+        running = {pool.submit(_do_with_named_errors, part, out): part.name for part in parts}
         for future in as_completed(running):
             yield running[future], future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _named(part: Part, out: Path, advance: Advance = untold) -> Figures:
+def _do_with_named_errors(part: Part, out: Path, advance: Advance = untold) -> Figures:
     try:
         return do_part(part, out, advance)
     except Dpm2Error as error:
@@ -129,10 +129,10 @@ def do_part(part: Part, out: Path, advance: Advance = untold) -> Figures:
         Dpm2Error: it failed, or its results could not be written. A fresh part then leaves no files.
     """
     began = perf_counter()
-    with _folder(part, out) as folder:
+    with _work_folder(part, out) as folder:
         figures: Figures = resolve_name(part.work)(folder, advance, **part.arguments)
         record = {
-            **_asked(part),
+            **_request(part),
             "commit": git_commit(),
             "seconds": round(perf_counter() - began, 1),
             "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),  # of the process so far
@@ -140,18 +140,18 @@ def do_part(part: Part, out: Path, advance: Advance = untold) -> Figures:
             "figures": figures,
         }
         with atomic_write(folder / DONE) as file:
-            file.write(json.dumps(record, indent=1, default=_plain) + "\n")
-    return _read(record)
+            file.write(json.dumps(record, indent=1, default=_json_value) + "\n")
+    return _figures_in(record)
 
 
 def figures_of(part: Part, out: Path) -> Figures | None:
     """Figures of a part that ended; None if it has not ended, had another request, or is not complete."""
     try:
-        asked = json.loads(json.dumps(_asked(part), default=_plain))
+        request = json.loads(json.dumps(_request(part), default=_json_value))
         record = {"content": part.content, **json.loads((out / part.name / DONE).read_text(encoding="utf-8"))}
-        if any(record[key] != asked[key] for key in asked):
+        if any(record[key] != request[key] for key in request):
             return None
-        return _read(record) if is_whole(out / part.name) else None
+        return _figures_in(record) if is_whole(out / part.name) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -168,12 +168,12 @@ def is_whole(folder: Path) -> bool:
 def remove_attempts(part: Part, out: Path) -> None:
     """Remove the files of killed attempts; none may be running."""
     folder = out / part.name
-    for left in folder.parent.glob(f".{glob.escape(folder.name)}.*.attempt"):
-        shutil.rmtree(left, ignore_errors=True)
+    for attempt in folder.parent.glob(f".{glob.escape(folder.name)}.*.attempt"):
+        shutil.rmtree(attempt, ignore_errors=True)
 
 
 @contextmanager
-def _folder(part: Part, out: Path) -> Iterator[Path]:
+def _work_folder(part: Part, out: Path) -> Iterator[Path]:
     """The folder to work in: the part's own, or one that replaces it at the end of the block.
 
     No two attempts work in the same folder: a worker that was considered dead may still be running.
@@ -187,10 +187,10 @@ def _folder(part: Part, out: Path) -> Iterator[Path]:
     try:
         with explaining(folder):
             attempt.mkdir(parents=True)
-            made = attempt.stat().st_ino
+            inode = attempt.stat().st_ino
         yield attempt
         with explaining(folder):
-            if attempt.stat().st_ino != made:  # removed meanwhile, and made again by a later write
+            if attempt.stat().st_ino != inode:  # removed meanwhile, and made again by a later write
                 raise Dpm2Error(f"{attempt}: removed while it was written to")
             if figures_of(part, out) is None:  # else another attempt with the same result was first
                 if folder.exists():
@@ -206,16 +206,16 @@ def _sizes(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def _read(record: Mapping[str, Any]) -> Figures:
+def _figures_in(record: Mapping[str, Any]) -> Figures:
     return {**record["figures"], "part": {key: record[key] for key in ("commit", "seconds", "peak_memory_mb")}}
 
 
-def _plain(argument: object) -> object:
+def _json_value(argument: object) -> object:
     """Convert an object that JSON cannot represent."""
     return argument.model_dump(mode="json") if isinstance(argument, Settings) else str(argument)
 
 
-def _asked(part: Part) -> dict[str, Any]:
+def _request(part: Part) -> dict[str, Any]:
     inputs = {str(path): _digest(path) for path in part.inputs}
     return {"arguments": dict(part.arguments), "inputs": inputs, "content": part.content}
 
@@ -224,10 +224,10 @@ def _digest(path: Path) -> str | None:
     if not path.is_file():
         return None
     stat = path.stat()
-    return _hashed(path, stat.st_mtime_ns, stat.st_size)
+    return _file_hash(path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache
-def _hashed(path: Path, mtime_ns: int, size: int) -> str:
+def _file_hash(path: Path, mtime_ns: int, size: int) -> str:
     """SHA-256 of a file, cached: many parts read the same weights. `mtime_ns` and `size`: its current ones."""
     return file_digest(path)

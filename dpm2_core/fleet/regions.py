@@ -25,7 +25,7 @@ from dpm2_core.slam.store.map_data import MapData
 
 LARGEST = 20_000
 """Most keyframes of a region."""
-_MOVED = 1e-3  # m and rad: if the borders moved by less, the region is not solved again
+_MAX_BORDER_MOTION = 1e-3  # m and rad: if the borders moved by less, the region is not solved again
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +87,12 @@ def solve(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSe
             inner[owner[join.one]].append(join)
         else:
             outer.append(join)
-    solved = [_region({name: maps[name] for name in names}, inner[number], settings)
+    solved = [_solve_region({name: maps[name] for name in names}, inner[number], settings)
               for number, names in enumerate(regions)]  # fmt: skip
     poses = {name: T for region in solved for name, T in region.poses.items()}
     checked: list[Join] = []
     if outer:
-        poses, checked = _borders(maps, solved, inner, outer, settings)
+        poses, checked = _solve_borders(maps, solved, inner, outer, settings)
     return Region(poses, [*(join for region in solved for join in region.joins), *checked])
 
 
@@ -101,8 +101,8 @@ def side_by_side(maps: Mapping[str, MapData], joins: Sequence[Join]) -> MapData:
     first = first_nodes(sizes_of(maps))
     loops = [join.loop_at(first) for join in joins]
     drives = list(maps.values())
-    both = _halved(drives)
-    return replace(both, edges=[*both.edges, *loops], georeference=drives[0].georeference)
+    merged = _merge_in_halves(drives)
+    return replace(merged, edges=[*merged.edges, *loops], georeference=drives[0].georeference)
 
 
 def sizes_of(maps: Mapping[str, MapData]) -> dict[str, int]:
@@ -121,15 +121,15 @@ def owners(nodes: Sequence[int], first: Mapping[str, int]) -> list[str]:
     return [names[number] for number in np.searchsorted(list(first.values()), nodes, side="right") - 1]
 
 
-def _halved(maps: Sequence[MapData]) -> MapData:
+def _merge_in_halves(maps: Sequence[MapData]) -> MapData:
     """One map of several, merged in halves, so that reading a cloud takes few calls, however many maps there are."""
     if len(maps) == 1:
         return maps[0]
     half = len(maps) // 2
-    return merge_maps(_halved(maps[:half]), _halved(maps[half:]), np.eye(4))
+    return merge_maps(_merge_in_halves(maps[:half]), _merge_in_halves(maps[half:]), np.eye(4))
 
 
-def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
+def _solve_region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: RobustSettings,
             held: Mapping[tuple[str, int], Array] | None = None) -> Region:  # fmt: skip
     """Solve drives and their joins; `held`: (4, 4) poses of nodes that are fixed."""
     data, first = side_by_side(maps, joins), first_nodes(sizes_of(maps))
@@ -141,54 +141,58 @@ def _region(maps: Mapping[str, MapData], joins: Sequence[Join], settings: Robust
     verdicts = {(loop.from_node, loop.to_node): loop.registration for loop in graph.loops}
     loops = [join.loop_at(first) for join in joins]
     out = [join.judged(verdicts[loop.from_node, loop.to_node]) for join, loop in zip(joins, loops, strict=True)]
-    return Region({name: graph.poses[at : at + len(maps[name])] for name, at in first.items()}, out)
+    return Region({name: graph.poses[begin : begin + len(maps[name])] for name, begin in first.items()}, out)
 
 
-def _borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mapping[int, Sequence[Join]],
+def _solve_borders(maps: Mapping[str, MapData], solved: Sequence[Region], inner: Mapping[int, Sequence[Join]],
              outer: Sequence[Join], settings: RobustSettings) -> tuple[dict[str, Array], list[Join]]:  # fmt: skip
     """Poses of all drives from those of the regions, and the checked joins between the regions."""
     ends = {(join.one, join.loop.from_node) for join in outer} | {(join.other, join.loop.to_node) for join in outer}
-    graph, where = PoseGraph(settings), dict[tuple[str, int], int]()
+    graph, border_node = PoseGraph(settings), dict[tuple[str, int], int]()
     for region in solved:
         own = {name: maps[name] for name in region.poses}
         data = side_by_side(own, [join for join in region.joins if join.loop.ok])
         first = first_nodes(sizes_of(own))
         data = replace(data, poses=np.concatenate([region.poses[name] for name in own]))
-        within = PoseGraph(settings)
-        restore(within, data)
+        region_graph = PoseGraph(settings)
+        restore(region_graph, data)
         nodes = {end: first[end[0]] + end[1] for end in sorted(ends) if end[0] in own}
-        order = sorted(nodes, key=lambda end: (within.part(nodes[end]), end))
-        tied = [pair for pair in pairwise(order) if len({within.part(nodes[end]) for end in pair}) == 1]
-        covariances = within.relative_covariances([(nodes[a], nodes[b]) for a, b in tied])
-        steps = {pair[1]: (pair[0], covariance) for pair, covariance in zip(tied, covariances, strict=True)}
+        order = sorted(nodes, key=lambda end: (region_graph.part(nodes[end]), end))
+        connected_pairs = [
+            pair for pair in pairwise(order) if len({region_graph.part(nodes[end]) for end in pair}) == 1
+        ]
+        covariances = region_graph.relative_covariances([(nodes[a], nodes[b]) for a, b in connected_pairs])
+        steps = {pair[1]: (pair[0], covariance) for pair, covariance in zip(connected_pairs, covariances, strict=True)}
         for end in order:
-            where[end], step = len(graph), None
+            border_node[end], step = len(graph), None
             if end in steps:
-                before, covariance = steps[end]
-                T = se3.inverse(data.poses[nodes[before]]) @ data.poses[nodes[end]]
-                step = Edge("odometry", where[before], where[end], Registration(T, covariance))
+                previous, covariance = steps[end]
+                T = se3.inverse(data.poses[nodes[previous]]) @ data.poses[nodes[end]]
+                step = Edge("odometry", border_node[previous], border_node[end], Registration(T, covariance))
             graph.add_node(region.poses[end[0]][end[1]], step)
     for join in outer:
-        graph.add_loop(join.loop.between(where[join.one, join.loop.from_node], where[join.other, join.loop.to_node]))
+        graph.add_loop(
+            join.loop.between(border_node[join.one, join.loop.from_node], border_node[join.other, join.loop.to_node])
+        )
     graph.optimize()
     checked = [join.judged(loop.registration) for join, loop in zip(outer, graph.loops, strict=True)]
     poses: dict[str, Array] = {}
     for number, region in enumerate(solved):
-        held = {end: graph.pose(node) for end, node in where.items() if end[0] in region.poses}
-        poses |= _moved(maps, region, inner[number], held, settings)
+        held = {end: graph.pose(node) for end, node in border_node.items() if end[0] in region.poses}
+        poses |= _update_poses(maps, region, inner[number], held, settings)
     return poses, checked
 
 
-def _moved(maps: Mapping[str, MapData], region: Region, joins: Sequence[Join],
+def _update_poses(maps: Mapping[str, MapData], region: Region, joins: Sequence[Join],
            held: Mapping[tuple[str, int], Array], settings: RobustSettings) -> dict[str, Array]:  # fmt: skip
     """Poses of a region whose borders have moved: moved rigidly, or solved again if that is not enough."""
     if not held:
         return region.poses
-    moves = [T @ se3.inverse(region.poses[name][node]) for (name, node), T in held.items()]
-    shift = moves[0]
-    poses = {name: shift @ T for name, T in region.poses.items()}
-    if max(np.abs(poses[name][node] - T).max() for (name, node), T in held.items()) <= _MOVED:
+    motions = [T @ se3.inverse(region.poses[name][node]) for (name, node), T in held.items()]
+    T_new_old = motions[0]
+    poses = {name: T_new_old @ T for name, T in region.poses.items()}
+    if max(np.abs(poses[name][node] - T).max() for (name, node), T in held.items()) <= _MAX_BORDER_MOTION:
         return poses
     own = {name: replace(maps[name], poses=poses[name]) for name in region.poses}
     kept = [join for join, after in zip(joins, region.joins, strict=True) if after.loop.ok]
-    return _region(own, kept, settings, held).poses
+    return _solve_region(own, kept, settings, held).poses

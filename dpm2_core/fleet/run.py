@@ -41,14 +41,14 @@ def carry_out(parts: Sequence[Part], out: Path, cluster: Cluster, view: View | N
     """
     out = out.resolve()  # a worker has another working directory
     make_folder(out)
-    _write(out, list(_before(parts, out).values()))
+    _write_summary(out, list(_initial_outcomes(parts, out).values()))
     with cluster:
         found = do_parts(parts, out, cluster, view or View())
-    _write(out, found)
+    _write_summary(out, found)
     return found
 
 
-def _write(out: Path, outcomes: Sequence[Outcome]) -> None:
+def _write_summary(out: Path, outcomes: Sequence[Outcome]) -> None:
     write_json(out / SUMMARY, {"drives": [outcome._asdict() for outcome in outcomes]})
 
 
@@ -67,7 +67,7 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     Args:
         out: absolute.
     """
-    outcomes = _before(parts, out)
+    outcomes = _initial_outcomes(parts, out)
     missing = [part for part in parts if outcomes[part.name].state == "stopped"]
     view.begun([part.name for part in missing])
     try:
@@ -82,7 +82,7 @@ def do_parts(parts: Sequence[Part], out: Path, cluster: Cluster, view: View) -> 
     return list(outcomes.values())
 
 
-def _before(parts: Sequence[Part], out: Path) -> dict[str, Outcome]:
+def _initial_outcomes(parts: Sequence[Part], out: Path) -> dict[str, Outcome]:
     """The outcome of each part before anything is done: complete ones are kept."""
     found = {part.name: figures_of(part, out) for part in parts}
     return {name: Outcome(name, "stopped" if row is None else "kept", row) for name, row in found.items()}

@@ -29,8 +29,8 @@ from dpm2_core.network.pretrained import weights_id
 from dpm2_core.slam.loops.retrieval import Vector
 from dpm2_core.slam.settings import SlamSettings
 
-_KEPT = ".merge"
-_CANDIDATES = 8
+_RESULTS_FOLDER = ".merge"
+_CANDIDATES_PER_KEYFRAME = 8
 """Similar places that are found for each keyframe."""
 
 
@@ -50,7 +50,7 @@ class Search:
     @property
     def kept(self) -> Path:
         """Folder of the stored results."""
-        return self.folder / _KEPT
+        return self.folder / _RESULTS_FOLDER
 
     def drives(self, left_out: dict[str, str]) -> dict[str, Part]:
         """The part that reads the places of each complete drive, in the order of their names."""
@@ -74,7 +74,7 @@ class Search:
         own = weights_id(self.settings.neural.weights)
         found: dict[str, Figures] = {}
         drives: dict[bytes, str] = {}  # by all their places: these are equal only for copies of a recording
-        outcomes = self._done(list(parts.values()))
+        outcomes = self._run_parts(list(parts.values()))
         for name, outcome in zip(parts, outcomes, strict=True):
             if outcome.figures is None:
                 left_out[name] = outcome.reason
@@ -93,13 +93,14 @@ class Search:
         index = FleetIndex(self.kept)
         versions = {name: part.arguments["version"] for name, part in parts.items()}
         if any(
-            versions.get(name) != version or not self._candidates(name).is_file() for name, version, _ in index.drives
+            versions.get(name) != version or not self._candidates_path(name).is_file()
+            for name, version, _ in index.drives
         ):
             index.clear()  # a drive is missing or has changed, or its candidates are missing
         new = [name for name in parts if name not in {known for known, *_ in index.drives}]
         for name in new:
             vectors = vectors_of(self.kept, name)
-            write_json(self._candidates(name), _candidates(index, vectors))
+            write_json(self._candidates_path(name), _find_candidates(index, vectors))
             index.add(name, versions[name], vectors)
         if new:
             index.save()
@@ -113,15 +114,15 @@ class Search:
         """
         maps = {name: part.arguments for name, part in parts.items()}
         work: dict[str, tuple[Part, str, str]] = {}
-        outside = False
+        outside_found = False
         for name, *_ in index.drives:
-            outside |= name not in inside
-            for one, rows in (self._pairs(name) if outside else {}).items():
+            outside_found |= name not in inside
+            for one, rows in (self._read_candidates(name) if outside_found else {}).items():
                 if one not in inside or name not in inside:
                     for number, stretch in enumerate(stretches(one, name, np.array(rows))):
                         part = join_part(number, stretch, maps, self.settings)
                         work[part.name] = part, one, name
-        outcomes = self._done([part for part, *_ in work.values()])
+        outcomes = self._run_parts([part for part, *_ in work.values()])
         if failed := [outcome for outcome in outcomes if outcome.figures is None]:
             raise Dpm2Error(f"{len(failed)} of {len(work)} stretches failed: {failed[0].name}: {failed[0].reason}")
         found: dict[tuple[str, str, int, int], Join] = {}
@@ -134,36 +135,36 @@ class Search:
                     found[key] = join
         return list(found.values())
 
-    def _done(self, parts: Sequence[Part]) -> list[Outcome]:
+    def _run_parts(self, parts: Sequence[Part]) -> list[Outcome]:
         outcomes = do_parts(parts, self.kept, self.cluster, self.view)
         if any(outcome.state == "stopped" for outcome in outcomes):
             raise KeyboardInterrupt  # else the map would lose the drives that were not examined
         return outcomes
 
-    def _candidates(self, name: str) -> Path:
+    def _candidates_path(self, name: str) -> Path:
         return self.kept / "candidates" / f"{name}.json"
 
-    def _pairs(self, name: str) -> dict[str, list[list[int]]]:
+    def _read_candidates(self, name: str) -> dict[str, list[list[int]]]:
         """The candidates of a drive, as `index` wrote them."""
-        path = self._candidates(name)
+        path = self._candidates_path(name)
         try:
             return TypeAdapter(dict[str, list[list[int]]]).validate_json(path.read_bytes())
         except (OSError, ValueError):
             raise Dpm2Error(f"{path}: damaged; remove the folder {self.kept}, and it is made again") from None
 
 
-def _candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:
+def _find_candidates(index: FleetIndex, vectors: Vector) -> dict[str, list[list[int]]]:
     """For each drive in the index: pairs of its node and the node of the new drive that look alike."""
     first = first_nodes({name: count for name, _, count in index.drives})
     out: dict[str, list[list[int]]] = defaultdict(list)
-    for node, found in enumerate(index.similar(vectors, _CANDIDATES)):
+    for node, found in enumerate(index.similar(vectors, _CANDIDATES_PER_KEYFRAME)):
         places = found[found >= 0].tolist()
         for place, name in zip(places, owners(places, first), strict=True):
             out[name].append([place - first[name], node])
     return out
 
 
-def affirmed(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
+def accepted_and_rejected(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
     """The accepted loops of pairs of drives that have enough of them; and all others, with the reason."""
     by_pair: dict[tuple[str, str], list[Join]] = defaultdict(list)
     rejected = []
@@ -172,15 +173,15 @@ def affirmed(joins: Sequence[Join]) -> tuple[list[Join], list[Join]]:
             by_pair[join.one, join.other].append(join)
         else:
             rejected.append(join)
-    enough: list[Join] = []
+    accepted: list[Join] = []
     for of_pair in by_pair.values():
         nodes = {join.loop.to_node for join in of_pair}
         if len(nodes) >= ENOUGH:
-            enough += of_pair
+            accepted += of_pair
         else:
             reason = f"only {len(nodes)} keyframes of the two drives agree, {ENOUGH} must"
             rejected += [replace(join, loop=join.loop.rejected(reason)) for join in of_pair]
-    return enough, rejected
+    return accepted, rejected
 
 
 def component(sizes: Mapping[str, int], joins: Sequence[Join], inside: Collection[str] = ()) -> list[str]:

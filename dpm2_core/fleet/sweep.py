@@ -16,7 +16,7 @@ from dpm2_core.fleet.part import Outcome, Part
 from dpm2_core.tables import FigureTable
 
 _COMMA = re.compile(r",(?![^\[{]*[\]}])")  # not within a list or a mapping
-_MEANS = {"t_err %": "t_err_percent", "APE m": "ape_rmse_m", "RPE m": "rpe_trans_m"}
+_MEAN_COLUMNS = {"t_err %": "t_err_percent", "APE m": "ape_rmse_m", "RPE m": "rpe_trans_m"}
 
 
 def variants(settings: Sequence[str]) -> dict[str, list[str]]:
@@ -26,8 +26,8 @@ def variants(settings: Sequence[str]) -> dict[str, list[str]]:
         UsageError: a key has no values, or is given twice.
     """
     keys = [_key(setting) for setting in settings]
-    if twice := {key for key in keys if keys.count(key) > 1}:
-        raise UsageError(f"--set {min(twice)}: given twice; give all its values at once, with commas")
+    if duplicates := {key for key in keys if keys.count(key) > 1}:
+        raise UsageError(f"--set {min(duplicates)}: given twice; give all its values at once, with commas")
     out = {}
     for values in product(*(_values(setting) for setting in settings)):
         chosen = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
@@ -68,13 +68,15 @@ def sweep_table(title: str, names: Sequence[str], outcomes: Sequence[Outcome]) -
     """A row for each combination: means over the drives that are complete with all of them, the same for each row."""
     found = {outcome.name: outcome.figures for outcome in outcomes if outcome.figures is not None}
     drives = dict.fromkeys(outcome.name.partition("/")[2] for outcome in outcomes)
-    whole = [drive for drive in drives if all(f"{name}/{drive}" in found for name in names)]
-    caption = f"means over {len(whole)} of {len(drives)} drives: those that are complete with all settings"
-    table = FigureTable(title, names=["settings"], figures=["failed", *_MEANS, "breaks", "loops", "s"], caption=caption)
+    complete = [drive for drive in drives if all(f"{name}/{drive}" in found for name in names)]
+    caption = f"means over {len(complete)} of {len(drives)} drives: those that are complete with all settings"
+    table = FigureTable(
+        title, names=["settings"], figures=["failed", *_MEAN_COLUMNS, "breaks", "loops", "s"], caption=caption
+    )
     for name in names:
-        rows = [found[f"{name}/{drive}"] or {} for drive in whole]
+        rows = [found[f"{name}/{drive}"] or {} for drive in complete]
         metrics = [row["metrics"] or {} for row in rows]
-        means = [_mean([one.get(key) for one in metrics]) for key in _MEANS.values()]
+        means = [_mean([one.get(key) for one in metrics]) for key in _MEAN_COLUMNS.values()]
         failed = sum(f"{name}/{drive}" not in found for drive in drives)
         sums = sum(row["breaks"] for row in rows), sum(row["loops"]["accepted"] for row in rows)
         seconds = sum(row["part"]["seconds"] for row in rows)

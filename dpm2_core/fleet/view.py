@@ -16,7 +16,7 @@ from dpm2_core.fleet.cluster import Status
 from dpm2_core.fleet.part import Outcome
 from dpm2_core.fleet.run import View
 
-_ROWS = 30
+_MAX_ROWS = 30
 """Running drives that are shown at once."""
 
 
@@ -46,26 +46,26 @@ class TerminalView(View):
         """As `View`."""
         self._status = status
         if self._console.is_terminal:
-            self._live.update(self._picture())
+            self._live.update(self._running_table())
 
     def ended(self, outcome: Outcome) -> None:
         """As `View`."""
         self._ended[outcome.name] = outcome
         count = f"{len(self._ended)} of {len(self._names)}"
-        words = f"failed: {outcome.reason}" if outcome.reason else "done"
-        self._console.print(f"{outcome.name}: {words} ({count})", style="red" if outcome.reason else "", soft_wrap=True)
+        text = f"failed: {outcome.reason}" if outcome.reason else "done"
+        self._console.print(f"{outcome.name}: {text} ({count})", style="red" if outcome.reason else "", soft_wrap=True)
 
-    def _picture(self) -> Group:
+    def _running_table(self) -> Group:
         table = Table(box=None, header_style="dim")
         for heading in ("drive", "", "frames", "attempt", "worker"):
             table.add_column(heading, no_wrap=True)
         running = [name for name in self._names if name in self._status and name not in self._ended]
-        for name in running[:_ROWS]:
-            now = self._status[name]
-            bar = ProgressBar(total=now.total or None, completed=now.done, width=24)
-            count = f"{now.done}/{now.total}" if now.total else "begins"
-            table.add_row(Text(name), bar, count, str(now.attempts), Text(now.where))
+        for name in running[:_MAX_ROWS]:
+            status = self._status[name]
+            bar = ProgressBar(total=status.total or None, completed=status.done, width=24)
+            count = f"{status.done}/{status.total}" if status.total else "begins"
+            table.add_row(Text(name), bar, count, str(status.attempts), Text(status.where))
         failed = sum(bool(outcome.reason) for outcome in self._ended.values())
         waiting = len(self._names) - len(running) - len(self._ended)
-        words = f"{len(running)} run, {waiting} wait, {len(self._ended)} ended, {failed} of them failed"
-        return Group(table, Text(words))
+        summary = f"{len(running)} run, {waiting} wait, {len(self._ended)} ended, {failed} of them failed"
+        return Group(table, Text(summary))

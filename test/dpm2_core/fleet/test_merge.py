@@ -360,7 +360,7 @@ def test_late_places_and_those_in_the_graph_are_found_alike(
 ) -> None:
     """This holds for any order, and for a kept or damaged index; an index whose saving was interrupted continues."""
     pytest.importorskip("faiss", reason="no faiss: pip install 'dpm2_ros[fleet]'")
-    monkeypatch.setattr("dpm2_core.fleet.places._LATE", 120)
+    monkeypatch.setattr("dpm2_core.fleet.places._MAX_OUTSIDE_GRAPH", 120)
     drives = [noise.normal(size=(50, WIDTH)).astype(np.float32) for _ in range(5)]
     again = [vectors + 0.05 * noise.normal(size=vectors.shape).astype(np.float32) for vectors in drives]
 
