@@ -12,7 +12,7 @@ from dpm2_core.errors import UsageError
 
 MIN_POINTS = 50
 """A scan with fewer points is rejected: a normal needs ten."""
-_CELLS = 2**20  # along each axis; a cell index of three axes fits into 63 bits
+_CELLS_PER_AXIS = 2**20  # a cell index of three axes fits into 63 bits
 
 
 def window(
@@ -37,8 +37,8 @@ def window(
     pairs = []
     for t, cloud in enumerate(clouds):
         weight = cloud.new_ones(cloud.shape[:1]) if weights is None else weights[t]
-        _check(cloud, weight, f"{name}, scan {t}")
-        keep = _downsampled(cloud.detach(), weight.detach(), count, voxel)
+        _check_scan(cloud, weight, f"{name}, scan {t}")
+        keep = _kept_indices(cloud.detach(), weight.detach(), count, voxel)
         # A scan without any weight keeps one point, so that it stays in the window, with a (zero) gradient of weights.
         kept = cloud[keep] if len(keep) else cloud[:1].nan_to_num(0.0, 0.0, 0.0)
         pairs.append((kept.double(), (weight[keep] if len(keep) else weight[:1]).double()))
@@ -48,7 +48,7 @@ def window(
     )
 
 
-def _check(cloud: Tensor, weight: Tensor, where: str) -> None:
+def _check_scan(cloud: Tensor, weight: Tensor, where: str) -> None:
     if cloud.ndim != 2 or cloud.shape[1] != 3 or not cloud.is_floating_point():
         raise UsageError(f"{where}: want floating-point points (N, 3), found {tuple(cloud.shape)} {cloud.dtype}")
     if len(cloud) < MIN_POINTS:
@@ -56,15 +56,15 @@ def _check(cloud: Tensor, weight: Tensor, where: str) -> None:
     if weight.shape != cloud.shape[:1]:
         raise UsageError(f"{where}: weights {tuple(weight.shape)} for {len(cloud)} points")
     # Padding may contain any values; the common case costs one synchronization with the device.
-    bad = ~cloud.detach().isfinite().all(1) & (weight.detach() != 0)
-    wrong = ~((weight.detach() >= 0) & (weight.detach() <= 1))
-    if bool((bad | wrong).any()):
-        if bool(bad.any()):
-            raise UsageError(f"{where}: {int(bad.sum())} of its {len(cloud)} points are not finite")
-        raise UsageError(f"{where}: {int(wrong.sum())} of its {len(cloud)} weights are not in 0..1")
+    bad_points = ~cloud.detach().isfinite().all(1) & (weight.detach() != 0)
+    bad_weights = ~((weight.detach() >= 0) & (weight.detach() <= 1))
+    if bool((bad_points | bad_weights).any()):
+        if bool(bad_points.any()):
+            raise UsageError(f"{where}: {int(bad_points.sum())} of its {len(cloud)} points are not finite")
+        raise UsageError(f"{where}: {int(bad_weights.sum())} of its {len(cloud)} weights are not in 0..1")
 
 
-def _downsampled(points: Tensor, weight: Tensor, count: int, voxel: float) -> Tensor:
+def _kept_indices(points: Tensor, weight: Tensor, count: int, voxel: float) -> Tensor:
     """Indices of the points to keep, in their own order."""
     index = weight.nonzero()[:, 0]
     if len(index) <= count:
@@ -73,8 +73,10 @@ def _downsampled(points: Tensor, weight: Tensor, count: int, voxel: float) -> Te
     generator = torch.Generator().manual_seed(len(points))
     order = torch.randperm(len(points), generator=generator).to(index.device)
     index = order[weight[order] != 0]
-    cell = (points[index] / voxel).floor().long().clamp(-_CELLS // 2, _CELLS // 2 - 1) + _CELLS // 2
-    key, by_cell = ((cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]).sort(stable=True)
+    cell = (points[index] / voxel).floor().long().clamp(
+        -_CELLS_PER_AXIS // 2, _CELLS_PER_AXIS // 2 - 1
+    ) + _CELLS_PER_AXIS // 2
+    key, by_cell = ((cell[:, 0] * _CELLS_PER_AXIS + cell[:, 1]) * _CELLS_PER_AXIS + cell[:, 2]).sort(stable=True)
     first = torch.ones_like(key, dtype=torch.bool)
     first[1:] = key[1:] != key[:-1]
     return index[by_cell[first].sort()[0][:count]].sort()[0]

@@ -20,8 +20,8 @@ from dpm2_core.diffslam.neighbors import NeighborSearch
 from dpm2_core.diffslam.soft_lm import SoftLmSettings, solve
 from dpm2_core.geometry import se3_torch
 
-_NEIGHBORS = 10  # points of a cloud whose plane gives a normal
-_LEAST_GAP = 1e-3  # of eigenvalues, in units of their sum
+_NORMAL_NEIGHBORS = 10  # points of a cloud whose plane gives a normal
+_MIN_GAP = 1e-3  # of eigenvalues, in units of their sum
 
 
 class IcpSettings(Settings):
@@ -89,8 +89,8 @@ class Matching:
         moved = se3_torch.transform(T[:, 0].detach(), source.points.detach())
         index = target.search.nearest(moved)[..., 0]
         matched = _gather(target.points, index)
-        near = (matched.detach() - moved).norm(dim=-1) <= self._settings.max_distance
-        weights = source.weights * target.weights.gather(1, index) * near
+        is_near = (matched.detach() - moved).norm(dim=-1) <= self._settings.max_distance
+        weights = source.weights * target.weights.gather(1, index) * is_near
         return _PlaneResiduals(source.points, matched, _gather(target.normals, index), weights, self._settings)
 
 
@@ -148,18 +148,20 @@ def _normals(points: Tensor, weights: Tensor, search: NeighborSearch) -> Tensor:
     They have the gradient of the eigenvector to first order: without it the derivative by one point is a third off. The
     gap to the other eigenvalues is bounded away from zero, as for neighborhoods on a line, which have no normal.
     """
-    at = points.detach()
-    index = search.nearest(torch.where(weights.detach()[..., None] > 0, at, torch.zeros_like(at)), _NEIGHBORS)
+    positions = points.detach()
+    index = search.nearest(
+        torch.where(weights.detach()[..., None] > 0, positions, torch.zeros_like(positions)), _NORMAL_NEIGHBORS
+    )
     flat = index.flatten(1)
-    near = _gather(points, flat).unflatten(1, index.shape[1:])
+    neighbors = _gather(points, flat).unflatten(1, index.shape[1:])
     w = weights.gather(1, flat).unflatten(1, index.shape[1:])[..., None]
     w = w / w.sum(-2, keepdim=True).clamp(min=1e-12)
-    centered = near - (w * near).sum(-2, keepdim=True)
+    centered = neighbors - (w * neighbors).sum(-2, keepdim=True)
     C = (w * centered).mT @ centered
     with torch.no_grad():
         values, vectors = torch.linalg.eigh(C)
         gap = values[..., :1] - values[..., 1:]
-        inverse_gap = gap / (gap**2 + (_LEAST_GAP * values.sum(-1, keepdim=True)) ** 2).clamp(min=1e-18)
+        inverse_gap = gap / (gap**2 + (_MIN_GAP * values.sum(-1, keepdim=True)) ** 2).clamp(min=1e-18)
         normal, others = vectors[..., :1], vectors[..., 1:]
-    turn = inverse_gap[..., None] * (others.mT @ (C - C.detach()) @ normal)  # zero, except for its gradient
-    return (normal + others @ turn)[..., 0]
+    correction = inverse_gap[..., None] * (others.mT @ (C - C.detach()) @ normal)  # zero, except for its gradient
+    return (normal + others @ correction)[..., 0]

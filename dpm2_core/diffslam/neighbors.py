@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-_CHUNK = 2**27  # distances at once, 1 GiB in float64
+_MAX_DISTANCES = 2**27  # distances at once, 1 GiB in float64
 
 
 class NeighborSearch:
@@ -36,9 +36,9 @@ class NeighborSearch:
     def nearest(self, queries: Tensor, k: int = 1) -> Tensor:
         """(B, M, k) indices of the k points nearest to queries (B, M, 3); a cloud with fewer repeats the nearest."""
         queries = queries.detach()
-        return self._by_tree(queries, k) if self._trees else nearest_by_distance(queries, self._points, k)
+        return self._nearest_by_tree(queries, k) if self._trees else nearest_by_distance(queries, self._points, k)
 
-    def _by_tree(self, queries: Tensor, k: int) -> Tensor:
+    def _nearest_by_tree(self, queries: Tensor, k: int) -> Tensor:
         out = torch.empty(*queries.shape[:2], k, dtype=torch.int64)
         for b, (tree, index) in enumerate(self._trees):
             found = tree.query(queries[b].numpy(), [*range(1, k + 1)], workers=torch.get_num_threads())[1]
@@ -52,7 +52,7 @@ def nearest_by_distance(queries: Tensor, points: Tensor, k: int) -> Tensor:
     As `NeighborSearch.nearest`.
     """
     B, N = points.shape[:2]
-    rows = max(1, _CHUNK // (B * N))
+    rows = max(1, _MAX_DISTANCES // (B * N))
     found = []
     for part in queries.split(rows, 1):
         # The fast form, |a|^2 + |b|^2 - 2ab, loses centimeters 100 m away.

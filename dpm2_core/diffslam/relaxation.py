@@ -58,35 +58,39 @@ class _Graph:
     def associate(self, T: Tensor) -> _Graph:
         return self
 
-    def _ends(self, T: Tensor) -> tuple[Tensor, Tensor]:
+    def _end_poses(self, T: Tensor) -> tuple[Tensor, Tensor]:
         poses = torch.cat([self._first[None], T[0]])
         return poses[self._edges[:, 0]], poses[self._edges[:, 1]]
 
-    def _residual(self, found: Tensor) -> Tensor:
+    def _residual(self, relative: Tensor) -> Tensor:
         """(E, 6) scaled residuals of the relative poses found (E, 4, 4)."""
         Z = self._measured
-        w = se3_torch.log_rotation(Z[:, :3, :3].mT @ found[:, :3, :3])
-        return self._scale * torch.cat([w, found[:, :3, 3] - Z[:, :3, 3]], -1)
+        w = se3_torch.log_rotation(Z[:, :3, :3].mT @ relative[:, :3, :3])
+        return self._scale * torch.cat([w, relative[:, :3, 3] - Z[:, :3, 3]], -1)
 
     def cost(self, T: Tensor) -> Tensor:
-        target, source = self._ends(T)
+        target, source = self._end_poses(T)
         r = self._residual(se3_torch.inverse(target) @ source)
         return (self._share * (r * r).sum(-1)).sum()[None]
 
     def normal_equations(self, T: Tensor) -> tuple[Tensor, Tensor]:
-        target, source = self._ends(T)
-        found = se3_torch.inverse(target) @ source
-        r = self._residual(found)
-        R, zero = found[:, :3, :3], torch.zeros_like(found[:, :3, :3])
+        target, source = self._end_poses(T)
+        relative = se3_torch.inverse(target) @ source
+        r = self._residual(relative)
+        R, zero = relative[:, :3, :3], torch.zeros_like(relative[:, :3, :3])
         J_r = se3_torch.inverse_right_jacobian(r[:, :3] / self._scale[:3])
         eye = torch.eye(3, dtype=R.dtype, device=R.device).expand_as(R)
-        by_source = torch.cat([torch.cat([J_r, zero], -1), torch.cat([zero, R], -1)], -2)
-        by_target = torch.cat(
-            [torch.cat([-J_r @ R.mT, zero], -1), torch.cat([se3_torch.hat(found[:, :3, 3]), -eye], -1)], -2
+        J_source = torch.cat([torch.cat([J_r, zero], -1), torch.cat([zero, R], -1)], -2)
+        J_target = torch.cat(
+            [torch.cat([-J_r @ R.mT, zero], -1), torch.cat([se3_torch.hat(relative[:, :3, 3]), -eye], -1)], -2
         )
         # Each edge's blocks, put into its columns; those of the first pose, which is fixed, are dropped.
-        target_is, source_is = torch.nn.functional.one_hot(self._edges, T.shape[1] + 1)[..., 1:].to(R.dtype).unbind(1)
-        J = torch.einsum("eij,ek->eikj", by_target, target_is) + torch.einsum("eij,ek->eikj", by_source, source_is)
+        target_columns, source_columns = (
+            torch.nn.functional.one_hot(self._edges, T.shape[1] + 1)[..., 1:].to(R.dtype).unbind(1)
+        )
+        J = torch.einsum("eij,ek->eikj", J_target, target_columns) + torch.einsum(
+            "eij,ek->eikj", J_source, source_columns
+        )
         J = (self._scale[:, None] * J.flatten(2)).flatten(0, 1)
         WJ = self._share.repeat_interleave(6)[:, None] * J
         return (WJ.mT @ J)[None], (WJ.mT @ r.flatten())[None]

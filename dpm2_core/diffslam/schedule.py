@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpm2_core.config import Settings
 
-_LEAST = 1e-12  # a SLAM loss of zero needs no bound
+_MIN_SLAM_LOSS = 1e-12  # a SLAM loss of zero needs no bound
 
 
 class ScheduleSettings(Settings):
@@ -41,5 +41,7 @@ def total_loss(model_loss: Tensor, slam_loss: Callable[[], Tensor], epoch: int, 
         return model_loss
     weighted = settings.gamma * slam_loss()
     if settings.most is not None:
-        weighted = weighted * (settings.most * model_loss.abs() / weighted.clamp(min=_LEAST)).detach().clamp(max=1)
+        weighted = weighted * (settings.most * model_loss.abs() / weighted.clamp(min=_MIN_SLAM_LOSS)).detach().clamp(
+            max=1
+        )
     return model_loss + weighted

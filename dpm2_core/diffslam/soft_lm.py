@@ -18,8 +18,8 @@ from torch import Tensor
 from dpm2_core.config import Settings
 from dpm2_core.geometry import se3_torch
 
-_SATURATION = 70.0  # limit of the exponent: beyond it a sigmoid in float64 has no gradient
-_FLOOR = 1e-8  # m2: a fit better than 0.1 mm is perfect; keeps the relative change finite there
+_MAX_EXPONENT = 70.0  # limit of the exponent: beyond it a sigmoid in float64 has no gradient
+_MIN_COST = 1e-8  # m2: a fit better than 0.1 mm is perfect; keeps the relative change finite there
 _GRADSLAM_NU = 200.0
 
 
@@ -76,7 +76,7 @@ def retract(T: Tensor, step: Tensor) -> Tensor:
 def next_damping(change: Tensor, settings: SoftLmSettings) -> Tensor:
     """Eq. 4: from `lambda_min` (the error fell) to `lambda_max` (it rose), for change (B,)."""
     low, high = settings.lambda_min, settings.lambda_max
-    exponent = (-settings.steepness * change).clamp(-_SATURATION, _SATURATION)
+    exponent = (-settings.steepness * change).clamp(-_MAX_EXPONENT, _MAX_EXPONENT)
     return low + (high - low) / (1 + settings.offset * exponent.exp())
 
 
@@ -100,8 +100,8 @@ def error_change(before: Tensor, after: Tensor, total: Tensor, settings: SoftLmS
     if settings.gate in ("paper", "gradslam"):
         change = total * (after - before)
     else:
-        change = settings.sensitivity * (after - before) / (before + _FLOOR)
-    return change.clamp(-_SATURATION, _SATURATION)
+        change = settings.sensitivity * (after - before) / (before + _MIN_COST)
+    return change.clamp(-_MAX_EXPONENT, _MAX_EXPONENT)
 
 
 def iterates(problem: Problem, T: Tensor, settings: SoftLmSettings) -> Iterator[Tensor]:
@@ -126,10 +126,10 @@ def solve(problem: Problem, T: Tensor, settings: SoftLmSettings) -> Tensor:
         return list(iterates(problem, T, settings))[-1]
     with torch.no_grad():
         T = list(iterates(problem, T, settings))[-1]
-    return _attach(problem.associate(T), T, settings.lambda_min)
+    return _attach_gradient(problem.associate(T), T, settings.lambda_min)
 
 
-def _attach(residuals: Residuals, T: Tensor, floor: float) -> Tensor:
+def _attach_gradient(residuals: Residuals, T: Tensor, floor: float) -> Tensor:
     """T with the gradient of the minimum: one Newton step, of length zero where T is the minimum.
 
     At the minimum g(T, clouds) = 0, hence dT = -(dg/dT)^-1 dg. The Jacobian is that of g itself and not J^T W J: the

@@ -103,15 +103,19 @@ def odometry(clouds: Clouds, weights: Weights = None, guess: Tensor | None = Non
     points, w = window(clouds, weights, settings.points, settings.voxel, name)
     scans = Cloud(points, w)
     steps = _edges([1], len(points))
-    found, evidence = _register(scans, steps, _guessed_steps(guess, points), settings.icp)
-    poses = chained(found, settings.truncate)
+    step_poses, step_shares = _register(scans, steps, _guessed_steps(guess, points), settings.icp)
+    poses = chained(step_poses, settings.truncate)
     longer = _edges(sorted(set(settings.spans) - {1}), len(points))
     if not len(longer):
         return poses
     start = poses.detach()
-    led_to = se3_torch.inverse(start[longer[:, 0]]) @ start[longer[:, 1]]
-    farther, seen = _register(scans, longer, led_to, settings.icp)
-    edges, measured, shares = torch.cat([steps, longer]), torch.cat([found, farther]), torch.cat([evidence, seen])
+    longer_init = se3_torch.inverse(start[longer[:, 0]]) @ start[longer[:, 1]]
+    longer_poses, longer_shares = _register(scans, longer, longer_init, settings.icp)
+    edges, measured, shares = (
+        torch.cat([steps, longer]),
+        torch.cat([step_poses, longer_poses]),
+        torch.cat([step_shares, longer_shares]),
+    )
     return relax(start, edges, measured, shares, settings.rotation_weight, settings.graph)
 
 
@@ -126,7 +130,7 @@ class SlamLoss(torch.nn.Module):
         super().__init__()
         self.settings = settings or SlamLossSettings()
         self._references: dict[tuple[tuple[str, int], ...], tuple[Tensor, Tensor | None]] = {}
-        self._before: Tensor | None = None
+        self._previous_reference: Tensor | None = None
 
     def forward(
         self,
@@ -157,12 +161,15 @@ class SlamLoss(torch.nn.Module):
         reference, guess = self._reference(target_clouds, target_weights, guess, frames)
         poses = odometry(pred_clouds, weights, guess, self.settings, "predicted clouds")
         if self.settings.placebo:
-            reference, self._before = poses.detach() if self._before is None else self._before, reference
+            reference, self._previous_reference = (
+                poses.detach() if self._previous_reference is None else self._previous_reference,
+                reference,
+            )
         return trajectory_loss(poses, reference.to(poses.device), self.settings.rotation_weight)
 
     def restart(self) -> None:
         """Drop the window before; for the start of an epoch, so that a resumed training continues in the same way."""
-        self._before = None
+        self._previous_reference = None
 
     @torch.no_grad()
     def _reference(self, clouds: Clouds, weights: Weights, guess: Tensor | None,

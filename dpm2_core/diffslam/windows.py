@@ -28,17 +28,17 @@ class ContiguousWindows(Sampler[list[int]]):
         """
         if window < 2 or every < 1:
             raise UsageError(f"windows: {window} scans, every {every}; want at least 2, every 1")
-        reach = (window - 1) * every + 1
-        if not any(length >= reach for length in lengths):
+        extent = (window - 1) * every + 1
+        if not any(length >= extent for length in lengths):
             longest = max(lengths, default=0)
             raise UsageError(
-                f"window {window}, every {every}: no sequence has the {reach} scans of it, {longest} at most"
+                f"window {window}, every {every}: no sequence has the {extent} scans of it, {longest} at most"
             )
         self._seed, self._epoch, self.windows = seed, 0, list[list[int]]()
         begin = 0
         for length in lengths:
             for block in range(0, length, window * every):  # every-th scans of a block, from each of its first ones
-                for start in range(block, min(block + every, length - reach + 1)):
+                for start in range(block, min(block + every, length - extent + 1)):
                     self.windows.append([begin + start + i * every for i in range(window)])
             begin += length
 
