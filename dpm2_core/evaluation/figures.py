@@ -20,9 +20,9 @@ from dpm2_core.frame import Array, Frame, Points
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_TRUTH = "#ffffff"
-_HEIGHTS = ("#3d4f8f", "#2f8f9d", "#7fd1ae", "#f6f3c0")  # ground to roofs
-_PIXELS = 1100  # of the map raster along its longer side: about 0.15 m for a street, with voxels of 0.2 m
+_TRUTH_COLOR = "#ffffff"
+_HEIGHT_COLORS = ("#3d4f8f", "#2f8f9d", "#7fd1ae", "#f6f3c0")  # ground to roofs
+_RASTER_PIXELS = 1100  # of the map raster along its longer side: about 0.15 m for a street, with voxels of 0.2 m
 _MARGIN = 45.0  # m of map shown around the trajectory; beyond it a LiDAR map is mostly stray points
 
 
@@ -49,7 +49,7 @@ def trajectory_png(
     if cloud is not None and len(cloud):
         axes.imshow(_raster(cloud, est[:, :3, 3], low, high), extent=(low[0], high[0], low[1], high[1]), origin="lower")
     if truth is not None:
-        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.2, label="ground truth (aligned)", zorder=4)
+        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH_COLOR, lw=1.2, label="ground truth (aligned)", zorder=4)
     axes.plot(est[:, 0, 3], est[:, 1, 3], color=ESTIMATE, lw=3.0, label="estimate", zorder=3)
     axes.plot(*est[0, :2, 3], "o", color=ESTIMATE, ms=8, mec=BACKGROUND, label="start", zorder=5)
     axes.plot(*est[-1, :2, 3], "s", color=ESTIMATE, ms=8, mec=BACKGROUND, label="end", zorder=5)
@@ -60,7 +60,7 @@ def trajectory_png(
     save_png(path, figure)
 
 
-def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array | None, title: str) -> None:
+def trajectories_png(path: Path | str, trajectories: Mapping[str, Array], truth: Array | None, title: str) -> None:
     """Draw the trajectories (N, 3), m, of several methods and the true one from above, all in one frame.
 
     Raises:
@@ -69,9 +69,9 @@ def trajectories_png(path: Path | str, ways: Mapping[str, Array], truth: Array |
     figure = new_figure(figsize=(9, 9), dpi=130, facecolor=BACKGROUND)
     axes = figure.add_axes((0.07, 0.05, 0.9, 0.9), facecolor=BACKGROUND, aspect="equal")
     if truth is not None:
-        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH, lw=1.5, label="ground truth", zorder=9)
-    for name, way in ways.items():
-        axes.plot(way[:, 0], way[:, 1], lw=1.5, label=name)
+        axes.plot(truth[:, 0], truth[:, 1], "--", color=_TRUTH_COLOR, lw=1.5, label="ground truth", zorder=9)
+    for name, positions in trajectories.items():
+        axes.plot(positions[:, 0], positions[:, 1], lw=1.5, label=name)
     axes.tick_params(colors=INK)
     axes.set_xlabel("m", color=INK)
     axes.legend(facecolor=BACKGROUND, edgecolor="none", labelcolor=INK)
@@ -112,9 +112,9 @@ def _bounds(positions: Array, cloud: Points | None) -> tuple[Array, Array]:
     """Corners (2,), (2,) of the drawn area: the trajectory with a margin, which is cut to the area with map points."""
     low, high = positions[:, :2].min(0) - _MARGIN, positions[:, :2].max(0) + _MARGIN
     if cloud is not None and len(cloud):
-        reach = 3.0
-        low = np.maximum(low, np.minimum(np.percentile(cloud[:, :2], 0.5, axis=0), positions[:, :2].min(0)) - reach)
-        high = np.minimum(high, np.maximum(np.percentile(cloud[:, :2], 99.5, axis=0), positions[:, :2].max(0)) + reach)
+        margin = 3.0
+        low = np.maximum(low, np.minimum(np.percentile(cloud[:, :2], 0.5, axis=0), positions[:, :2].min(0)) - margin)
+        high = np.minimum(high, np.maximum(np.percentile(cloud[:, :2], 99.5, axis=0), positions[:, :2].max(0)) + margin)
     return low, high
 
 
@@ -131,19 +131,19 @@ def _raster(cloud: Points, positions: Array, low: Array, high: Array) -> NDArray
     if not len(cloud):
         return np.full((1, 1, 3), to_rgb(BACKGROUND))
     nearest = KDTree(cloud).query(cloud[:: len(cloud) // 2000 + 1], k=[2])[0]
-    pixel = max((high - low).max() / _PIXELS, np.median(np.minimum(nearest, 1.0)))  # inf for a single point
+    pixel = max((high - low).max() / _RASTER_PIXELS, np.median(np.minimum(nearest, 1.0)))  # inf for a single point
     width, height = np.ceil((high - low) / pixel).astype(int)
     x, y = ((cloud[:, :2] - low) / pixel).astype(int).T
     z = cloud[:, 2] - positions[KDTree(positions[:, :2]).query(cloud[:, :2])[1], 2]
     cell = np.minimum(y, height - 1) * width + np.minimum(x, width - 1)
     count = np.bincount(cell, minlength=width * height)
-    top = np.full(width * height, -np.inf)
-    np.maximum.at(top, cell, z)
-    bottom, ceiling = np.percentile(z, [3, 95])
-    heights = LinearSegmentedColormap.from_list("heights", _HEIGHTS)
-    hue = heights(np.clip((top - bottom) / max(ceiling - bottom, 1e-3), 0, 1))[:, :3]
-    strength = np.where(count > 0, 0.4 + 0.6 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
-    return (np.array(to_rgb(BACKGROUND)) * (1 - strength) + hue * strength).reshape(height, width, 3)
+    highest = np.full(width * height, -np.inf)
+    np.maximum.at(highest, cell, z)
+    low_z, high_z = np.percentile(z, [3, 95])
+    heights = LinearSegmentedColormap.from_list("heights", _HEIGHT_COLORS)
+    hue = heights(np.clip((highest - low_z) / max(high_z - low_z, 1e-3), 0, 1))[:, :3]
+    brightness = np.where(count > 0, 0.4 + 0.6 * np.clip(np.log1p(count) / np.log(6), 0, 1), 0.0)[:, None]
+    return (np.array(to_rgb(BACKGROUND)) * (1 - brightness) + hue * brightness).reshape(height, width, 3)
 
 
 def _scale_bar(axes: Axes, low: Array, high: Array) -> None:

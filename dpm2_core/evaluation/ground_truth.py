@@ -59,11 +59,11 @@ def _check_overlap(truth: Trajectory, path: Path | str, source: Source, start: i
         return
     first, last = sorted((first, key_at(stop - 1)))
     if end < first or begin > last:
-        of_truth, of_frames = (
+        truth_range, frame_range = (
             f"from {a / 1e9:.3f} to {b / 1e9:.3f} s" if stamped else f"{a} to {b}"
             for a, b in ((begin, end), (first, last))
         )
-        raise UsageError(f"{path}: poses {of_truth}, but the frames of {source.name} are {of_frames}")
+        raise UsageError(f"{path}: poses {truth_range}, but the frames of {source.name} are {frame_range}")
 
 
 def truth_by_stamp(
@@ -75,9 +75,9 @@ def truth_by_stamp(
     if truth.kind == "tum":
         during = (truth.keys >= stamps[0]) & (truth.keys <= stamps[-1])
         return truth.keys[during].tolist(), truth.poses[during]
-    at = dict(zip(index, stamps, strict=True))
-    found = [i for i, key in enumerate(truth.keys.tolist()) if key in at]
-    return [at[int(truth.keys[i])] for i in found], lidar_poses(truth.poses[found], T_cam_lidar)
+    stamp_of = dict(zip(index, stamps, strict=True))
+    found = [i for i, key in enumerate(truth.keys.tolist()) if key in stamp_of]
+    return [stamp_of[int(truth.keys[i])] for i in found], lidar_poses(truth.poses[found], T_cam_lidar)
 
 
 def camera_poses(poses: Array, T_cam_lidar: Array | None) -> Array:

@@ -66,8 +66,8 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
         raise UsageError(f"frame {frame.index} has no image")
     cloud = crop(frame.points, encoder.settings.points)
     points = collate([build_pyramid(cloud, encoder.settings, images)])
-    given: list[Any] = []
-    hook = attention.register_forward_pre_hook(lambda module, arguments: given.append(arguments))
+    inputs: list[Any] = []
+    hook = attention.register_forward_pre_hook(lambda module, arguments: inputs.append(arguments))
     device = next(model.parameters()).device
     try:
         encoded = encoder(*to_device((points, views), device))
@@ -82,11 +82,11 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     if point is None:
         if not seen.any():
             raise UsageError(f"no reference point of frame {frame.index} is in its image")
-        off = np.linalg.norm(uv - [width / 2, height / 2], axis=1)
-        point = int(np.where(seen, off, np.inf).argmin())
+        distance = np.linalg.norm(uv - [width / 2, height / 2], axis=1)
+        point = int(np.where(seen, distance, np.inf).argmin())
     elif not 0 <= point < len(seen) or not seen[point]:
         raise UsageError(f"point {point}: want one in the image: {', '.join(map(str, np.flatnonzero(seen)))}")
-    weights = attention.weights(*given[-1])[0, :, point].mean(0)
+    weights = attention.weights(*inputs[-1])[0, :, point].mean(0)
     sizes = [m.features.shape[-2:] for m in encoded.maps]
     heat = np.zeros((height, width), np.float32)
     for (h, w), part in zip(sizes, weights.float().cpu().split([h * w for h, w in sizes]), strict=True):
@@ -98,34 +98,35 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     return ImageAttention(pixels, xyz[0].cpu().numpy().astype(np.float64), uv, seen, point, heat)
 
 
-def attention_png(path: Path, looked: Mapping[str, ImageAttention], title: str) -> None:
+def attention_png(path: Path, attentions: Mapping[str, ImageAttention], title: str) -> None:
     """A panel of several networks' attention, one below the other (the paper's Figure 7).
 
     Raises:
         Dpm2Error: the file could not be written.
     """
-    figure = new_figure(figsize=(10, 3.4 * max(1, len(looked)) + 0.6), dpi=100, facecolor=BACKGROUND)
-    for row, (name, attention) in enumerate(looked.items()):
-        axes = figure.add_subplot(len(looked), 1, 1 + row, facecolor=BACKGROUND)
+    figure = new_figure(figsize=(10, 3.4 * max(1, len(attentions)) + 0.6), dpi=100, facecolor=BACKGROUND)
+    for row, (name, attention) in enumerate(attentions.items()):
+        axes = figure.add_subplot(len(attentions), 1, 1 + row, facecolor=BACKGROUND)
         draw_attention(axes, attention)
         axes.set_title(f"{name}: {axes.get_title()}", color=INK)
     figure.suptitle(title, color=INK)
     save_png(path, figure)
 
 
-def draw_attention(axes: Any, looked: ImageAttention) -> None:
+def draw_attention(axes: Any, attention: ImageAttention) -> None:
     """Draw the image with its reference points, and over it the attention of the chosen one."""
-    gray = looked.pixels.mean(2, keepdims=True) / 255 * 0.7
+    gray = attention.pixels.mean(2, keepdims=True) / 255 * 0.7
     color = cv2.cvtColor(
-        cv2.applyColorMap((255 * looked.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
+        cv2.applyColorMap((255 * attention.heat).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
     )
-    axes.imshow(gray + (color / 255 - gray) * (0.75 * looked.heat[..., None]))
-    near = np.linalg.norm(looked.points, axis=1)
-    axes.scatter(*looked.uv[looked.seen].T, c=near[looked.seen], cmap="viridis_r", s=14, linewidths=0)
-    x, y = looked.uv[looked.chosen]
+    axes.imshow(gray + (color / 255 - gray) * (0.75 * attention.heat[..., None]))
+    distance = np.linalg.norm(attention.points, axis=1)
+    axes.scatter(*attention.uv[attention.seen].T, c=distance[attention.seen], cmap="viridis_r", s=14, linewidths=0)
+    x, y = attention.uv[attention.chosen]
     axes.plot(x, y, "o", markersize=16, markerfacecolor="none", markeredgecolor=ESTIMATE, markeredgewidth=2)
     axes.set_title(
-        f"reference points, near ones light; attention of point {looked.chosen}, {near[looked.chosen]:.1f} m away",
+        f"reference points, near ones light; attention of point {attention.chosen}, "
+        f"{distance[attention.chosen]:.1f} m away",
         color=INK,
     )
     axes.set_axis_off()

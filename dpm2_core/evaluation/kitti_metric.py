@@ -66,22 +66,25 @@ def segment_errors(
         stamps: (N,) ns, for the speeds; by default KITTI's period apart.
     """
     stamps = stamps_of(np.arange(len(gt))) if stamps is None else stamps
-    at = np.flatnonzero(known(gt))  # position of each true pose among the frames
-    gt, est = gt[at], est[at]
+    frame_of = np.flatnonzero(known(gt))  # position of each true pose among the frames
+    gt, est = gt[frame_of], est[frame_of]
     step = 10 if tuple(lengths) == OFFICIAL_LENGTHS else 1
     travelled = arc_lengths(gt[:, :3, 3])
     starts = np.arange(0, len(gt), step)
     first, length = starts.repeat(len(lengths)), np.tile(np.array(lengths, np.float64), len(starts))
     last = np.searchsorted(travelled, travelled[first] + length, side="right")  # the first frame beyond the length
-    whole = last < len(gt)
-    first, last, length = first[whole], last[whole], length[whole]
+    is_complete = last < len(gt)
+    first, last, length = first[is_complete], last[is_complete], length[is_complete]
     both = known(est)[first] & known(est)[last]
     first, last, length = first[both], last[both], length[both]
     error = se3.inverse(relative(est, first, last)) @ relative(gt, first, last)
     # As in the development kit: to the end of the first frame beyond the length, whether that one is there or not.
     time, period = stamps - stamps[0], 1e9 * frame_period(stamps)
-    end = np.minimum(time[at[last]], np.interp(travelled[first] + length, travelled, time[at]) + period) + period
-    seconds = (end - time[at[first]]) / 1e9
+    end = (
+        np.minimum(time[frame_of[last]], np.interp(travelled[first] + length, travelled, time[frame_of]) + period)
+        + period
+    )
+    seconds = (end - time[frame_of[first]]) / 1e9
     speed = np.divide(length, seconds, out=np.full_like(length, np.nan), where=seconds > 0)
     return SegmentErrors(length, np.linalg.norm(error[:, :3, 3], axis=1) / length, se3.angle(error) / length, speed)
 

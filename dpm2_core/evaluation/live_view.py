@@ -24,12 +24,12 @@ from dpm2_core.slam.system import SlamResult
 if TYPE_CHECKING:
     import rerun
 
-_SCAN = 6000  # points of a scan that are shown; all of a keyframe are, in the map
-_COLORS = {State.TRACKING: (90, 200, 120), State.DEGRADED: (240, 180, 60), State.LOST: (230, 80, 70)}
-_ACCEPTED, _REJECTED, _WAY = (90, 160, 255), (230, 90, 80), (240, 210, 90)
-_WIDTH = 640  # largest width of an image that is shown: encoding a larger one took longer than all the rest
-_PATIENCE = 10.0  # s, for a viewer to receive the remaining data
-_PORT = 9876  # of a viewer that runs already, also on another machine: forwarded by ssh
+_MAX_SCAN_POINTS = 6000  # points of a scan that are shown; all of a keyframe are, in the map
+_STATE_COLORS = {State.TRACKING: (90, 200, 120), State.DEGRADED: (240, 180, 60), State.LOST: (230, 80, 70)}
+_ACCEPTED_COLOR, _REJECTED_COLOR, _TRAJECTORY_COLOR = (90, 160, 255), (230, 90, 80), (240, 210, 90)
+_MAX_IMAGE_WIDTH = 640  # largest width of an image that is shown: encoding a larger one took longer than all the rest
+_FLUSH_TIMEOUT = 10.0  # s, for a viewer to receive the remaining data
+_VIEWER_PORT = 9876  # of a viewer that runs already, also on another machine: forwarded by ssh
 
 
 def check_view(viewer: bool, record: Path | None, out: Path) -> None:
@@ -46,7 +46,7 @@ def check_view(viewer: bool, record: Path | None, out: Path) -> None:
         import rerun  # noqa: F401
     if record is not None and not record.parent.is_dir() and record.parent.resolve() != out.resolve():
         raise UsageError(f"--record {record}: no such folder")
-    if viewer and not _shown():
+    if viewer and not _can_show_viewer():
         raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
 
 
@@ -77,7 +77,7 @@ class LiveView:
         elif record is not None:
             self._stream.save(record, default_blueprint=layout)
         self._stages: list[str] = []
-        self._keyframes = 0
+        self._shown_keyframes = 0
         self._loops: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
 
     def __enter__(self) -> LiveView:
@@ -85,7 +85,7 @@ class LiveView:
 
     def __exit__(self, *_: object) -> None:
         with suppress(Exception):  # the viewer has been closed: its remaining data are not needed
-            self._stream.flush(timeout_sec=_PATIENCE)
+            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT)
         self._stream.disconnect()
 
     def add(self, frame: Frame, result: SlamResult, mapper: Mapper) -> None:
@@ -98,16 +98,16 @@ class LiveView:
         self._show_figures(tracked)
         if frame.images:
             pixels = frame.images[0].pixels
-            step = -(-pixels.shape[1] // _WIDTH)
+            step = -(-pixels.shape[1] // _MAX_IMAGE_WIDTH)
             jpeg = cv2.imencode(".jpg", pixels[::step, ::step, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
             self._stream.log("image", self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         if tracked.keyframe is not None:
             self._show_map(mapper, () if result.map is None else result.map.loops)
 
     def _show_scan(self, frame: Frame, T_map_lidar: Array, tracked: OdometryResult) -> None:
-        points = frame.points[:: max(1, len(frame.points) // _SCAN), :3]
+        points = frame.points[:: max(1, len(frame.points) // _MAX_SCAN_POINTS), :3]
         points = points[np.isfinite(points).all(1)]
-        color = _COLORS.get(tracked.state, (150, 150, 150))
+        color = _STATE_COLORS.get(tracked.state, (150, 150, 150))
         self._stream.log("map/lidar", self._pose(T_map_lidar))
         self._stream.log("map/lidar/scan", self._rr.Points3D(points, colors=color, radii=0.05))
 
@@ -129,21 +129,21 @@ class LiveView:
         """Show new keyframes, and all poses again if a loop has moved them."""
         poses = mapper.poses
         moved = any(loop.ok for loop in loops)
-        for node in range(0 if moved else self._keyframes, len(poses)):
+        for node in range(0 if moved else self._shown_keyframes, len(poses)):
             self._stream.log(f"map/keyframes/{node}", self._pose(poses[node]))
-        for node in range(self._keyframes, len(poses)):
+        for node in range(self._shown_keyframes, len(poses)):
             cloud = mapper.clouds[node]
             heights = np.clip((cloud[:, 2] + 2.0) / 8.0, 0, 1)[:, None]
             colors = (np.array([70, 110, 150]) * (1 - heights) + np.array([240, 230, 200]) * heights).astype(np.uint8)
             self._stream.log(f"map/keyframes/{node}/cloud", self._rr.Points3D(cloud[:, :3], colors=colors, radii=0.04))
-        self._keyframes = len(poses)
-        self._stream.log("map/way", self._rr.LineStrips3D([poses[:, :3, 3]], colors=_WAY, radii=0.1))
+        self._shown_keyframes = len(poses)
+        self._stream.log("map/way", self._rr.LineStrips3D([poses[:, :3, 3]], colors=_TRAJECTORY_COLOR, radii=0.1))
         for loop in loops:
             self._loops[loop.ok].append((loop.from_node, loop.to_node))
-            what = "accepted" if loop.ok else f"rejected: {loop.registration.reason}"
+            verdict = "accepted" if loop.ok else f"rejected: {loop.registration.reason}"
             level = self._rr.TextLogLevel.INFO if loop.ok else self._rr.TextLogLevel.DEBUG
-            self._stream.log("log", self._rr.TextLog(f"loop {loop.from_node} - {loop.to_node} {what}", level=level))
-        for ok, name, color in ((True, "accepted", _ACCEPTED), (False, "rejected", _REJECTED)):
+            self._stream.log("log", self._rr.TextLog(f"loop {loop.from_node} - {loop.to_node} {verdict}", level=level))
+        for ok, name, color in ((True, "accepted", _ACCEPTED_COLOR), (False, "rejected", _REJECTED_COLOR)):
             if ends := self._loops[ok]:
                 strips = [poses[[a, b], :3, 3] for a, b in ends]
                 self._stream.log(f"map/loops/{name}", self._rr.LineStrips3D(strips, colors=color, radii=0.08))
@@ -152,12 +152,12 @@ class LiveView:
         return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
 
-def _shown() -> bool:
+def _can_show_viewer() -> bool:
     """Whether a viewer can open or is running: without a display rerun would still start one, and wait forever."""
     if not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         return True
-    with socket.socket() as found:
-        return found.connect_ex(("127.0.0.1", _PORT)) == 0
+    with socket.socket() as connection:
+        return connection.connect_ex(("127.0.0.1", _VIEWER_PORT)) == 0
 
 
 def _layout(b: Any) -> Any:

@@ -80,9 +80,9 @@ def extras() -> Finding:
         name = re.match(r"[\w.-]+", line)
         if extra and name:
             wanted.setdefault(extra[1], []).append(name[0])
-    there = {extra for extra, names in wanted.items() if all(map(package_version, names))}
-    missing = sorted(set(wanted) - there)
-    found = f"{', '.join(sorted(there)) or 'none'}; without {', '.join(missing) or 'none'}"
+    installed = {extra for extra, names in wanted.items() if all(map(package_version, names))}
+    missing = sorted(set(wanted) - installed)
+    found = f"{', '.join(sorted(installed)) or 'none'}; without {', '.join(missing) or 'none'}"
     return Finding("extras", "ok" if not missing else "note", found)
 
 

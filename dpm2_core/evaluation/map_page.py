@@ -23,8 +23,8 @@ MOST_POINTS = 1_000_000
 """6 MB, 8 MB as text."""
 IMAGES = 6_000_000
 """Bytes that all images together may take, 8 MB as text."""
-_COARSEST = 12.8  # m, the first level of detail
-_SHARPEST = 60  # quality of a JPEG that had to be made smaller
+_COARSEST_VOXEL = 12.8  # m, the first level of detail
+_JPEG_QUALITY = 60  # quality of a JPEG that had to be made smaller
 
 
 def write_map_page(path: Path, data: MapData, voxel: float) -> None:
@@ -53,11 +53,11 @@ def by_detail(cloud: Points, finest: float) -> Points:
     Args:
         cloud: (N, 4). finest: distance, m, below which distinguishing points gives no benefit.
     """
-    noise = np.random.default_rng(0)
-    rest, order, size = np.arange(len(cloud)), [], _COARSEST
+    rng = np.random.default_rng(0)
+    rest, order, size = np.arange(len(cloud)), [], _COARSEST_VOXEL
     while len(rest):
         chosen = voxel_first(cloud[rest], size) if size > finest else np.arange(len(rest))
-        order.append(noise.permutation(rest[chosen]))
+        order.append(rng.permutation(rest[chosen]))
         rest = np.delete(rest, chosen)
         size /= 2
     return cloud[np.concatenate(order)] if order else cloud
@@ -65,9 +65,9 @@ def by_detail(cloud: Points, finest: float) -> Points:
 
 def _content(data: MapData, voxel: float) -> dict[str, Any]:
     """The data for the page's script: positions relative to the center of the keyframes."""
-    middle = data.poses[:, :3, 3].mean(0)
+    center = data.poses[:, :3, 3].mean(0)
     cloud = by_detail(map_cloud(data.clouds, data.poses, voxel), 2 * voxel)[:MOST_POINTS]
-    local = cloud[:, :3].astype(np.float64) - middle
+    local = cloud[:, :3].astype(np.float64) - center
     scale = max(0.005, float(np.abs(local).max(initial=0.0)) / 32_000)
     packed = np.round(local / scale).astype("<i2")
     low, high = np.percentile(local[:, 2], [2, 98]) if len(local) else (0.0, 1.0)
@@ -75,33 +75,33 @@ def _content(data: MapData, voxel: float) -> dict[str, Any]:
         "scale": scale,
         "heights": [float(low), float(max(high, low + 1.0))],
         "points": base64.b64encode(packed.tobytes()).decode("ascii"),
-        "middle": middle.round(3).tolist(),
-        "keyframes": _keyframes(data, middle),
-        "tracks": _tracks(data, middle),
+        "middle": center.round(3).tolist(),
+        "keyframes": _keyframes(data, center),
+        "tracks": _tracks(data, center),
         "loops": [_loop(edge) for edge in data.edges if edge.kind == "loop"],
     }
 
 
-def _keyframes(data: MapData, middle: Array) -> list[dict[str, Any]]:
+def _keyframes(data: MapData, center: Array) -> list[dict[str, Any]]:
     jpegs = [data.thumbnail(node) for node in range(len(data))]
-    room = IMAGES // max(1, sum(jpeg is not None for jpeg in jpegs))
+    max_bytes = IMAGES // max(1, sum(jpeg is not None for jpeg in jpegs))
     return [
         {
-            "at": (T[:3, 3] - middle).round(3).tolist(),
+            "at": (T[:3, 3] - center).round(3).tolist(),
             "yaw": round(float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))), 1),
             "stamp": str(keyframe.stamp),  # ns exceed the precision of a number in JavaScript
             "frame": keyframe.index,
             "robot": keyframe.robot,
             "session": keyframe.session,
-            "image": None if (small := _within(jpeg, room)) is None else data_url(small, "image/jpeg"),
+            "image": None if (small := _shrink_image(jpeg, max_bytes)) is None else data_url(small, "image/jpeg"),
         }
         for keyframe, T, jpeg in zip(data.keyframes, data.poses, jpegs, strict=True)
     ]
 
 
-def _tracks(data: MapData, middle: Array) -> list[list[list[float]]]:
+def _tracks(data: MapData, center: Array) -> list[list[list[float]]]:
     """The trajectory of each drive, including keyframes that were pruned."""
-    return [(way.poses[:, :3, 3] - middle).round(3).tolist() for way in ways(data)]
+    return [(drive.poses[:, :3, 3] - center).round(3).tolist() for drive in ways(data)]
 
 
 def _loop(edge: Edge) -> dict[str, Any]:
@@ -113,15 +113,15 @@ def _loop(edge: Edge) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _within(jpeg: bytes | None, room: int) -> bytes | None:
-    """The image in at most `room` bytes, resized if necessary; None if there is none, or it is no JPEG."""
+def _shrink_image(jpeg: bytes | None, max_bytes: int) -> bytes | None:
+    """The image in at most `max_bytes` bytes, resized if necessary; None if there is none, or it is no JPEG."""
     if jpeg is None or not jpeg.startswith(b"\xff\xd8"):
         return None
     try:
         pixels = decode_compressed(jpeg)[:, :, ::-1]
     except ValueError:
         return None
-    while len(jpeg) > room and min(pixels.shape[:2]) > 16:
+    while len(jpeg) > max_bytes and min(pixels.shape[:2]) > 16:
         pixels = cv2.resize(pixels, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
-        jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _SHARPEST])[1].tobytes()
-    return jpeg if len(jpeg) <= room else None
+        jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return jpeg if len(jpeg) <= max_bytes else None

@@ -21,8 +21,8 @@ from dpm2_core.network.model import DeepPointMap2
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_TARGET, _SOURCE = "#3f7fbf", ESTIMATE
-_REACH = 50.0  # m of each scan that is drawn around its sensor
+_TARGET_COLOR, _SOURCE_COLOR = "#3f7fbf", ESTIMATE
+_VIEW_RANGE = 50.0  # m of each scan that is drawn around its sensor
 
 
 def matches_png(
@@ -31,18 +31,18 @@ def matches_png(
     source: Frame,
     target: Frame,
     title: str = "",
-    looked: ImageAttention | None = None,
+    attention: ImageAttention | None = None,
 ) -> None:
     """Draw how a network registers a scan to another, in two views from above: the scans next to each other with their
     matches, and one on top of the other.
 
     Args:
-        looked: attention to draw on the source's image; None: no image.
+        attention: drawn on the source's image; None: no image.
 
     Raises:
         Dpm2Error: too few points, or the file could not be written.
     """
-    compared_png(path, [(title, network, looked)], source, target)
+    compared_png(path, [(title, network, attention)], source, target)
 
 
 def compared_png(
@@ -63,52 +63,54 @@ def compared_png(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     images = []
-    for title, network, looked in networks:
-        canvas = FigureCanvasAgg(_figure(network, source, target, title, looked))
+    for title, network, attention in networks:
+        canvas = FigureCanvasAgg(_figure(network, source, target, title, attention))
         canvas.draw()
         images.append(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])  # BGR
     with atomic_write(path, "wb") as file:
         file.write(cv2.imencode(".png", np.vstack(images))[1].tobytes())  # all are equally wide
 
 
-def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, looked: ImageAttention | None) -> Figure:
-    of_source, of_target = network.describe(source), network.describe(target)
-    result = network.register(of_source, of_target)
-    at_source, at_target, confidence = network.matches(of_source, of_target)
+def _figure(
+    network: DeepPointMap2, source: Frame, target: Frame, title: str, attention: ImageAttention | None
+) -> Figure:
+    source_descriptors, target_descriptors = network.describe(source), network.describe(target)
+    result = network.register(source_descriptors, target_descriptors)
+    source_points, target_points, confidence = network.matches(source_descriptors, target_descriptors)
     with needs("plot", "drawing"):
         from matplotlib.collections import LineCollection  # half a second to import: not for every command
 
-    low = 0.0 if looked is None else 0.43  # the image's fraction of the height, below the scans
-    figure = new_figure(figsize=(18, 7.2 / (1 - low)), dpi=110, facecolor=BACKGROUND)
+    attention_height = 0.0 if attention is None else 0.43  # the image's fraction of the height, below the scans
+    figure = new_figure(figsize=(18, 7.2 / (1 - attention_height)), dpi=110, facecolor=BACKGROUND)
 
-    def place(left: float, width: float) -> tuple[float, float, float, float]:
-        return left, low + 0.02 * (1 - low), width, 0.88 * (1 - low)
+    def axes_box(left: float, width: float) -> tuple[float, float, float, float]:
+        return left, attention_height + 0.02 * (1 - attention_height), width, 0.88 * (1 - attention_height)
 
-    beside = figure.add_axes(place(0.01, 0.63), facecolor=BACKGROUND, aspect="equal")
-    above = figure.add_axes(place(0.66, 0.33), facecolor=BACKGROUND, aspect="equal")
-    if looked is not None:
-        draw_attention(figure.add_axes((0.02, 0.01, 0.96, low - 0.04), facecolor=BACKGROUND), looked)
-    right = np.array([2.1 * _REACH, 0.0])
+    matches_axes = figure.add_axes(axes_box(0.01, 0.63), facecolor=BACKGROUND, aspect="equal")
+    overlay_axes = figure.add_axes(axes_box(0.66, 0.33), facecolor=BACKGROUND, aspect="equal")
+    if attention is not None:
+        draw_attention(figure.add_axes((0.02, 0.01, 0.96, attention_height - 0.04), facecolor=BACKGROUND), attention)
+    source_shift = np.array([2.1 * _VIEW_RANGE, 0.0])
     for axes, points, shift, color in (
-        (beside, target.points, np.zeros(2), _TARGET),
-        (beside, source.points, right, _SOURCE),
-        (above, target.points, np.zeros(2), _TARGET),
-        (above, se3.transform(result.T_target_source, source.points), np.zeros(2), _SOURCE),
+        (matches_axes, target.points, np.zeros(2), _TARGET_COLOR),
+        (matches_axes, source.points, source_shift, _SOURCE_COLOR),
+        (overlay_axes, target.points, np.zeros(2), _TARGET_COLOR),
+        (overlay_axes, se3.transform(result.T_target_source, source.points), np.zeros(2), _SOURCE_COLOR),
     ):
-        near = points[np.abs(points[:, :2]).max(1) < _REACH]
+        near = points[np.abs(points[:, :2]).max(1) < _VIEW_RANGE]
         axes.plot(*(near[:, :2] + shift).T, ",", color=color, alpha=0.6)
         axes.set_axis_off()
     order = np.argsort(confidence)  # the most confident on top
-    ends = np.stack([at_target[order, :2], at_source[order, :2] + right], 1)
+    ends = np.stack([target_points[order, :2], source_points[order, :2] + source_shift], 1)
     lines = LineCollection(list(ends), array=confidence[order], cmap="viridis", linewidths=0.8, clim=(0, 1))
-    beside.add_collection(lines)
+    matches_axes.add_collection(lines)
     for column in (0, 1):
-        beside.scatter(
+        matches_axes.scatter(
             ends[:, column, 0], ends[:, column, 1], c=confidence[order], cmap="viridis", vmin=0, vmax=1, s=9, zorder=3
         )
-    beside.set(xlim=(-_REACH, right[0] + _REACH), ylim=(-_REACH, _REACH))
-    above.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH))
-    bar = figure.colorbar(lines, ax=beside, fraction=0.02, pad=0.01)
+    matches_axes.set(xlim=(-_VIEW_RANGE, source_shift[0] + _VIEW_RANGE), ylim=(-_VIEW_RANGE, _VIEW_RANGE))
+    overlay_axes.set(xlim=(-_VIEW_RANGE, _VIEW_RANGE), ylim=(-_VIEW_RANGE, _VIEW_RANGE))
+    bar = figure.colorbar(lines, ax=matches_axes, fraction=0.02, pad=0.01)
     bar.set_label("confidence of a match", color=INK)
     bar.ax.tick_params(colors=INK)
     meters, degrees = se3.magnitude(result.T_target_source)
@@ -117,5 +119,5 @@ def _figure(network: DeepPointMap2, source: Frame, target: Frame, title: str, lo
         if result.ok
         else f"not registered: {result.reason}"
     )
-    figure.text(0.02, low + 0.945 * (1 - low), f"{title}: {outcome}", color=INK, fontsize=13)
+    figure.text(0.02, attention_height + 0.945 * (1 - attention_height), f"{title}: {outcome}", color=INK, fontsize=13)
     return figure

@@ -127,10 +127,11 @@ def evaluate(
         compared=int(both.sum()),
         failed_frames=int((~has_est).sum()) if failed_frames is None else failed_frames,
         path_length_m=path_length(gt[has_gt]),
-        **_kitti(segments),
+        **_kitti_figures(segments),
         lengths_m=tuple(lengths),
         per_length=tuple(
-            LengthErrors(length_m=length, **_kitti(segments.where(segments.length == length))) for length in lengths
+            LengthErrors(length_m=length, **_kitti_figures(segments.where(segments.length == length)))
+            for length in lengths
         ),
         per_speed=_by_speed(segments),
         ape_rmse_m=_rms(position),
@@ -159,10 +160,10 @@ def have_other_axes(gt: Array, est: Array) -> bool:
     extent (17 degrees) or more, far more than the error of an odometry whose trajectory fits to a tenth.
     """
     T_gt_est = align(est[:, :3, 3], gt[:, :3, 3])
-    turn = gt[0, :3, :3] @ est[0, :3, :3].T - T_gt_est[:3, :3]
+    R_difference = gt[0, :3, :3] @ est[0, :3, :3].T - T_gt_est[:3, :3]
     centered = est[:, :3, 3] - est[:, :3, 3].mean(0)
     extent = _rms(np.linalg.norm(centered, axis=1))
-    return ape_rmse(gt, est) < 0.1 * extent and _rms(np.linalg.norm(centered @ turn.T, axis=1)) > 0.3 * extent
+    return ape_rmse(gt, est) < 0.1 * extent and _rms(np.linalg.norm(centered @ R_difference.T, axis=1)) > 0.3 * extent
 
 
 def ape_rmse(gt: Array, est: Array) -> float:
@@ -187,8 +188,8 @@ def rpe(gt: Array, est: Array, stamps: Keys | None = None) -> tuple[float | None
     """
     stamps = stamps_of(np.arange(len(gt))) if stamps is None else stamps
     both = known(gt) & known(est)
-    follows = np.diff(stamps) <= 1.5e9 * frame_period(stamps)
-    first = np.flatnonzero(both[:-1] & both[1:] & follows)
+    is_consecutive = np.diff(stamps) <= 1.5e9 * frame_period(stamps)
+    first = np.flatnonzero(both[:-1] & both[1:] & is_consecutive)
     if not len(first):
         return None, None
     error = se3.inverse(relative(gt, first, first + 1)) @ relative(est, first, first + 1)
@@ -209,11 +210,11 @@ def path_length(poses: Array) -> float:
 
 def _by_speed(segments: SegmentErrors) -> tuple[SpeedErrors, ...]:
     step = np.floor(segments.speed / SPEED_STEP + 0.5)
-    of = ((k, segments.where(step == k)) for k in np.unique(step[np.isfinite(step)]).tolist())
-    return tuple(SpeedErrors(speed_mps=k * SPEED_STEP, **_kitti(chosen)) for k, chosen in of)
+    by_step = ((k, segments.where(step == k)) for k in np.unique(step[np.isfinite(step)]).tolist())
+    return tuple(SpeedErrors(speed_mps=k * SPEED_STEP, **_kitti_figures(chosen)) for k, chosen in by_step)
 
 
-def _kitti(segments: SegmentErrors) -> dict[str, Any]:
+def _kitti_figures(segments: SegmentErrors) -> dict[str, Any]:
     """The KITTI metric of some segments, under the names that all models here use."""
     mean = segments.mean()
     t_err, r_err = (None, None) if mean is None else (100 * mean[0], 100 * float(np.degrees(mean[1])))

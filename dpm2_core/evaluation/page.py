@@ -43,9 +43,11 @@ def page(title: str, body: str, *, style: str = "", script: str = "", data: Any 
     for name, text in (("style", style), ("script", script)):
         if f"</{name}" in text.lower():
             raise ValueError(f"</{name} within the {name} of a page")
-    held = "" if data is None else f'<script type="application/json" id="data">{_json(data)}</script>\n'
-    run = f"<script>\n{script}\n</script>\n" if script else ""
-    return _PAGE.format(policy=_POLICY, title=escape(title), style=style, body=body, data=held, script=run)
+    data_element = "" if data is None else f'<script type="application/json" id="data">{_json(data)}</script>\n'
+    script_element = f"<script>\n{script}\n</script>\n" if script else ""
+    return _PAGE.format(
+        policy=_POLICY, title=escape(title), style=style, body=body, data=data_element, script=script_element
+    )
 
 
 def asset(name: str) -> str:

@@ -40,7 +40,7 @@ class PairSet:
     """
 
     def __init__(self, root: Path, pairs: int, network: NetworkSettings, images: bool, farthest: float = FAR) -> None:
-        noise = np.random.default_rng(0)
+        rng = np.random.default_rng(0)
         self.drives = open_packed(root)
         self.network, self.images = network, images
         for drive in self.drives:
@@ -53,22 +53,22 @@ class PairSet:
             if not any(has_pair(drive.poses, low, high) for drive in self.drives):
                 raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
         while len(self.pairs) < pairs:
-            d = int(noise.integers(len(self.drives)))
+            d = int(rng.integers(len(self.drives)))
             poses = self.drives[d].poses
-            a = int(noise.integers(len(poses)))
+            a = int(rng.integers(len(poses)))
             distance = np.linalg.norm(poses[:, :3, 3] - poses[a, :3, 3], axis=1)
             low, high = bounds[len(self.pairs) % 2]
             others = np.flatnonzero((distance > low) & (distance <= high))
             if len(others) == 0:
                 continue
-            b = int(noise.choice(others))
-            yaw = float(noise.uniform(-np.pi, np.pi)) if len(self.pairs) % 4 >= 2 else 0.0
-            turn = se3.exp([0, 0, yaw, 0, 0, 0])
-            T = se3.inverse(poses[b]) @ poses[a] @ se3.inverse(turn)
-            self.pairs.append((self._frame(d, a, yaw), self._frame(d, b, 0.0), T, float(distance[b])))
+            b = int(rng.choice(others))
+            yaw = float(rng.uniform(-np.pi, np.pi)) if len(self.pairs) % 4 >= 2 else 0.0
+            T_turned_lidar = se3.exp([0, 0, yaw, 0, 0, 0])
+            T = se3.inverse(poses[b]) @ poses[a] @ se3.inverse(T_turned_lidar)
+            self.pairs.append((self._frame_number(d, a, yaw), self._frame_number(d, b, 0.0), T, float(distance[b])))
             self._scale.append(float(self.drives[d].about.get("scale", 1.0)))
 
-    def _frame(self, drive: int, index: int, yaw: float) -> int:
+    def _frame_number(self, drive: int, index: int, yaw: float) -> int:
         return self.frames.setdefault((drive, index, yaw), len(self.frames))
 
     @torch.inference_mode()
@@ -80,10 +80,10 @@ class PairSet:
             pyramids, images = [], []
             for drive, index, yaw in keys[begin : begin + 8]:
                 sample = fitted(self.drives[drive][index], self.drives[drive], self.network.points)
-                turn = se3.exp([0, 0, yaw, 0, 0, 0])
-                R = turn[:3, :3]
+                T_turned_lidar = se3.exp([0, 0, yaw, 0, 0, 0])
+                R = T_turned_lidar[:3, :3]
                 images.append([in_encoded_axes(image, R, 1.0) for image in sample.images] if self.images else [])
-                pyramids.append(build_pyramid(se3.transform(turn, sample.cloud), self.network, images[-1]))
+                pyramids.append(build_pyramid(se3.transform(T_turned_lidar, sample.cloud), self.network, images[-1]))
             out += model.encoder.encode_batch(collate(pyramids), collate_views(images, self.network.image))
         return out
 
@@ -109,13 +109,13 @@ class PairSet:
         rows = self.errors(model)
         meters = rows[:, 2] / np.array(self._scale)
         near = rows[:, 0] <= NEAR
-        good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
+        is_success = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
         out = {}
         for name, chosen in (("near", near), ("far", ~near), ("turned", rows[:, 1] > 0)):
             if not chosen.any():
                 continue
             out[f"{name}_m"] = float(np.median(meters[chosen]))
             out[f"{name}_deg"] = float(np.median(rows[chosen, 3]))
-            out[f"{name}_success"] = float(good[chosen].mean())
-        out["chi2"] = float(np.median(rows[good, 4])) if good.any() else float("nan")
+            out[f"{name}_success"] = float(is_success[chosen].mean())
+        out["chi2"] = float(np.median(rows[is_success, 4])) if is_success.any() else float("nan")
         return out

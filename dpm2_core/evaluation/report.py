@@ -17,17 +17,17 @@ def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None =
     how_measured = ["how it is measured"]
     table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)
     t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
-    how = f"the path is shorter than {min(metrics.lengths_m):g} m; `dpm2 eval --lengths` takes shorter ones"
+    kitti_note = f"the path is shorter than {min(metrics.lengths_m):g} m; `dpm2 eval --lengths` takes shorter ones"
     if t_err is not None and r_err is not None:
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"
-        how = f"{metrics.segments} segments of {in_words(metrics.lengths_m)} from {start}, unaligned; {devkit}"
+        kitti_note = f"{metrics.segments} segments of {in_words(metrics.lengths_m)} from {start}, unaligned; {devkit}"
     states = f"{metrics.failed_frames} {failed or f'failed, {metrics.breaks} breaks'}"
-    true = f"true path {_value(metrics.path_length_m, 'm')}"
+    true_path = f"true path {_value(metrics.path_length_m, 'm')}"
     if metrics.compared is not None and metrics.compared < metrics.frames:
-        true += f", {metrics.compared} poses compared"
-    table.add_row("frames", str(metrics.frames), f"{states}; {true}")
-    table.add_row("KITTI t_err", _value(t_err, "%"), how)
+        true_path += f", {metrics.compared} poses compared"
+    table.add_row("frames", str(metrics.frames), f"{states}; {true_path}")
+    table.add_row("KITTI t_err", _value(t_err, "%"), kitti_note)
     table.add_row("KITTI r_err", _value(r_err, "deg/100 m"), "the same segments")
     for part in metrics.per_length if metrics.segments else ():
         values = f"{_value(part.r_err_deg_per_100m, 'deg/100 m')}, {part.segments} segments"

@@ -96,8 +96,8 @@ def write_truth(path: Path, stamps: Sequence[int], poses: Array) -> None:
     Raises:
         Dpm2Error: it could not be written.
     """
-    there = known(poses)
-    write_tum(path, np.asarray(stamps, np.int64)[there], poses[there])
+    is_known = known(poses)
+    write_tum(path, np.asarray(stamps, np.int64)[is_known], poses[is_known])
 
 
 def remove_results(folder: Path, *names: str) -> None:
@@ -120,13 +120,13 @@ def set_aside(folder: Path, name: str) -> Path:
     Raises:
         Dpm2Error: a file could not be moved.
     """
-    into = next(path for path in numbered(folder / name) if not path.exists())
-    make_folder(into)
+    subfolder = next(path for path in numbered(folder / name) if not path.exists())
+    make_folder(subfolder)
     for result in (TRAJECTORY, *MAPPING):
-        with explaining(folder / result, f"not moved to {into}"):
+        with explaining(folder / result, f"not moved to {subfolder}"):
             if (folder / result).exists():
-                (folder / result).replace(into / result)
-    return into
+                (folder / result).replace(subfolder / result)
+    return subfolder
 
 
 def read_run(path: Path) -> RunFolder:

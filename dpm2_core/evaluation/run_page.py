@@ -20,7 +20,7 @@ from dpm2_core.evaluation.run_folder import TRAJECTORY, RunFolder, read_run
 from dpm2_core.frame import Array
 from dpm2_core.tables import FigureTable, cells_of
 
-_BINS = 300  # of the time along a drive
+_TIME_BINS = 300  # of the time along a drive
 _KITTI = {"t_err %": "{t_err_percent:.3f}", "r_err deg/100 m": "{r_err_deg_per_100m:.3f}"}
 _FIGURES = {
     "APE rmse m": "{ape_rmse_m:.3f}", "APE mean m": "{ape_mean_m:.3f}", "RPE m": "{rpe_trans_m:.4f}",
@@ -46,8 +46,8 @@ def find_runs(folders: Sequence[Path]) -> list[tuple[str, Path]]:
         found += [(str(path.relative_to(folder)) if path != folder else folder.resolve().name, path) for path in below]
     runs = {path.resolve(): Path(name).parts for name, path in reversed(found)}
     while len(set(runs.values())) < len(runs):
-        often = Counter(runs.values())
-        runs = {path: parts if often[parts] == 1 else path.parts[-len(parts) - 1 :] for path, parts in runs.items()}
+        counts = Counter(runs.values())
+        runs = {path: parts if counts[parts] == 1 else path.parts[-len(parts) - 1 :] for path, parts in runs.items()}
     return [("/".join(parts), path) for path, parts in reversed(runs.items())]
 
 
@@ -59,7 +59,10 @@ def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[Fig
     """
     read = [(name, read_run(path)) for name, path in runs]
     groups = _by_truth(read)
-    parts = [f"<h1>{escape(title)}</h1>", *(_table(table) for table in [*tables, *([_figures(read)] if read else [])])]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        *(_table_html(table) for table in [*tables, *([_figures_table(read)] if read else [])]),
+    ]
     if groups:
         parts.append('<div id="groups"></div><noscript>The drawings need JavaScript.</noscript>')
     return page(
@@ -67,7 +70,7 @@ def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[Fig
         "\n".join(parts),
         style=asset("run_page.css"),
         script=asset("run_page.js") if groups else "",
-        data=[_group(group) for group in groups] if groups else None,
+        data=[_group_data(group) for group in groups] if groups else None,
     )
 
 
@@ -84,14 +87,14 @@ def _by_truth(runs: Sequence[tuple[str, RunFolder]]) -> list[list[tuple[str, Run
     return [list(group) for _, group in groupby(sorted(runs, key=key), key)]
 
 
-def _group(runs: Sequence[tuple[str, RunFolder]]) -> dict[str, Any]:
+def _group_data(runs: Sequence[tuple[str, RunFolder]]) -> dict[str, Any]:
     truth = runs[0][1].truth
-    way = [] if truth is None else _flat(truth.poses[:, :3, 3])
+    truth_xy = [] if truth is None else _flat_xy(truth.poses[:, :3, 3])
     name = ", ".join(name for name, _ in runs) if len(runs) < 3 else f"{runs[0][0]} and {len(runs) - 1} more"
-    return {"name": name, "truth": way, "runs": [_run(name, run) for name, run in runs]}
+    return {"name": name, "truth": truth_xy, "runs": [_run_data(name, run) for name, run in runs]}
 
 
-def _run(name: str, run: RunFolder) -> dict[str, Any]:
+def _run_data(name: str, run: RunFolder) -> dict[str, Any]:
     T = aligned(run)
     positions = (T @ run.trajectory.poses)[:, :3, 3]
     ends = np.array([[loop.start, loop.end] for loop in run.loops]).reshape(-1, 2, 3) @ T[:3, :3].T + T[:3, 3]
@@ -99,7 +102,7 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
     stages = {stage: round(float(times.mean()), 3) for stage, times in run.stages_ms.items() if len(times)}
     return {
         "name": name,
-        "way": _flat(positions),
+        "way": _flat_xy(positions),
         "loops": [
             [*np.round(end[:, :2].ravel(), 2).tolist(), loop.accepted, loop.reason]
             for end, loop in zip(ends, run.loops, strict=True)
@@ -107,11 +110,13 @@ def _run(name: str, run: RunFolder) -> dict[str, Any]:
         "states": [(state, len(list(group))) for state, group in groupby(run.states)],
         "stages": stages,
         "time": [
-            round(float(part.mean()), 2) for part in np.array_split(total, max(1, min(_BINS, len(total)))) if len(part)
+            round(float(part.mean()), 2)
+            for part in np.array_split(total, max(1, min(_TIME_BINS, len(total))))
+            if len(part)
         ],
-        "byLength": _errors(run.metrics.get("per_length", ()), "length_m"),
-        "bySpeed": _errors(run.metrics.get("per_speed", ()), "speed_mps"),
-        "segments": _of(_lengths(run)),
+        "byLength": _error_rows(run.metrics.get("per_length", ()), "length_m"),
+        "bySpeed": _error_rows(run.metrics.get("per_speed", ()), "speed_mps"),
+        "segments": _lengths_suffix(_lengths(run)),
     }
 
 
@@ -127,23 +132,23 @@ def aligned(run: RunFolder) -> Array:
     return align(est[both, :3, 3], true[both, :3, 3]) if both.sum() > 1 else np.eye(4)
 
 
-def _flat(positions: Array) -> list[float]:
+def _flat_xy(positions: Array) -> list[float]:
     """x, y of (N, 3) positions in sequence, rounded to the centimeter."""
-    sound = positions[np.isfinite(positions).all(1), :2]
-    found: list[float] = np.round(sound, 2).ravel().tolist()
+    finite = positions[np.isfinite(positions).all(1), :2]
+    found: list[float] = np.round(finite, 2).ravel().tolist()
     return found
 
 
-def _errors(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
+def _error_rows(rows: Sequence[dict[str, Any]], key: str) -> list[list[float]]:
     names = (key, "t_err_percent", "r_err_deg_per_100m")
     return [[row[name] for name in names] for row in rows if all(row.get(name) is not None for name in names)]
 
 
-def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
+def _figures_table(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
     # The KITTI metric of other segments is another figure: each set of lengths has its own columns.
     measured = dict.fromkeys(_lengths(run) for _, run in runs if run.metrics.get("t_err_percent") is not None)
     kitti = sorted(measured, key=lambda lengths: lengths != OFFICIAL_LENGTHS) or [OFFICIAL_LENGTHS]
-    headings = [name + _of(lengths) for lengths in kitti for name in _KITTI]
+    headings = [name + _lengths_suffix(lengths) for lengths in kitti for name in _KITTI]
     caption = (
         "APE after SE(3) alignment, RPE and the KITTI metric unaligned, this of segments of 100 to 800 m if no other"
     )
@@ -151,7 +156,9 @@ def _figures(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
                         caption=f"{caption} lengths are named.")  # fmt: skip
     for name, run in runs:
         errors = [
-            cell for of in kitti for cell in cells_of(run.metrics if _lengths(run) == of else {}, _KITTI.values())
+            cell
+            for lengths in kitti
+            for cell in cells_of(run.metrics if _lengths(run) == lengths else {}, _KITTI.values())
         ]
         figures = cells_of({**run.metrics, "timing": run.timing}, _FIGURES.values())
         accepted = sum(loop.accepted for loop in run.loops)
@@ -164,11 +171,11 @@ def _lengths(run: RunFolder) -> tuple[float, ...]:
     return tuple(run.metrics.get("lengths_m") or OFFICIAL_LENGTHS)
 
 
-def _of(lengths: Sequence[float]) -> str:
+def _lengths_suffix(lengths: Sequence[float]) -> str:
     return "" if lengths == OFFICIAL_LENGTHS else f" of {in_words(lengths)}"
 
 
-def _table(table: FigureTable) -> str:
+def _table_html(table: FigureTable) -> str:
     head = "".join(f"<th>{escape(text)}</th>" for text in table.headings)
     body = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>\n" for row in table.rows)
     caption = f"<p>{escape(table.caption)}</p>" if table.caption else ""

@@ -158,7 +158,7 @@ class Result:
             "breaks": self.recorder.breaks,
             **({"imu": dict(self.imu)} if self.imu else {}),
             **({"problems": dict(self.problems)} if self.problems else {}),
-            "stages_ms": {stage: _summary([*compress(times, whole)]) for stage, times in stages.items()},
+            "stages_ms": {stage: _time_summary([*compress(times, whole)]) for stage, times in stages.items()},
         }
 
     @cached_property
@@ -170,7 +170,7 @@ class Result:
         """
         if not len(self):
             return None
-        truth, poses, stamps = self._compared()
+        truth, poses, stamps = self._matched_poses()
         if truth is None:
             return None
         if not isinstance(self.ground_truth, Trajectory):
@@ -225,7 +225,7 @@ class Result:
         if not len(self):
             return ["no trajectory.png: no frame was processed"]
         try:
-            truth, poses, _ = self._compared()
+            truth, poses, _ = self._matched_poses()
         except UsageError:  # the truth is of another drive
             truth, poses = None, self.poses
         title = f"{self.source.name}: {len(self)} frames"
@@ -235,7 +235,7 @@ class Result:
             return [f"no trajectory.png: {error}"]
         return []
 
-    def _compared(self) -> tuple[Array | None, Array, Keys]:
+    def _matched_poses(self) -> tuple[Array | None, Array, Keys]:
         """Ground truth and estimate (M, 4, 4) of the same frames, and their stamps (M,), ns."""
         truth, stamps = self.ground_truth, np.array(self.recorder.stamps)
         if not isinstance(truth, Trajectory):
@@ -246,8 +246,10 @@ class Result:
             index = np.array(self.recorder.index)
             true, est, numbers = matched(truth, Trajectory(self.sensor_poses, index, truth.kind))
             stamps = np.interp(numbers, index, stamps).astype(np.int64)
-        during = np.flatnonzero(known(est))  # all frames have a pose: the truth before and after is not of this drive
-        drive = slice(during[0], during[-1] + 1)
+        known_frames = np.flatnonzero(
+            known(est)
+        )  # all frames have a pose: the truth before and after is not of this drive
+        drive = slice(known_frames[0], known_frames[-1] + 1)
         return true[drive], est[drive], stamps[drive]
 
     @property
@@ -267,6 +269,6 @@ def save_config(config: Config, out: Path) -> None:
         file.write(dump_settings(config))
 
 
-def _summary(times: list[float]) -> dict[str, float]:
+def _time_summary(times: list[float]) -> dict[str, float]:
     median, p95 = np.percentile(np.array(times) * 1e3, [50, 95]) if times else (0.0, 0.0)
     return {"median": round(float(median), 3), "p95": round(float(p95), 3)}

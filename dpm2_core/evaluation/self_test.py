@@ -16,10 +16,10 @@ from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
 
 BEAMS, COLUMNS = 64, 1024
-_HEIGHT, _REACH = 1.7, 60.0  # of the LiDAR above the ground, m
-_STEP = 1.0  # m per scan: 36 km/h at 10 Hz
-_MOST = 60  # scans
-_WARM = 3
+_LIDAR_HEIGHT, _MAX_RANGE = 1.7, 60.0  # of the LiDAR above the ground, m
+_SCAN_SPACING = 1.0  # m per scan: 36 km/h at 10 Hz
+_MAX_SCANS = 60
+_WARMUP_SCANS = 3
 """The first scans compile the loops, load the network, and have no motion estimate yet: they are not counted."""
 
 SLOW_ODOMETRY = 70.0
@@ -27,7 +27,7 @@ SLOW_ODOMETRY = 70.0
 SLOW_KEYFRAME = 1000.0
 """ms: there is a keyframe every 5 m, at 18 km/h one per second."""
 EXPECTED = "below 30 ms and 300 ms on two cores of a server processor"
-_WRONG = 0.2  # m, over at most 60 m of walls
+_MAX_ERROR = 0.2  # m, over at most 60 m of walls
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class SelfTest:
 
     def finding(self) -> Finding:
         """The result as a line among those of the machine."""
-        mapped = "no keyframe" if self.keyframe_ms is None else f"{self.keyframe_ms:.0f} ms a keyframe"
-        found = f"{self.frames} scans, {self.odometry_ms:.0f} ms each, {mapped}, {100 * self.error_m:.1f} cm off"
+        keyframe_time = "no keyframe" if self.keyframe_ms is None else f"{self.keyframe_ms:.0f} ms a keyframe"
+        found = f"{self.frames} scans, {self.odometry_ms:.0f} ms each, {keyframe_time}, {100 * self.error_m:.1f} cm off"
         found = f"{found}; {self.start_s:.1f} s to start"
-        if self.failed or not self.error_m < _WRONG:
+        if self.failed or not self.error_m < _MAX_ERROR:
             return Finding(
                 "self-test", "error", f"{found}; {self.failed} not registered", "the SLAM does not work here"
             )
@@ -69,27 +69,27 @@ def self_test(seconds: float = 8.0) -> SelfTest:
     """Run the SLAM along a computed street with the default settings, for about this number of seconds."""
     began = perf_counter()
     street = _street(np.random.default_rng(5))
-    noise = np.random.default_rng(6)
+    rng = np.random.default_rng(6)
     slam = make_slam(SlamSettings())
     odometry, keyframes, failed, start, number = [], [], 0, 0.0, 0
     error = float("inf")
-    for number in range(_MOST):
+    for number in range(_MAX_SCANS):
         T = _pose(number)
-        scan = street_scan(street, T, noise)
+        scan = street_scan(street, T, rng)
         result = slam.process(Frame(number * 10**8, scan, index=number)).odometry
         error = float(np.linalg.norm((se3.inverse(_pose(0)) @ T)[:3, 3] - result.T_odom_lidar[:3, 3]))
-        if number < _WARM:
+        if number < _WARMUP_SCANS:
             start = perf_counter() - began
             continue
         failed += result.failed
-        mapped = result.seconds["map"]
-        odometry.append(sum(result.seconds.values()) - mapped)
+        map_seconds = result.seconds["map"]
+        odometry.append(sum(result.seconds.values()) - map_seconds)
         if result.keyframe is not None:
-            keyframes.append(mapped)
+            keyframes.append(map_seconds)
         if perf_counter() - began > seconds and keyframes:
             break
-    middle = 1e3 * median(keyframes) if keyframes else None
-    return SelfTest(number + 1, error, failed, start, 1e3 * median(odometry), middle)
+    keyframe_ms = 1e3 * median(keyframes) if keyframes else None
+    return SelfTest(number + 1, error, failed, start, 1e3 * median(odometry), keyframe_ms)
 
 
 def street_scan(boxes: Array, T_world_lidar: Array, noise: np.random.Generator) -> Points:
@@ -103,20 +103,20 @@ def street_scan(boxes: Array, T_world_lidar: Array, noise: np.random.Generator) 
     azimuth = np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False)[None]
     up = np.broadcast_to(np.sin(elevation), (BEAMS, COLUMNS))
     rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), up], -1).reshape(-1, 3)
-    origin, ways = T_world_lidar[:3, 3], rays @ T_world_lidar[:3, :3].T
+    origin, directions = T_world_lidar[:3, 3], rays @ T_world_lidar[:3, :3].T
     with np.errstate(divide="ignore"):
-        inverse = 1.0 / ways
-    reach = np.where(ways[:, 2] < 0, -origin[2] * inverse[:, 2], np.inf)
+        inverse = 1.0 / directions
+    ranges = np.where(directions[:, 2] < 0, -origin[2] * inverse[:, 2], np.inf)
     for low, high in boxes:
-        if np.hypot(*(np.clip(origin[:2], low[:2], high[:2]) - origin[:2])) > _REACH:
+        if np.hypot(*(np.clip(origin[:2], low[:2], high[:2]) - origin[:2])) > _MAX_RANGE:
             continue
         near, far = (low - origin) * inverse, (high - origin) * inverse
         enter, leave = np.minimum(near, far).max(1), np.maximum(near, far).min(1)
-        reach = np.where((enter > 0.5) & (enter < leave) & (enter < reach), enter, reach)
-    reach += noise.normal(0, 0.02, len(reach))
-    seen = reach < _REACH
+        ranges = np.where((enter > 0.5) & (enter < leave) & (enter < ranges), enter, ranges)
+    ranges += noise.normal(0, 0.02, len(ranges))
+    seen = ranges < _MAX_RANGE
     intensity = np.full((int(seen.sum()), 1), 0.5)
-    return np.hstack([rays[seen] * reach[seen, None], intensity]).astype(np.float32)
+    return np.hstack([rays[seen] * ranges[seen, None], intensity]).astype(np.float32)
 
 
 def _street(rng: np.random.Generator) -> Array:
@@ -141,6 +141,6 @@ def _box(x: float, y: float, size: tuple[float, float, float]) -> Array:
 
 def _pose(number: int) -> Array:
     """(4, 4) T_world_lidar of a scan: straight ahead, with a little steering."""
-    x = _STEP * number
-    turned = se3.exp(np.array([0, 0, 0.05 * np.sin(x / 12), 0, 0, 0]))[:3, :3]
-    return se3.make(turned, np.array([x, 0.6 * np.sin(x / 12), _HEIGHT]))
+    x = _SCAN_SPACING * number
+    R = se3.exp(np.array([0, 0, 0.05 * np.sin(x / 12), 0, 0, 0]))[:3, :3]
+    return se3.make(R, np.array([x, 0.6 * np.sin(x / 12), _LIDAR_HEIGHT]))

@@ -101,7 +101,7 @@ def trajectory_pictures(runs: Mapping[str, Mapping[str, Path]], out: Path, notes
     """
     for sequence, folders in runs.items():
         ways, truth = aligned_ways(folders)
-        draw = partial(trajectories_png, ways=ways, truth=truth, title=sequence)
+        draw = partial(trajectories_png, trajectories=ways, truth=truth, title=sequence)
         if not drawn(out / f"trajectories_{sequence}.png", notes, draw):
             break  # the others would give the same note
 
