@@ -74,27 +74,31 @@ def ablation(settings: AblationSettings, out: Path) -> Table:
     table: Table = {name: {drives: {} for drives in settings.measure} for name in settings.variants}
     for seed in range(settings.seeds):
         for name in settings.variants:
-            for drives, figures in _measured(settings, name, seed, out).items():
+            for drives, figures in _train_and_measure(settings, name, seed, out).items():
                 for figure, value in figures.items():
                     table[name][drives].setdefault(figure, []).append(value)
     return table
 
 
-def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> dict[str, dict[str, float]]:
+def _train_and_measure(settings: AblationSettings, name: str, seed: int, out: Path) -> dict[str, dict[str, float]]:
     """Figures by drives of one training."""
     network = merged(settings.training.network, settings.variants[name])
-    first = settings.training.optimiser
-    optimiser = first.model_copy(update={"seed": first.seed + seed})
+    base = settings.training.optimiser
+    optimiser = base.model_copy(update={"seed": base.seed + seed})
     training = settings.training.model_copy(update={"network": network, "optimiser": optimiser})
     folder = out / name.replace(" ", "_") / str(seed)
-    weights, known = folder / WEIGHTS, folder / "figures.json"
-    asked = {"measure": settings.measure, "content": _content(settings.measure.values()), "pairs": settings.pairs}
-    read = [weights_path(training.start)] if training.start else []
-    begin_training(folder, training, read, {"content": _content(training.data.packed)})
-    if weights.exists() and known.exists() and (stored := json.loads(known.read_text()))["asked"] == asked:
+    weights, figures_file = folder / WEIGHTS, folder / "figures.json"
+    request = {"measure": settings.measure, "content": _digests(settings.measure.values()), "pairs": settings.pairs}
+    inputs = [weights_path(training.start)] if training.start else []
+    begin_training(folder, training, inputs, {"content": _digests(training.data.packed)})
+    if (
+        weights.exists()
+        and figures_file.exists()
+        and (stored := json.loads(figures_file.read_text()))["asked"] == request
+    ):
         return dict(stored["figures"])
     if not weights.exists():
-        known.unlink(missing_ok=True)  # figures of earlier weights: a stopped measurement is repeated
+        figures_file.unlink(missing_ok=True)  # figures of earlier weights: a stopped measurement is repeated
         train_registration(training, folder)
     model = load_model(weights)
     images = training.data.images and model.encoder.image is not None
@@ -102,12 +106,12 @@ def _measured(settings: AblationSettings, name: str, seed: int, out: Path) -> di
         drives: PairSet(Path(folder_of), settings.pairs, model.settings, images).measure(model)
         for drives, folder_of in settings.measure.items()
     }
-    with atomic_write(known) as file:
-        file.write(json.dumps({"asked": asked, "figures": figures}))
+    with atomic_write(figures_file) as file:
+        file.write(json.dumps({"asked": request, "figures": figures}))
     return figures
 
 
-def _content(folders: Iterable[str]) -> list[str]:
+def _digests(folders: Iterable[str]) -> list[str]:
     """Digests of folders of packed drives, so that other drives in their place are detected."""
     return [f"{folder}: {packed_digest(open_packed(Path(folder)))}" for folder in folders]
 
@@ -131,12 +135,16 @@ def ablation_tables(table: Table) -> Iterator[FigureTable]:
     found = gains(table)
     for drives in table[first]:
         columns = ["near m", "near", "far", "turned"]
-        shown = FigureTable(drives, names=["variant"], figures=columns, text=[f"right near pairs beside {first}"])
+        figure_table = FigureTable(
+            drives, names=["variant"], figures=columns, text=[f"right near pairs beside {first}"]
+        )
         for name, rows in table.items():
             row = {figure: mean(values) for figure, values in rows[drives].items()}
             gain = found.get(name, {}).get(drives, {}).get("near_success")
-            shown.add_row(name, *(_cell(row, figure) for figure in COMPARED), "" if gain is None else str(Gain(**gain)))
-        yield shown
+            figure_table.add_row(
+                name, *(_cell(row, figure) for figure in COMPARED), "" if gain is None else str(Gain(**gain))
+            )
+        yield figure_table
 
 
 def _cell(row: dict[str, float], figure: str) -> str:

@@ -39,12 +39,12 @@ def paired_gain(without: Sequence[float], with_: Sequence[float], lower_is_bette
         without, with_: a figure of each seed, in the same order; a seed in which either is not finite is left out.
     """
     pairs = [pair for pair in zip(without, with_, strict=True) if all(map(isfinite, pair))]
-    size = abs(mean(a for a, _ in pairs)) if pairs else 0.0
-    if not size:
+    baseline = abs(mean(a for a, _ in pairs)) if pairs else 0.0
+    if not baseline:
         return None
     sign = -1 if lower_is_better else 1
-    gains = [sign * (b - a) / size for a, b in pairs]
+    gains = [sign * (b - a) / baseline for a, b in pairs]
     center, n = mean(gains), len(gains)
-    half = float(stdtrit(n - 1, 0.975)) * stdev(gains) / n**0.5 if n > 1 else None
-    low, high = (None, None) if half is None else (center - half, center + half)
+    half_width = float(stdtrit(n - 1, 0.975)) * stdev(gains) / n**0.5 if n > 1 else None
+    low, high = (None, None) if half_width is None else (center - half_width, center + half_width)
     return Gain(center, low, high, sum(gain > 0 for gain in gains), n)

@@ -13,7 +13,7 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 
-_REACH = 100.0  # m, KISS-ICP's default
+_MAX_RANGE = 100.0  # m, KISS-ICP's default
 
 
 class Peer(Protocol):
@@ -69,8 +69,8 @@ def kiss_icp_config(threads: int, deskew: bool) -> Any:
         from kiss_icp.config import load_config
 
     config = load_config(None)
-    config.data.deskew, config.data.max_range = deskew, _REACH
-    config.mapping.voxel_size = _REACH / 100
+    config.data.deskew, config.data.max_range = deskew, _MAX_RANGE
+    config.mapping.voxel_size = _MAX_RANGE / 100
     config.registration.max_num_threads = threads
     return config
 
@@ -149,11 +149,11 @@ def make_peer(name: str, threads: int, deskew: bool) -> Peer:
 
 def cloud_and_times(frame: Frame) -> tuple[Array, Array]:
     """(M, 3) float64 points without invalid ones, and (M,) their times within the sweep, 0..1; (0,) without times."""
-    sound = np.isfinite(frame.points[:, :3]).all(1)
-    cloud = frame.points[sound, :3].astype(np.float64)
+    finite = np.isfinite(frame.points[:, :3]).all(1)
+    cloud = frame.points[finite, :3].astype(np.float64)
     if frame.time_offset is None:
         return cloud, np.array([])
-    times = frame.time_offset[sound].astype(np.float64)
+    times = frame.time_offset[finite].astype(np.float64)
     span = float(np.ptp(times)) if len(times) else 0.0
     return cloud, (times - times.min()) / span if span > 0 else np.zeros(len(times))
 
@@ -174,6 +174,8 @@ def at_stamps(poses: Array, ends: Sequence[int], stamps: Sequence[int]) -> Array
     end, stamp = np.asarray(ends, np.float64), np.asarray(stamps, np.float64)
     number = np.arange(len(poses))
     before, after = np.maximum(number - 1, 0), np.maximum(number, 1)
-    span, own = end[after] - end[before], np.minimum(number, 1.0)
-    part = np.divide(stamp - end[before], span, out=own, where=span > 0)  # its own pose where a clock went back
-    return se3.interpolated(poses[before], poses[after], np.clip(part, -1, 1))
+    span, own_fraction = end[after] - end[before], np.minimum(number, 1.0)
+    fraction = np.divide(
+        stamp - end[before], span, out=own_fraction, where=span > 0
+    )  # its own pose where a clock went back
+    return se3.interpolated(poses[before], poses[after], np.clip(fraction, -1, 1))

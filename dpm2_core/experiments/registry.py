@@ -20,7 +20,7 @@ from dpm2_core.files import atomic_write
 from dpm2_core.fleet.part import Figures, Part, Progress, run_parts
 from dpm2_core.tables import FigureTable
 
-_ALWAYS = frozenset({"data", "out", "sequences", "workers", "overrides"})
+_COMMON_OPTIONS = frozenset({"data", "out", "sequences", "workers", "overrides"})
 
 
 @dataclass(frozen=True)
@@ -89,17 +89,17 @@ def tables_in(folder: Path) -> list[FigureTable]:
     for name in EXPERIMENTS:
         below = (page.with_suffix(".json") for page in sorted(folder.rglob(f"{name}.html")))  # `carry_out` writes both
         for path in dict.fromkeys([folder / f"{name}.json", *below]):
-            where = "" if path.parent == folder else f"{path.parent.relative_to(folder)}: "
-            tables += _tables_of(path, where)
+            prefix = "" if path.parent == folder else f"{path.parent.relative_to(folder)}: "
+            tables += _read_tables(path, prefix)
     return tables
 
 
-def _tables_of(path: Path, where: str) -> list[FigureTable]:
-    """The tables in an experiment's JSON file, with `where` before their titles; none if there is no such file."""
+def _read_tables(path: Path, prefix: str) -> list[FigureTable]:
+    """The tables in an experiment's JSON file, with `prefix` before their titles; none if there is no such file."""
     if not path.is_file():
         return []
     try:
-        return [shown(record, where) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
+        return [shown(record, prefix) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no record of an experiment: {error}") from None
 
@@ -123,29 +123,31 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Finding
         findings.notes.append(f"parts were made at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", _record(request, findings, figures), threads=request.workers)
     tables = [shown(table.record()) for table in findings.tables]
-    runs = [(f"{row}, {sequence}", path) for sequence, of in findings.runs.items() for row, path in of.items()]
+    runs = [
+        (f"{row}, {sequence}", path) for sequence, folders in findings.runs.items() for row, path in folders.items()
+    ]
     with atomic_write(request.out / f"{name}.html") as file:
         file.write(runs_page(f"{name}: {EXPERIMENTS[name].paper}", runs, tables))
     return findings
 
 
 def _check_options(name: str, request: Request, experiment: Experiment) -> None:
-    useless = [
+    unsupported = [
         field.name
         for field in fields(request)
-        if field.name not in _ALWAYS | experiment.uses and getattr(request, field.name) not in (None, ())
+        if field.name not in _COMMON_OPTIONS | experiment.uses and getattr(request, field.name) not in (None, ())
     ]
-    if useless:
-        raise UsageError(f"{name}: has no use for --{useless[0]}")
+    if unsupported:
+        raise UsageError(f"{name}: has no use for --{unsupported[0]}")
 
 
 def _check_names(name: str, parts: Sequence[Part]) -> None:
     """Reject two parts in one folder: the second would overwrite the first, and both rows would show its figures."""
     folders = Counter(part.name for part in parts)
-    twice = [folder for folder, count in folders.items() if count > 1]
-    if twice:
+    repeated = [folder for folder, count in folders.items() if count > 1]
+    if repeated:
         raise UsageError(
-            f"{name}: two results of one name ({twice[0]}); name --sequences, --registration and --peer differently"
+            f"{name}: two results of one name ({repeated[0]}); name --sequences, --registration and --peer differently"
         )
 
 

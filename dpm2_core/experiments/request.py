@@ -63,7 +63,7 @@ class Findings:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-def drawn(path: Path, notes: list[str], draw: Callable[[Path], None]) -> bool:
+def draw_if_possible(path: Path, notes: list[str], draw: Callable[[Path], None]) -> bool:
     """Draw an image; False, and a note, if a package for it is not installed."""
     try:
         draw(path)

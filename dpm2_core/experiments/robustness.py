@@ -11,7 +11,7 @@ from dpm2_core.data.corrupt import CorruptedSource, parse_corruption
 from dpm2_core.data.source import Source, frame_at
 from dpm2_core.evaluation.figures import corrupted_png
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, PAPER, TESTED
-from dpm2_core.experiments.request import Experiment, Findings, Request, drawn
+from dpm2_core.experiments.request import Experiment, Findings, Request, draw_if_possible
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
@@ -35,7 +35,7 @@ SHARES = (0.05, 0.3, 0.5, 1.0)
 KINDS = {"camera": "camera black", "obstruction": "box before the LiDAR"}
 _PAPER_MEAN = {"camera": (0.62, 0.61, 0.69, 1.04), "obstruction": (0.62, 0.66, 0.71, 0.74)}
 """Mean t_err of 06 to 10, percent, of the paper's table 2."""
-_PICTURED = 4
+_DRAWN_FRAME = 4
 """Position of the frame that is drawn."""
 
 
@@ -45,13 +45,13 @@ def _variants(request: Request) -> list[tuple[str, list[str], str | None]]:
     for name, settings in registrations(request):
         rows.append((f"{name}, whole", settings, None))
         for kind, label in KINDS.items():
-            if kind == "camera" and not _sees(request, settings):
+            if kind == "camera" and not _uses_images(request, settings):
                 continue
             rows += [(f"{name}, {label} {share:.0%}", settings, f"{kind}={share},seed=0") for share in SHARES]
     return rows
 
 
-def _sees(request: Request, settings: Sequence[str]) -> bool:
+def _uses_images(request: Request, settings: Sequence[str]) -> bool:
     """Whether there are images, and a camera would be used: if not, black images change nothing."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
     config = load_settings(Config, None, [*settings, *weights, *request.overrides])
@@ -60,11 +60,11 @@ def _sees(request: Request, settings: Sequence[str]) -> bool:
 
 def _has_images(request: Request) -> bool:
     """Whether the first frame of a sequence has an image."""
-    sources = (_opened(request, sequence) for sequence in present(request, TESTED, ORIGINAL_POSES))
+    sources = (_open_sequence(request, sequence) for sequence in present(request, TESTED, ORIGINAL_POSES))
     return any(frame_at(source, 0).images for source in sources)
 
 
-def _opened(request: Request, sequence: str) -> Source:
+def _open_sequence(request: Request, sequence: str) -> Source:
     return open_drive(request.data, reading(request, sequence, ORIGINAL_POSES))
 
 
@@ -86,16 +86,16 @@ def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     table = ResultTable("Failing sensors: t_err % / r_err deg per 100 m", [*sequences, MEAN], SHOWN, caption)
     variants = _variants(request)
     changes: dict[str, float | None] = {}
-    whole: float | None = None
+    baseline: float | None = None
     for name, _, corrupt in variants:
         add_runs(table, name, sequences, figures)
         mean = table.rows[-1].cells[MEAN]["t_err_percent"]
-        whole = mean if corrupt is None else whole
-        change = 100 * (mean / whole - 1) if mean is not None and whole else None
+        baseline = mean if corrupt is None else baseline
+        change = 100 * (mean / baseline - 1) if mean is not None and baseline else None
         if corrupt is not None:
             changes[name] = change
-            said = ["" if change is None else f"{change:+.0f} %", table.rows[-1].note]
-            table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, said)))
+            row_notes = ["" if change is None else f"{change:+.0f} %", table.rows[-1].note]
+            table.rows[-1] = replace(table.rows[-1], note="; ".join(filter(None, row_notes)))
     table.add("DeepPointMap2, whole", PAPER, "the paper")
     for kind, means in _PAPER_MEAN.items():
         for share, mean in zip(SHARES, means, strict=True):
@@ -107,19 +107,19 @@ def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
     if not any(corrupt and corrupt.startswith("camera") for _, _, corrupt in variants):
         notes.append("no rows with a black camera: there are no images, or this configuration makes no use of them")
     runs = run_folders([name for name, _, _ in variants], sequences, request.out)
-    _picture(request, sequences[0], notes)
+    _draw_corrupted(request, sequences[0], notes)
     return Findings([table], notes, runs, {"change_percent": changes})
 
 
-def _picture(request: Request, sequence: str, notes: list[str]) -> None:
+def _draw_corrupted(request: Request, sequence: str, notes: list[str]) -> None:
     """The paper's figure 6: a frame as it is, and with both sensors corrupted."""
-    source = _opened(request, sequence)
-    at = min(_PICTURED, len(source) - 1)
-    hit = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
-    before, after = (frame_at(of, at) for of in (source, hit))
+    source = _open_sequence(request, sequence)
+    position = min(_DRAWN_FRAME, len(source) - 1)
+    corrupted = CorruptedSource(source, parse_corruption("camera=1,obstruction=1,seed=0"))
+    before, after = (frame_at(each, position) for each in (source, corrupted))
     path = request.out / f"corrupted_{sequence}.png"
     title = f"{sequence}, frame {before.index}: camera black, box before the LiDAR"
-    drawn(path, notes, lambda to: corrupted_png(to, before, after, title))
+    draw_if_possible(path, notes, lambda to: corrupted_png(to, before, after, title))
 
 
 ROBUSTNESS = Experiment(frozenset({"weights", "registrations", "lengths", "frames"}), _parts, _findings)

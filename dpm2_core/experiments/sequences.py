@@ -75,11 +75,14 @@ def registrations(request: Request) -> list[tuple[str, list[str]]]:
 def own_part(name: str, sequence: str, request: Request, settings: Sequence[str], **more: Any) -> Part:
     """The part of our SLAM on a sequence; the user's settings override `settings`."""
     weights = [] if request.weights is None else [f"slam.neural.weights={request.weights}"]
-    asked = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
-    named = [setting.partition("=")[2] for setting in asked if setting.endswith(".safetensors")]
-    files = [Path(os.path.expanduser(path)) for path in named]
-    arguments, content = {"drive": _drive(request, asked), **more}, drive_content(request.data, asked)
-    return Part(f"{_folder(name)}/{sequence}", OWN, arguments, files, content=content)
+    all_settings = [f"input.sequence='{sequence}'", *settings, *weights, *request.overrides]
+    weight_files = [setting.partition("=")[2] for setting in all_settings if setting.endswith(".safetensors")]
+    files = [Path(os.path.expanduser(path)) for path in weight_files]
+    arguments, content = (
+        {"drive": _drive_arguments(request, all_settings), **more},
+        drive_content(request.data, all_settings),
+    )
+    return Part(f"{_folder_name(name)}/{sequence}", OWN, arguments, files, content=content)
 
 
 def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[str]) -> list[Part]:
@@ -94,9 +97,9 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
         if equals and "{sequence}" not in file and len(sequences) > 1:
             raise UsageError(f"--peer {text}: of {len(sequences)} sequences; put {{sequence}} where its name stands")
         for sequence in sequences:
-            asked = reading(request, sequence, settings)
-            drive, content = _drive(request, asked), drive_content(request.data, asked)
-            folder, path = f"{_folder(name)}/{sequence}", Path(file.replace("{sequence}", sequence))
+            drive_settings = reading(request, sequence, settings)
+            drive, content = _drive_arguments(request, drive_settings), drive_content(request.data, drive_settings)
+            folder, path = f"{_folder_name(name)}/{sequence}", Path(file.replace("{sequence}", sequence))
             if equals:
                 parts.append(Part(folder, GIVEN, {"drive": drive, "file": path}, [path], content=content))
             else:
@@ -122,19 +125,21 @@ def add_runs(
     Args:
         label: of the row; `name` by default. about: further note on the row.
     """
-    of = {sequence: figures[f"{_folder(name)}/{sequence}"] for sequence in sequences}
-    failed = [f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in of.items() if f["failed_frames"]]
+    by_sequence = {sequence: figures[f"{_folder_name(name)}/{sequence}"] for sequence in sequences}
+    failed = [
+        f"{f['failed_frames']} of {f['frames']} frames of {s}" for s, f in by_sequence.items() if f["failed_frames"]
+    ]
     notes = [about, f"failed: {', '.join(failed)}" if failed else ""]
-    cells = {sequence: {figure: f.get(figure) for figure in table.figures} for sequence, f in of.items()}
+    cells = {sequence: {figure: f.get(figure) for figure in table.figures} for sequence, f in by_sequence.items()}
     table.add(label or name, cells, note="; ".join(filter(None, notes)))
 
 
 def run_folders(names: Sequence[str], sequences: Sequence[str], out: Path) -> dict[str, dict[str, Path]]:
     """Folders of the runs by sequence and name."""
-    return {sequence: {name: out / _folder(name) / sequence for name in names} for sequence in sequences}
+    return {sequence: {name: out / _folder_name(name) / sequence for name in names} for sequence in sequences}
 
 
-def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
+def _drive_arguments(request: Request, settings: Sequence[str]) -> dict[str, Any]:
     return {
         "data": request.data,
         "settings": list(settings),
@@ -143,5 +148,5 @@ def _drive(request: Request, settings: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _folder(name: str) -> str:
+def _folder_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name)

@@ -108,11 +108,11 @@ def peer(folder: Path, advance: Advance, drive: Drive, name: str) -> Figures:
     write_tum(folder / TRAJECTORY, stamps, poses)
     write_frames(folder / FRAMES, [(i, s, "", name) for i, s in zip(index, stamps, strict=True)],
                  {"total": seconds})  # fmt: skip
-    truth = _truth(source, start, stop)
+    truth = _true_poses(source, start, stop)
     write_truth(folder / TRUTH, stamps, truth)
     fps = len(seconds) / sum(seconds)
     write_json(folder / TIMING, {"frames": len(stamps), "fps": fps})
-    return _measured(folder, source, (stamps, truth, poses), drive, fps)
+    return _write_metrics(folder, source, (stamps, truth, poses), drive, fps)
 
 
 def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
@@ -123,21 +123,21 @@ def given(folder: Path, advance: Advance, drive: Drive, file: Path) -> Figures:
     """
     source = open_drive(drive["data"], drive["settings"], images=False)
     start, stop = span_of(source, drive["frames"])
-    truth = _truth(source, start, stop)
+    truth = _true_poses(source, start, stop)
     # Only names and stamps are needed, but a source provides them only with its frames.
     keys = [(frame.index, frame.stamp) for frame in prefetch(source.frames(start, stop))]
     index, stamps = (np.array(column, np.int64) for column in zip(*keys, strict=True))
-    poses = _poses_of(file, source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
+    poses = _read_poses(file, source, (start, stop), truth, {"tum": stamps, "kitti-indexed": index})
     if not known(poses).any():
         raise UsageError(f"{file}: has no pose during the frames of {source.name}")
-    there = known(poses)
-    write_tum(folder / TRAJECTORY, stamps[there].tolist(), poses[there])
+    is_known = known(poses)
+    write_tum(folder / TRAJECTORY, stamps[is_known].tolist(), poses[is_known])
     write_truth(folder / TRUTH, stamps.tolist(), truth)
     advance(len(truth), len(truth))
-    return _measured(folder, source, (stamps, truth, poses), drive, None)
+    return _write_metrics(folder, source, (stamps, truth, poses), drive, None)
 
 
-def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, Keys]) -> Array:
+def _read_poses(file: Path, source: Source, span: tuple[int, int], truth: Array, keys: dict[str, Keys]) -> Array:
     """Poses (N, 4, 4) of the LiDAR for the frames of a span, with true poses `truth` and `keys`; NaN for none.
 
     Raises:
@@ -145,9 +145,9 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
     """
     found = read_trajectory(file)
     if found.kind == "kitti" and len(found) != len(truth):  # of the whole recording, or of a longer one
-        whole = read_ground_truth(source, file, *span)
-        assert isinstance(whole, np.ndarray)
-        return whole
+        all_poses = read_ground_truth(source, file, *span)
+        assert isinstance(all_poses, np.ndarray)
+        return all_poses
     own_keys = keys.get(found.kind, np.arange(len(truth), dtype=np.int64))
     if found.kind == "tum":  # may be of some frames only, such as keyframes: between these nothing is known
         same = same_stamps(own_keys, found.keys)
@@ -161,19 +161,19 @@ def _poses_of(file: Path, source: Source, span: tuple[int, int], truth: Array, k
     return lidar_poses(poses, source.T_cam_lidar)
 
 
-def _truth(source: Source, start: int, stop: int) -> Array:
+def _true_poses(source: Source, start: int, stop: int) -> Array:
     if source.poses is None:
         raise UsageError(f"{source.name}: no ground truth to compare with")
     return source.poses[start:stop]
 
 
-def _measured(
+def _write_metrics(
     folder: Path, source: Source, poses: tuple[Sequence[int] | Keys, Array, Array], drive: Drive, fps: float | None
 ) -> Figures:
     """Figures of stamps (N,) ns, true and estimated poses (N, 4, 4) of the LiDAR; they are those of KITTI's left camera
     if its extrinsics are known."""
-    stamps, *both = poses
-    truth, est = (camera_poses(each, source.T_cam_lidar) for each in both)
+    stamps, *pair = poses
+    truth, est = (camera_poses(each, source.T_cam_lidar) for each in pair)
     metrics: Metrics = evaluate(truth, est, tuple(drive["lengths"]), stamps=np.asarray(stamps, np.int64))
     metrics = metrics.model_copy(update={"truth": source.truth, "fps": fps})
     write_json(folder / METRICS, metrics.model_dump())

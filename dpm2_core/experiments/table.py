@@ -45,9 +45,9 @@ class ResultTable:
         """Add a row, with the table's columns. If the table has a column `MEAN` and the row does not, the mean of each
         figure is added that every column has."""
         cells = {column: cells[column] for column in self.columns if column in cells}
-        given = [column for column in self.columns if column != MEAN]
+        data_columns = [column for column in self.columns if column != MEAN]
         if MEAN in self.columns and MEAN not in cells:
-            cells = {**cells, MEAN: {figure: _mean(cells, given, figure) for figure in self.figures}}
+            cells = {**cells, MEAN: {figure: _mean(cells, data_columns, figure) for figure in self.figures}}
         self.rows.append(Row(name, origin, cells, note))
 
     def record(self) -> dict[str, Any]:
@@ -63,8 +63,8 @@ class ResultTable:
 
 def _mean(cells: Cells, columns: Sequence[str], figure: str) -> float | None:
     values = [cells.get(column, {}).get(figure) for column in columns]
-    there = [value for value in values if value is not None]
-    return sum(there) / len(there) if there and len(there) == len(values) else None
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
 def shown(record: Mapping[str, Any], where: str = "") -> FigureTable:

@@ -75,17 +75,17 @@ def train(
         UsageError: no such scans, or too few.
     """
     settings = settings_of(training)
-    kind = task_type(training["task"])
+    task_class = task_type(training["task"])
     # All arms must see the same scans, so the one that needs most decides: the one without the SLAM loss.
-    needs = kind.learns_from(settings_of({**training, "arm": "without"}))
-    scans = open_scans(training["data"], needs, training["learn"])
-    asked = {"training": training, "until": until, "content": scans.digest()}
-    begin_training(folder, settings, data=asked, start=start)
+    required = task_class.learns_from(settings_of({**training, "arm": "without"}))
+    scans = open_scans(training["data"], required, training["learn"])
+    inputs = {"training": training, "until": until, "content": scans.digest()}
+    begin_training(folder, settings, data=inputs, start=start)
     task = new_task(training["task"], settings)
     train_task(task, scans, folder, until=until)
     advance(1, 1)
     epochs = until or settings.epochs
-    return {"scans": len(scans), "epochs": epochs, **_logged(folder, epochs, settings.slam.gamma)}
+    return {"scans": len(scans), "epochs": epochs, **_log_figures(folder, epochs, settings.slam.gamma)}
 
 
 def measure_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Scans) -> Figures:
@@ -110,10 +110,10 @@ def slam_on(folder: Path, advance: Advance, task: str, weights: Path, drive: Sca
     for run in slam_runs(load_task(task, weights), *drive):
         rows[run.sequence] = figures_of(run)
         for kind, poses in run.poses.items():
-            place = folder / folder_name(run.sequence) / kind
-            make_folder(place)
-            write_tum(place / TRAJECTORY, run.stamps, poses)
-            write_truth(place / TRUTH, run.stamps, run.truth)
+            run_folder = folder / folder_name(run.sequence) / kind
+            make_folder(run_folder)
+            write_tum(run_folder / TRAJECTORY, run.stamps, poses)
+            write_truth(run_folder / TRUTH, run.stamps, run.truth)
         advance(len(rows), len(rows))
     return {"sequences": rows, **mean_figures(list(rows.values()))}
 
@@ -123,14 +123,14 @@ def folder_name(sequence: str) -> str:
     return sequence.replace("/", "_")
 
 
-def _logged(folder: Path, epochs: int, gamma: float) -> Figures:
+def _log_figures(folder: Path, epochs: int, gamma: float) -> Figures:
     """The loss of the last of these epochs, the ratio of the SLAM loss to the task's when first used, and the skipped
     steps."""
     rows = [row for row in read_log(folder) if "norm" in row]
-    epoch = max(1, len(rows) // epochs)  # steps of an epoch
-    first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch]
+    epoch_steps = max(1, len(rows) // epochs)
+    first = [row for row in rows if row.get("slam_loss") is not None and row["task_loss"]][:epoch_steps]
     share = [gamma * row["slam_loss"] / row["task_loss"] for row in first]
-    last = [row["task_loss"] for row in rows[-epoch:] if row["task_loss"] is not None]  # None: it was not finite
+    last = [row["task_loss"] for row in rows[-epoch_steps:] if row["task_loss"] is not None]  # None: it was not finite
     return {
         "last_task_loss": median(last) if last else None,
         "slam_share_at_first": median(share) if share else None,

@@ -12,7 +12,7 @@ from statistics import mean
 from typing import Any
 
 from dpm2_core.errors import UsageError
-from dpm2_core.experiments.kitti import trajectory_pictures
+from dpm2_core.experiments.kitti import draw_trajectories
 from dpm2_core.experiments.paired import paired_gain
 from dpm2_core.experiments.request import Experiment, Findings, Request
 from dpm2_core.experiments.sequences import learned_note
@@ -75,28 +75,33 @@ class TaskTable:
             UsageError: the SLAM loss would never be used, or there are no such scans.
         """
         self._check_slam_loss(request)
-        learned, tested_on = (open_scans(request.data, (), words).digest() for words in self._sequences(request))
+        learned_digest, tested_digest = (
+            open_scans(request.data, (), words).digest() for words in self._sequences(request)
+        )
         shared: list[Part] = []
         arms: list[Part] = []
         measured: list[Part] = []
         drive = request.data, list(self._sequences(request)[1])
         for seed in range(request.seeds or SEEDS):
-            common = first_slam_epoch(settings_of(self._training(request, seed, "with")))
+            shared_epochs = first_slam_epoch(settings_of(self._training(request, seed, "with")))
             start = None
-            if common:
+            if shared_epochs:
                 training = self._training(request, seed, "without")
-                shared.append(Part(self._name(seed, "shared"), TRAIN, {"training": training, "until": common},
-                                   request.config_files, content=learned))  # fmt: skip
-                start = request.out / self._name(seed, "shared")
+                shared.append(Part(self._arm_name(seed, "shared"), TRAIN,
+                                   {"training": training, "until": shared_epochs},
+                                   request.config_files, content=learned_digest))  # fmt: skip
+                start = request.out / self._arm_name(seed, "shared")
             for arm in ARMS:
-                name = self._name(seed, arm)
+                name = self._arm_name(seed, arm)
                 training = self._training(request, seed, arm)
                 checkpoint = [] if start is None else [start / CHECKPOINT]
                 inputs = [*request.config_files, *checkpoint]
-                arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs, content=learned))
+                arms.append(Part(name, TRAIN, {"training": training, "start": start}, inputs, content=learned_digest))
                 weights = request.out / name / WEIGHTS
-                tested = {"task": self.task, "weights": weights, "drive": drive}
-                part = Part(self._measured(seed, arm), self.measured, tested, [weights], content=tested_on)
+                arguments = {"task": self.task, "weights": weights, "drive": drive}
+                part = Part(
+                    self._measurement_name(seed, arm), self.measured, arguments, [weights], content=tested_digest
+                )
                 measured.append(part)
         return [stage for stage in (shared, arms, measured) if stage]
 
@@ -115,12 +120,12 @@ class TaskTable:
         """The table, with a row per arm, and the gain by the SLAM loss."""
         seeds = range(request.seeds or SEEDS)
         table = ResultTable(self.title, list(self.figures), {"mean": ".4g"}, "Means over the seeds and the test scans.")
-        of: dict[str, dict[str, list[float]]] = {
-            arm: {name: [figures[self._measured(seed, arm)][name] for seed in seeds] for name in self.figures}
+        values_by_arm: dict[str, dict[str, list[float]]] = {
+            arm: {name: [figures[self._measurement_name(seed, arm)][name] for seed in seeds] for name in self.figures}
             for arm in ARMS
         }
         for arm in ARMS:
-            table.add(ROWS[arm], _means(of[arm]))
+            table.add(ROWS[arm], _means(values_by_arm[arm]))
         for name, row in self.paper.items():
             table.add(name, {figure: {"mean": value} for figure, value in row.items()}, "the paper")
         gains: dict[str, dict[str, Any]] = {}
@@ -128,18 +133,18 @@ class TaskTable:
                                  "Over the mean of the arm named last, seed by seed; positive is better.")  # fmt: skip
         for key, (before, arm) in COMPARED.items():
             for figure in self.figures:
-                gain = paired_gain(of[before][figure], of[arm][figure], figure not in self.higher)
+                gain = paired_gain(values_by_arm[before][figure], values_by_arm[arm][figure], figure not in self.higher)
                 if gain is not None:
                     gains.setdefault(key, {})[figure] = asdict(gain)
                     compared = f"{figure}: {ROWS[arm]} for {ROWS[before]}"
                     gain_table.add(compared, {"gain": {"percent": 100 * gain.mean}}, note=str(gain))
-        notes = [*self.notes, *self._warnings(request, of, figures)]
+        notes = [*self.notes, *self._warnings(request, values_by_arm, figures)]
         if self.measured == SLAM:
-            self._pictures(request, figures, notes)
+            self._draw_trajectories(request, figures, notes)
         return Findings([table, gain_table], notes, extra={"gains": gains})
 
     def _warnings(
-        self, request: Request, of: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
+        self, request: Request, values_by_arm: Mapping[str, Mapping[str, list[float]]], figures: Mapping[str, Figures]
     ) -> list[str]:
         notes = learned_note(*(sequence_names(request.data, chosen) for chosen in self._sequences(request)))
         settings = settings_of(self._training(request, 0, "with"))
@@ -147,19 +152,22 @@ class TaskTable:
             notes.append(
                 "the last epoch has the SLAM loss: the arms are measured right after it; choose other slam.every"
             )
-        still = [figures[self._measured(seed, "without")].get("still_rpe_m") for seed in range(request.seeds or SEEDS)]
-        if self.measured == SLAM and still[0] is not None and sum(of["without"]["output_rpe_m"]) >= sum(
-            value for value in still if value is not None
+        still_rpe = [
+            figures[self._measurement_name(seed, "without")].get("still_rpe_m")
+            for seed in range(request.seeds or SEEDS)
+        ]
+        if self.measured == SLAM and still_rpe[0] is not None and sum(values_by_arm["without"]["output_rpe_m"]) >= sum(
+            value for value in still_rpe if value is not None
         ):  # fmt: skip
             notes.append("odometry on what the network makes is no better than standing still: nothing can be compared")
         return notes
 
-    def _pictures(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
+    def _draw_trajectories(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
         """The paper's figure 3: trajectories on the output of both arms of the first seed, one image per sequence."""
-        names = map(folder_name, figures[self._measured(0, "with")]["sequences"])
-        folders = {ROWS[arm]: request.out / self._measured(0, arm) for arm in ("without", "with")}
+        names = map(folder_name, figures[self._measurement_name(0, "with")]["sequences"])
+        folders = {ROWS[arm]: request.out / self._measurement_name(0, arm) for arm in ("without", "with")}
         runs = {name: {row: folder / name / "output" for row, folder in folders.items()} for name in names}
-        trajectory_pictures(runs, request.out, notes)
+        draw_trajectories(runs, request.out, notes)
 
     def _training(self, request: Request, seed: int, arm: Arm) -> Training:
         defaults = () if request.config is not None else self.defaults
@@ -172,35 +180,35 @@ class TaskTable:
         """The sequences to learn from, and those to test on."""
         return request.learn or self.learn, request.sequences or self.test
 
-    def _name(self, seed: int, arm: str) -> str:
+    def _arm_name(self, seed: int, arm: str) -> str:
         return f"{self.task}/seed_{seed}/{arm}"
 
-    def _measured(self, seed: int, arm: str) -> str:
+    def _measurement_name(self, seed: int, arm: str) -> str:
         kind = "slam" if self.measured == SLAM else "figures"
-        return f"{self._name(seed, arm)}/{kind}"
+        return f"{self._arm_name(seed, arm)}/{kind}"
 
 
 def _means(figures: Mapping[str, Sequence[float]]) -> Cells:
-    known = {name: [value for value in values if isfinite(value)] for name, values in figures.items()}
-    return {name: {"mean": mean(values) if values else None} for name, values in known.items()}
+    finite = {name: [value for value in values if isfinite(value)] for name, values in figures.items()}
+    return {name: {"mean": mean(values) if values else None} for name, values in finite.items()}
 
 
 _CARLA_LEARN, _CARLA_TEST = tuple(map(str, range(8))), tuple(map(str, range(9, 15)))
-_GROUND = {
+_PAPER_GROUND = {
     "mse_authors": (0.76, 0.72), "ground_iou": (0.81, 0.81), "ground_precision": (0.85, 0.83),
     "ground_recall": (0.94, 0.97),
 }  # fmt: skip
-_OF_OBSTACLES = ("mse", "miou", "precision", "recall")
+_OBSTACLE_FIGURES = ("mse", "miou", "precision", "recall")
 _DSLR_DEFAULTS = ("slam.gamma=8", "slam.begin=44", "slam.every=3", "slam_loss.points=1024")
 
 GNDNET = TaskTable(
     title="Table 1: GndNet on SemanticKITTI",
     task="gndnet",
     measured=MEASURE,
-    figures=dict.fromkeys((*_GROUND, *_OF_OBSTACLES), ".4g"),
+    figures=dict.fromkeys((*_PAPER_GROUND, *_OBSTACLE_FIGURES), ".4g"),
     paper={
-        "GndNet": {name: both[0] for name, both in _GROUND.items()},
-        "GndNet with SLAM loss": {name: both[1] for name, both in _GROUND.items()},
+        "GndNet": {name: both[0] for name, both in _PAPER_GROUND.items()},
+        "GndNet with SLAM loss": {name: both[1] for name, both in _PAPER_GROUND.items()},
     },
     learn=("00", "02", "03", "04", "08", "10"),
     test=("05", "09", "01", "06"),

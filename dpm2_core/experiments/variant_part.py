@@ -49,12 +49,12 @@ def training_of(
     """
     chosen = load_settings(RegistrationTrainingSettings, config, settings)
     path = weights_path(start)
-    own = network_settings(path)
+    base = network_settings(path)
     if chosen.start:
         raise UsageError(f"start {chosen.start}: what all variants start from is named by --weights")
-    if "preset" in chosen.model_fields_set and chosen.preset != own.preset:
-        raise UsageError(f"preset {chosen.preset}: the network is that of --weights {start}, of preset {own.preset}")
-    tree = merged(merged(own.model_dump(mode="json"), chosen.network), network)
+    if "preset" in chosen.model_fields_set and chosen.preset != base.preset:
+        raise UsageError(f"preset {chosen.preset}: the network is that of --weights {start}, of preset {base.preset}")
+    tree = merged(merged(base.model_dump(mode="json"), chosen.network), network)
     data = chosen.data
     if not data.packed:
         images = any((drive / "pixels.npy").is_file() for drive in packed)

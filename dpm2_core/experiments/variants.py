@@ -13,7 +13,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.evaluation.image_attention import attention_png, image_attention
 from dpm2_core.experiments.ablation import TABLE_4 as TRAINED_ALIKE
 from dpm2_core.experiments.kitti import ORIGINAL_POSES, TESTED
-from dpm2_core.experiments.request import Experiment, Findings, Request, drawn
+from dpm2_core.experiments.request import Experiment, Findings, Request, draw_if_possible
 from dpm2_core.experiments.sequences import (
     FAILED,
     SHOWN,
@@ -41,7 +41,7 @@ AS_PAPER: dict[str, Any] = {
 }
 """What all variants have in common, except for what a variant changes: only the fusion determines where a reference
 point is, and what is there."""
-_POINTS = 256
+_DEFAULT_POINTS = 256
 """Reference points of a variant without a number: Table 4 of the paper has the figures of this number in Table 3."""
 TABLE_3: dict[str, dict[str, Any]] = {
     "FPS 128": {"fusion": {"points": 128}},
@@ -64,8 +64,8 @@ _PAPER_4 = {
     "without learnable": (0.72, 0.46, 18.00, 1.16, 1.21), "without spatial": (41.5, 21.5, 29.9, 26.3, 20.9),
 }  # fmt: skip
 TABLE_4 = {name: TRAINED_ALIKE[name] for name in _PAPER_4}
-_FOR_SLAM = ("slam.", "input.")  # settings of the user that are not of the training
-_ALONE = ("slam.registration=neural", "slam.visual.enabled=false")  # the network alone, as in the paper
+_SLAM_PREFIXES = ("slam.", "input.")  # settings of the user that are not of the training
+_NETWORK_ONLY = ("slam.registration=neural", "slam.visual.enabled=false")  # the network alone, as in the paper
 
 
 @dataclass(frozen=True)
@@ -91,106 +91,114 @@ class VariantTable:
         sequences = present(request, TESTED, ORIGINAL_POSES)
         start = request.weights or "small"
         packs = []
-        for sequence in _learned(request):
-            asked = reading(request, sequence)
-            of = {"data": request.data, "weights": start, "settings": asked}
-            content = drive_content(request.data, asked)
-            packs.append(Part(f"packed/{sequence}", PACK, of, [weights_path(start)], content=content))
+        for sequence in _training_sequences(request):
+            drive_settings = reading(request, sequence)
+            pack_arguments = {"data": request.data, "weights": start, "settings": drive_settings}
+            content = drive_content(request.data, drive_settings)
+            packs.append(Part(f"packed/{sequence}", PACK, pack_arguments, [weights_path(start)], content=content))
         training: dict[str, Any] = {
             "config": request.config,
-            "settings": [text for text in request.overrides if not text.startswith(_FOR_SLAM)],
+            "settings": [text for text in request.overrides if not text.startswith(_SLAM_PREFIXES)],
             "start": start,
         }
         training_of(**training, network={}, packed=())
-        _check_drive(request)
+        _check_slam_settings(request)
         arguments = {"training": training, "packed": [request.out / pack.name / DRIVE for pack in packs]}
         content = " ".join(pack.content for pack in packs)
         inputs = [weights_path(start), *request.config_files]
         trained = [
-            Part(self._training(name), TRAIN, {**arguments, "network": _joined(change)}, inputs, content=content)
+            Part(
+                self._training_name(name),
+                TRAIN,
+                {**arguments, "network": _with_common_changes(change)},
+                inputs,
+                content=content,
+            )
             for name, change in self.variants.items()
         ]
         stages: list[list[Part]] = [packs, trained]
         if self.judged:
-            stages.append([self._run(request, v, sequence) for v in self.variants for sequence in sequences])
+            stages.append([self._run_part(request, v, sequence) for v in self.variants for sequence in sequences])
         return stages
 
     def findings(self, request: Request, figures: Mapping[str, Figures]) -> Findings:
         """The table, and the panel of attention maps."""
         sequences = present(request, TESTED, ORIGINAL_POSES)
-        notes = learned_note(_learned(request), sequences)
+        notes = learned_note(_training_sequences(request), sequences)
         tables = []
         if self.judged:
             caption = f"t_err % / r_err deg per 100 m, mean over {segments(request)}, network alone. {FAILED}"
             table = ResultTable(self.title, [*sequences, MEAN], SHOWN, caption)
             for variant in self.variants:
-                random = len(figures[self._training(variant)]["random_at_start"])
+                random = len(figures[self._training_name(variant)]["random_at_start"])
                 about = f"{random} tensors began at random" if random else ""
-                add_runs(table, self._name(variant), sequences, figures, variant, about)
+                add_runs(table, self._row_name(variant), sequences, figures, variant, about)
             for variant, row in self.paper.items():
                 table.add(variant, {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True)}, "the paper")
             tables.append(table)
             notes.append("every variant was fine-tuned from the same weights, as far as they fit it")
             notes += paper_notes(request, sequences, TESTED)
-        names = [self._name(variant) for variant in self.variants] if self.judged else []
+        names = [self._row_name(variant) for variant in self.variants] if self.judged else []
         runs = run_folders(names, sequences, request.out)
         if self.variants is not TABLE_3:
-            self._panel(request, sequences[0], notes)
+            self._draw_attention(request, sequences[0], notes)
         return Findings(tables, notes, runs)
 
-    def _run(self, request: Request, variant: str, sequence: str) -> Part:
-        weights = request.out / self._training(variant) / WEIGHTS
-        own = replace(request, weights=str(weights), overrides=_for_slam(request))
-        return own_part(self._name(variant), sequence, own, [*ORIGINAL_POSES, *_ALONE])
+    def _run_part(self, request: Request, variant: str, sequence: str) -> Part:
+        weights = request.out / self._training_name(variant) / WEIGHTS
+        variant_request = replace(request, weights=str(weights), overrides=_slam_overrides(request))
+        return own_part(self._row_name(variant), sequence, variant_request, [*ORIGINAL_POSES, *_NETWORK_ONLY])
 
-    def _panel(self, request: Request, sequence: str, notes: list[str]) -> None:
+    def _draw_attention(self, request: Request, sequence: str, notes: list[str]) -> None:
         """The paper's figure 7: attention of one reference point to the image, for every variant with attention."""
         frame = frame_at(open_drive(request.data, reading(request, sequence)), 0)
         if not frame.images:
             notes.append("no attention maps: the data set has no images")
             return
-        looked = {}
+        attentions = {}
         for variant in self.variants:
-            model = load_model(request.out / self._training(variant) / WEIGHTS)
+            model = load_model(request.out / self._training_name(variant) / WEIGHTS)
             try:
-                looked[variant] = image_attention(model, frame)
+                attentions[variant] = image_attention(model, frame)
             except UsageError as error:  # pooling and painting have no attention
                 notes.append(f"no attention map of {variant}: {error}")
         title = f"{sequence}, frame {frame.index}: attention of one reference point"
         path = request.out / f"attention_{sequence}.png"
-        drawn(path, notes, lambda to: attention_png(to, looked, title))
+        draw_if_possible(path, notes, lambda to: attention_png(to, attentions, title))
 
-    def _name(self, variant: str) -> str:
+    def _row_name(self, variant: str) -> str:
         return f"variant {variant}"
 
-    def _training(self, variant: str) -> str:
+    def _training_name(self, variant: str) -> str:
         return f"trained/{variant.replace(' ', '_')}"
 
 
-def _for_slam(request: Request) -> tuple[str, ...]:
-    return tuple(text for text in request.overrides if text.startswith(_FOR_SLAM))
+def _slam_overrides(request: Request) -> tuple[str, ...]:
+    return tuple(text for text in request.overrides if text.startswith(_SLAM_PREFIXES))
 
 
-def _check_drive(request: Request) -> None:
+def _check_slam_settings(request: Request) -> None:
     """Check that each variant is run with its own weights: else every row would be of the same weights, or of none.
 
     Raises:
         UsageError: the user's settings replace those of a variant.
     """
-    own = "those of the variant"
-    slam = load_settings(Config, None, [*_ALONE, f"slam.neural.weights={own}", *_for_slam(request)]).slam
-    if slam.neural.weights != own:
+    placeholder = "those of the variant"
+    slam = load_settings(
+        Config, None, [*_NETWORK_ONLY, f"slam.neural.weights={placeholder}", *_slam_overrides(request)]
+    ).slam
+    if slam.neural.weights != placeholder:
         raise UsageError(f"slam.neural.weights={slam.neural.weights}: each variant is driven with its own weights;"
                          " what all start from is named by --weights")  # fmt: skip
     if slam.registration != "neural":
         raise UsageError(f"slam.registration={slam.registration}: the variants are driven with the network alone")
 
 
-def _joined(change: Mapping[str, Any]) -> dict[str, Any]:
-    return {"fusion": {"points": _POINTS, **AS_PAPER["fusion"], **change.get("fusion", {})}}
+def _with_common_changes(change: Mapping[str, Any]) -> dict[str, Any]:
+    return {"fusion": {"points": _DEFAULT_POINTS, **AS_PAPER["fusion"], **change.get("fusion", {})}}
 
 
-def _learned(request: Request) -> list[str]:
+def _training_sequences(request: Request) -> list[str]:
     """The sequences to learn from: the requested ones, or those of the paper that the data set has."""
     return present(replace(request, sequences=request.learn), LEARNED)
 
