@@ -18,7 +18,7 @@ from dpm2_core.tasks.scan import TaskScan, TaskScans
 from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
 from dpm2_core.tasks.training import mean_figures
 
-_LEAST_DIVERGENCE = 5.0
+_MIN_DIVERGENCE = 5.0
 """Below this a smaller divergence of a VAE does not reduce the loss, nats: the codes keep some information."""
 
 
@@ -47,47 +47,47 @@ class AeLidarTask(Task):
         super().__init__(settings)
         self.network = LidarAutoencoder(settings.network)
         self.slam_loss = SlamLoss(settings.slam_loss)
-        self._ratio = 0.0  # share of the divergence that counts
+        self._divergence_weight = 0.0  # share of the divergence that counts
         self._reader = RangeReader(settings.network.image)
 
     def start_epoch(self, epoch: int) -> None:
         """Increase the weight of the divergence with every epoch."""
-        self._ratio = min(1.0, (epoch + 1) / self.settings.divergence_warmup)
+        self._divergence_weight = min(1.0, (epoch + 1) / self.settings.divergence_warmup)
 
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Sum of absolute errors, and divergence; SLAM on the reconstructions against SLAM on the scans."""
         scans = self._reader.read(window, keep=True)
-        made, divergence = self.network(scans.images)
-        loss = image_error(made, scans.images)
+        output, divergence = self.network(scans.images)
+        loss = image_error(output, scans.images)
         if self.settings.network.variational:
-            loss = loss + self._ratio * divergence.clamp(min=_LEAST_DIVERGENCE).mean()
-        return loss, lambda: slam_of(self.slam_loss, made, scans, self.windows(len(made)))
+            loss = loss + self._divergence_weight * divergence.clamp(min=_MIN_DIVERGENCE).mean()
+        return loss, lambda: slam_of(self.slam_loss, output, scans, self.windows(len(output)))
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans: `chamfer_m` (mean distance, m) and `chamfer` (as DSLR gives it) to the scan, and
         `d_error_m`, the mean error of the distance over ground. And the `variety` of the reconstructions and of the
         scans, `varies_m` and `target_varies_m`."""
-        rows, seen = [], list[tuple[RangeScans, RangeScans]]()
+        rows, pairs = [], list[tuple[RangeScans, RangeScans]]()
         for index in range(len(scans)):
             true = self._reader.read([scans[index].to(self.device)])
-            made = self._made(true)
-            seen.append((made, true))
-            row = chamfer_figures(made.clouds()[0], true.clouds()[0])
-            rows.append(row | {"d_error_m": float(made.off(true)[true.masks].mean())})
-        found, target = zip(*seen, strict=True)
+            output = self._reconstruct(true)
+            pairs.append((output, true))
+            row = chamfer_figures(output.clouds()[0], true.clouds()[0])
+            rows.append(row | {"d_error_m": float(output.off(true)[true.masks].mean())})
+        found, target = zip(*pairs, strict=True)
         return mean_figures(rows) | {"varies_m": variety(found), "target_varies_m": variety(target)}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """The reconstruction and the scan, as range images show them."""
         scans = self._reader.read([scan])
-        return {"output": self._made(scans).clouds()[0], "input": scans.clouds()[0]}
+        return {"output": self._reconstruct(scans).clouds()[0], "input": scans.clouds()[0]}
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan and its reconstruction: range images, and seen from above."""
         scans = self._reader.read([scan])
-        rows = {"scan": scans, "reconstruction": self._made(scans)}
+        rows = {"scan": scans, "reconstruction": self._reconstruct(scans)}
         range_png(path, rows, f"AE_lidar: {scan.sequence}, scan {scan.number}")
 
-    def _made(self, scans: RangeScans) -> RangeScans:
+    def _reconstruct(self, scans: RangeScans) -> RangeScans:
         """The reconstructions of scans; a slot has a point if the scan had one there."""
         return scans.with_images(self.network(scans.images)[0])

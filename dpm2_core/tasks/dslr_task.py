@@ -22,7 +22,7 @@ from dpm2_core.tasks.task import SlamTaskTraining, Task, TaskOptimizer
 from dpm2_core.tasks.training import mean_figures
 
 _BATCH = 16
-_MOVED = 0.5
+_MOVING_DIFFERENCE = 0.5
 """A slot whose distance differs from that of the static twin by more than this, m, shows a moving object."""
 
 
@@ -92,25 +92,25 @@ class DslrTask(Task):
         if self.stage == 1:
             both = torch.cat([static.images, dynamic.images])
             return image_error(network.decoder(network.static_encoder(both)), both), None
-        other = torch.randperm(len(window))
+        shuffled = torch.randperm(len(window))
         if self.stage == 2:
-            codes, moved = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)
-            made = network.decoder(torch.cat([codes, moved]))
-            pairs = _adversarial_loss(network.discriminator(codes, codes[other]), 1.0)
-            pairs = pairs + _adversarial_loss(network.discriminator(codes[other], moved), 0.0)
-            error = image_error(made, torch.cat([static.images, dynamic.images]))
-            return error + self.settings.adversarial * pairs, None
+            static_codes, dynamic_codes = network.static_encoder(torch.cat([static.images, dynamic.images])).chunk(2)
+            output = network.decoder(torch.cat([static_codes, dynamic_codes]))
+            pair_loss = _adversarial_loss(network.discriminator(static_codes, static_codes[shuffled]), 1.0)
+            pair_loss = pair_loss + _adversarial_loss(network.discriminator(static_codes[shuffled], dynamic_codes), 0.0)
+            error = image_error(output, torch.cat([static.images, dynamic.images]))
+            return error + self.settings.adversarial * pair_loss, None
         with torch.no_grad():
-            codes = network.static_encoder(static.images)
-        moved = network.dynamic_encoder(dynamic.images)
-        made = network.decoder(moved)
-        passes = _adversarial_loss(network.discriminator(codes[other], moved), 1.0)
+            static_codes = network.static_encoder(static.images)
+        dynamic_codes = network.dynamic_encoder(dynamic.images)
+        output = network.decoder(dynamic_codes)
+        adversarial_loss = _adversarial_loss(network.discriminator(static_codes[shuffled], dynamic_codes), 1.0)
 
         def slam() -> Tensor:
-            return slam_of(self.slam_loss, made, static, self.windows(len(made)))
+            return slam_of(self.slam_loss, output, static, self.windows(len(output)))
 
         weight = self.settings.adversarial / (len(window) if self.settings.adversarial_shared else 1)
-        return image_error(made, static.images) + weight * passes, slam
+        return image_error(output, static.images) + weight * adversarial_loss, slam
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans.
@@ -119,45 +119,45 @@ class DslrTask(Task):
         `moved_m`: the mean error of the distance where something moves. `input_...`: the same without translation.
         `varies_m` and `target_varies_m`: the `variety` of the translated scans and of the twins.
         """
-        rows, seen = [], list[tuple[RangeScans, RangeScans]]()
+        rows, pairs = [], list[tuple[RangeScans, RangeScans]]()
         for begin in range(0, len(scans), _BATCH):
-            part = [scans[i].to(self.device) for i in range(begin, min(begin + _BATCH, len(scans)))]
-            dynamic, static = self._reader.read(part), self._reader.read(part, static=True)
-            made = self._made(dynamic)
-            seen.append((made, static))
-            for i in range(len(part)):
-                of = static.part(i, i + 1)
-                row = _compared(made.part(i, i + 1), dynamic.part(i, i + 1), of)
-                before = _compared(dynamic.part(i, i + 1), dynamic.part(i, i + 1), of)
-                rows.append(row | {f"input_{name}": value for name, value in before.items()})
-        found, target = zip(*seen, strict=True)
+            batch = [scans[i].to(self.device) for i in range(begin, min(begin + _BATCH, len(scans)))]
+            dynamic, static = self._reader.read(batch), self._reader.read(batch, static=True)
+            output = self._translate(dynamic)
+            pairs.append((output, static))
+            for i in range(len(batch)):
+                twin = static.part(i, i + 1)
+                row = _scan_figures(output.part(i, i + 1), dynamic.part(i, i + 1), twin)
+                unchanged = _scan_figures(dynamic.part(i, i + 1), dynamic.part(i, i + 1), twin)
+                rows.append(row | {f"input_{name}": value for name, value in unchanged.items()})
+        found, target = zip(*pairs, strict=True)
         return mean_figures(rows) | {"varies_m": variety(found), "target_varies_m": variety(target)}
 
     def clouds(self, scan: TaskScan) -> dict[str, Tensor]:
         """Points (N, 3), m, as range images show them: `output`, the translated scan, `kept`, points of the scan that
         `Dslr.in_front` keeps, `input`, the scan, and `target`, its static twin."""
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
-        made = self._made(dynamic)
-        moving = self.network.in_front(dynamic.images[:, 0], made.images[:, 0])
+        output = self._translate(dynamic)
+        moving = self.network.in_front(dynamic.images[:, 0], output.images[:, 0])
         kept = replace(dynamic, masks=dynamic.masks & ~moving)
-        kinds = {"output": made, "kept": kept, "input": dynamic, "target": static}
-        return {name: of.clouds()[0] for name, of in kinds.items()}
+        kinds = {"output": output, "kept": kept, "input": dynamic, "target": static}
+        return {name: range_scans.clouds()[0] for name, range_scans in kinds.items()}
 
     def figure(self, scan: TaskScan, path: Path) -> None:
         """The scan, its translation and its static twin: range images, and seen from above."""
         dynamic, static = self._reader.read([scan]), self._reader.read([scan], static=True)
-        rows = {"scan": dynamic, "translated": self._made(dynamic), "static twin": static}
+        rows = {"scan": dynamic, "translated": self._translate(dynamic), "static twin": static}
         range_png(path, rows, f"DSLR: {scan.sequence}, scan {scan.number}")
 
-    def _made(self, dynamic: RangeScans) -> RangeScans:
+    def _translate(self, dynamic: RangeScans) -> RangeScans:
         """The translated scans; a slot has a point if the scan had one there."""
         return dynamic.with_images(self.network(dynamic.images))
 
 
-def _compared(result: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
+def _scan_figures(result: RangeScans, dynamic: RangeScans, static: RangeScans) -> dict[str, float]:
     """Figures of one scan's translation against its static twin."""
-    moved = dynamic.masks & static.masks & (dynamic.off(static) > _MOVED)
-    error = float(result.off(static)[moved].mean())
+    is_moving = dynamic.masks & static.masks & (dynamic.off(static) > _MOVING_DIFFERENCE)
+    error = float(result.off(static)[is_moving].mean())
     return chamfer_figures(result.clouds()[0], static.clouds()[0]) | {"moved_m": error}
 
 

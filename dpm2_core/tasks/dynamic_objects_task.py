@@ -28,10 +28,10 @@ MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32)
 """Cars, bicycles, buses, motorcycles, on rails, trucks, other vehicles, people, riders: SemanticKITTI's classes."""
 FIRST_MOVING = 252
 """Classes of the same objects while they move have this number and higher ones."""
-_STRETCH = 0.2
-_SLOPE = 0.07  # standard deviation along and across
-_SHADOWS, _MISSING = 8, 0.15  # most shadows in a scan; largest share of its voxels that are left out
-_SETTLED = 400  # scans for the statistics
+_MAX_STRETCH = 0.2
+_SLOPE_SIGMA = 0.07  # standard deviation along and across
+_MAX_SHADOWS, _MAX_MISSING = 8, 0.15  # most shadows in a scan; largest share of its voxels that are left out
+_STATISTICS_SCANS = 400  # scans for the statistics
 
 Voxels = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 """(V,) numbers of the occupied voxels of a scan, ascending, the fraction of their points that can move, and their
@@ -70,15 +70,15 @@ class DynamicObjectTask(Task):
     def losses(self, window: list[TaskScan]) -> tuple[Tensor, Callable[[], Tensor] | None]:
         """Cross-entropy over the occupied voxels, each weighted with the root of its number of points."""
         network, scans = self.settings.network, [self._voxels(scan) for scan in window]
-        drawn = [
-            _pasted(own, others) if torch.rand(()) < self.settings.paste else own
+        samples = [
+            _paste_objects(own, others) if torch.rand(()) < self.settings.paste else own
             for own, others in zip(scans, scans[1:] + scans[:1], strict=True)
         ]
-        chosen = [where for where, _, _ in drawn]
-        logits = self.net(occupancy(chosen, network).to(self.device)).flatten(1)
-        found = torch.cat([row[torch.from_numpy(w)] for row, w in zip(logits, chosen, strict=True)])
-        target = torch.from_numpy(np.concatenate([movable for _, movable, _ in drawn])).to(found)
-        weight = torch.from_numpy(np.sqrt(np.concatenate([count for _, _, count in drawn]))).to(found)
+        numbers = [number for number, _, _ in samples]
+        logits = self.net(occupancy(numbers, network).to(self.device)).flatten(1)
+        found = torch.cat([row[torch.from_numpy(w)] for row, w in zip(logits, numbers, strict=True)])
+        target = torch.from_numpy(np.concatenate([movable for _, movable, _ in samples])).to(found)
+        weight = torch.from_numpy(np.sqrt(np.concatenate([count for _, _, count in samples]))).to(found)
         loss = functional.binary_cross_entropy_with_logits(found, target, weight, reduction="sum")
         return loss / weight.sum().clamp(min=1), None
 
@@ -88,22 +88,22 @@ class DynamicObjectTask(Task):
         points, movable, counted = _arrays(scan)
         keep = counted & (torch.rand(len(points)).numpy() >= self.settings.thin * float(torch.rand(())))
         if torch.rand(()) < 0.5:
-            keep &= ~_shadowed(points)
-        voxel, inside = voxels(_varied(points[keep]), self.settings.network)
-        where, back, count = np.unique(voxel[inside], return_inverse=True, return_counts=True)
-        fraction = np.bincount(back, movable[keep][inside], len(where)) / count
+            keep &= ~_is_shadowed(points)
+        voxel, inside = voxels(_transform_randomly(points[keep]), self.settings.network)
+        numbers, inverse, count = np.unique(voxel[inside], return_inverse=True, return_counts=True)
+        fraction = np.bincount(inverse, movable[keep][inside], len(numbers)) / count
         if torch.rand(()) < 0.5:
-            seen = torch.rand(len(where)).numpy() >= _MISSING * float(torch.rand(()))
-            where, fraction, count = where[seen], fraction[seen], count[seen]
-        return where, fraction, count
+            seen = torch.rand(len(numbers)).numpy() >= _MAX_MISSING * float(torch.rand(()))
+            numbers, fraction, count = numbers[seen], fraction[seen], count[seen]
+        return numbers, fraction, count
 
     def settle(self, scans: TaskScans) -> None:
         """Set the means and variances of the layers to those of whole scans. Training has seen only thinned and mixed
         scans, and on kinds of scans not trained on this costs as much as anything else."""
         network, generator = self.settings.network, torch.Generator().manual_seed(self.settings.optimiser.seed)
-        chosen = torch.randperm(len(scans), generator=generator)[:_SETTLED].tolist()
-        scanned = (voxels(_arrays(scans[i])[0], network) for i in chosen)
-        grids = (occupancy([voxel[inside]], network).to(self.device) for voxel, inside in scanned)
+        chosen = torch.randperm(len(scans), generator=generator)[:_STATISTICS_SCANS].tolist()
+        voxelized = (voxels(_arrays(scans[i])[0], network) for i in chosen)
+        grids = (occupancy([voxel[inside]], network).to(self.device) for voxel, inside in voxelized)
         with mixed_precision(self.device):  # as `DynamicObjectNet.probability`
             update_bn(grids, self.net)
 
@@ -132,14 +132,14 @@ class DynamicObjectTask(Task):
         dynamic_objects_png(path, points[counted], self.net.probability(points)[counted] > DYNAMIC, movable[counted])
 
 
-def _pasted(own: Voxels, others: Voxels) -> Voxels:
+def _paste_objects(own: Voxels, others: Voxels) -> Voxels:
     """A scan's own voxels with the dynamic objects among the others, each voxel once."""
     objects = others[1] > 0.5
-    where = np.concatenate([own[0], others[0][objects]])
-    unique, back = np.unique(where, return_inverse=True)
+    numbers = np.concatenate([own[0], others[0][objects]])
+    unique, inverse = np.unique(numbers, return_inverse=True)
     movable, count = np.zeros(len(unique)), np.zeros(len(unique), np.int64)
-    np.maximum.at(movable, back, np.concatenate([own[1], others[1][objects]]))
-    np.add.at(count, back, np.concatenate([own[2], others[2][objects]]))
+    np.maximum.at(movable, inverse, np.concatenate([own[1], others[1][objects]]))
+    np.add.at(count, inverse, np.concatenate([own[2], others[2][objects]]))
     return unique, movable, count
 
 
@@ -157,23 +157,23 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
     return points, np.isin(labels, MOVABLE) | (labels >= FIRST_MOVING), finite & ~np.isin(labels, UNCOUNTED)
 
 
-def _shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_shadowed(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which of the points (N, 4) lie in the shadows of random objects that do not exist: sectors of up to 0.24 rad,
     each from some distance on."""
     azimuth, distance = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     out = np.zeros(len(points), np.bool_)
-    for start, width, beyond in torch.rand(int(float(torch.rand(())) * _SHADOWS), 3).tolist():
+    for start, width, beyond in torch.rand(int(float(torch.rand(())) * _MAX_SHADOWS), 3).tolist():
         out |= ((azimuth - math.tau * start) % math.tau < 0.04 + 0.2 * width) & (distance > 4 + 30 * beyond)
     return out
 
 
-def _varied(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def _transform_randomly(points: NDArray[np.float32]) -> NDArray[np.float32]:
     """The points (N, 4) rotated about z by a random angle, mirrored in half of the cases, stretched by up to 20 % and
     tilted. On a slope cars are higher above the lowest point around them, and a network trained without slopes finds
     none there."""
     angle, side = float(torch.rand(())) * 2 * math.pi, 1 if torch.rand(()) < 0.5 else -1
-    stretch = 1 + _STRETCH * (2 * torch.rand(3).numpy() - 1)
-    slope = _SLOPE * torch.randn(2).numpy()
+    stretch = 1 + _MAX_STRETCH * (2 * torch.rand(3).numpy() - 1)
+    slope = _SLOPE_SIGMA * torch.randn(2).numpy()
     c, s = math.cos(angle), math.sin(angle)
     M = np.array([[c, -side * s, 0], [s, side * c, 0], [*slope, 1]]) * stretch
     return np.concatenate([points[:, :3] @ M.T.astype(np.float32), points[:, 3:]], 1)

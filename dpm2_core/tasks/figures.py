@@ -14,7 +14,7 @@ from dpm2_core.evaluation.canvas import BACKGROUND, INK, new_figure, save_png
 from dpm2_core.network.perception.gndnet import GroundSettings, cell_of, height_above
 from dpm2_core.tasks.range_scans import RangeScans
 
-_FAR = 40.0  # m, the last color of a range image, and the edge of the view from above
+_MAX_DISTANCE = 40.0  # m, the last color of a range image, and the edge of the view from above
 
 
 def dynamic_objects_png(
@@ -33,8 +33,8 @@ def dynamic_objects_png(
         (~found & truth, "dynamic object, missed", "tab:red"),
         (found & ~truth, "standing, taken for one", "tab:blue"),
     )
-    for which, name, color in kinds:
-        axes.plot(points[which, 1], points[which, 0], ".", ms=1, mew=0, color=color, label=f"{name}: {which.sum()}")
+    for mask, name, color in kinds:
+        axes.plot(points[mask, 1], points[mask, 0], ".", ms=1, mew=0, color=color, label=f"{name}: {mask.sum()}")
     axes.set(xlim=(40, -40), ylim=(-40, 40), xlabel="y, m", ylabel="x (ahead), m", aspect="equal")
     axes.legend(markerscale=12, loc="upper right")
     save_png(path, figure)
@@ -48,7 +48,7 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
     Raises:
         Dpm2Error: the file could not be written.
     """
-    above = (height_above(points, found, settings) > settings.threshold) & cell_of(points, settings)[1]
+    is_above = (height_above(points, found, settings) > settings.threshold) & cell_of(points, settings)[1]
     half = settings.cells * settings.cell / 2
     seen = truth[truth.isfinite()].cpu().numpy()
     low, high = (
@@ -71,7 +71,7 @@ def ground_png(path: Path, found: Tensor, truth: Tensor, points: Tensor, setting
         axes.set(title=title, xlabel="y, m", xlim=(half, -half), ylim=(-half, half))
         axes.set_ylabel("x (ahead), m")
         if grid is found:
-            xy = points[above, :2].cpu().numpy()
+            xy = points[is_above, :2].cpu().numpy()
             axes.plot(xy[:, 1], xy[:, 0], ",", color="crimson", alpha=0.4)
     save_png(path, figure)
 
@@ -89,17 +89,19 @@ def range_png(path: Path, rows: Mapping[str, RangeScans], title: str) -> None:
     figure.text(0.01, 1 - 0.3 / (3.4 * len(rows) + 0.6), title, color=INK, fontsize=13, va="center")
     for k, (name, scans) in enumerate(rows.items()):
         bottom, height = (len(rows) - 1 - k) / len(rows) * 0.94, 0.94 / len(rows)
-        flat = figure.add_axes((0.01, bottom + 0.15 * height, 0.7, 0.7 * height), facecolor="black")
+        image_axes = figure.add_axes((0.01, bottom + 0.15 * height, 0.7, 0.7 * height), facecolor="black")
         d = np.where(scans.masks[0].cpu().numpy(), scans.images[0, 0].cpu().numpy() * scans.scale, np.nan)
         half = d.shape[1] // 2
-        flat.imshow(np.roll(d, half, 1)[:, ::-1], aspect="auto", vmin=0, vmax=_FAR, cmap="turbo")  # ahead in the middle
-        flat.set_title(name, color=INK, loc="left", fontsize=11)
-        flat.set(xticks=[], yticks=[])
-        above = figure.add_axes((0.73, bottom + 0.02, 0.26, height - 0.04), facecolor="black", aspect="equal")
+        image_axes.imshow(
+            np.roll(d, half, 1)[:, ::-1], aspect="auto", vmin=0, vmax=_MAX_DISTANCE, cmap="turbo"
+        )  # ahead in the middle
+        image_axes.set_title(name, color=INK, loc="left", fontsize=11)
+        image_axes.set(xticks=[], yticks=[])
+        top_axes = figure.add_axes((0.73, bottom + 0.02, 0.26, height - 0.04), facecolor="black", aspect="equal")
         points = scans.clouds()[0].cpu().numpy()
         order = np.argsort(points[:, 2])
-        above.scatter(
+        top_axes.scatter(
             points[order, 0], points[order, 1], c=points[order, 2], s=0.6, cmap="viridis", vmin=-2, vmax=2, lw=0
         )
-        above.set(xlim=(-_FAR, _FAR), ylim=(-_FAR, _FAR), xticks=[], yticks=[])
+        top_axes.set(xlim=(-_MAX_DISTANCE, _MAX_DISTANCE), ylim=(-_MAX_DISTANCE, _MAX_DISTANCE), xticks=[], yticks=[])
     save_png(path, figure)

@@ -77,9 +77,9 @@ class GroundTask(Task):
             UsageError: a scan without labels in a training that has no SLAM loss to learn from it.
         """
         network = self.settings.network
-        turn, up = self._moved()
-        clouds = [scan.points @ turn.T + up for scan in window]
-        pairs = [elevation_labels(c, self._ground(scan), network) for c, scan in zip(clouds, window, strict=True)]
+        R, lift = self._random_motion()
+        clouds = [scan.points @ R.T + lift for scan in window]
+        pairs = [elevation_labels(c, self._ground_mask(scan), network) for c, scan in zip(clouds, window, strict=True)]
         known = torch.stack([known for _, known in pairs])
         labels = torch.stack([filled(label, k) for label, k in pairs])
         elevation = self.net(clouds)
@@ -94,22 +94,22 @@ class GroundTask(Task):
             parts = self.windows(len(xyz))
             return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], requested[p]) for p in parts]).mean()
 
-        counts = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
-        loss = ground_loss(elevation, labels, counts, network)
+        cell_weights = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
+        loss = ground_loss(elevation, labels, cell_weights, network)
         return loss, slam
 
-    def _ground(self, scan: TaskScan) -> Tensor:
+    def _ground_mask(self, scan: TaskScan) -> Tensor:
         """Which points (N,) are known to be of the ground."""
         if scan.labels is None and self.settings.slam.gamma > 0:
             return torch.zeros(len(scan.points), dtype=torch.bool, device=scan.points.device)
         return ground_of(scan)[0]
 
-    def _moved(self) -> tuple[Tensor, Tensor]:
+    def _random_motion(self) -> tuple[Tensor, Tensor]:
         """A random roll, pitch and lift: (4, 4) and (4,) that rotate and move points (N, 4)."""
-        turn = torch.eye(4)
-        turn[:3, :3] = random_tilt(math.radians(self.settings.tilt))
-        up = torch.tensor([0.0, 0.0, (2 * float(torch.rand(1)) - 1) * self.settings.lift, 0.0])
-        return turn.to(self.device), up.to(self.device)
+        R = torch.eye(4)
+        R[:3, :3] = random_tilt(math.radians(self.settings.tilt))
+        lift = torch.tensor([0.0, 0.0, (2 * float(torch.rand(1)) - 1) * self.settings.lift, 0.0])
+        return R.to(self.device), lift.to(self.device)
 
     def evaluate(self, scans: TaskScans) -> dict[str, float]:
         """Means over the scans of `ground_metrics`."""

@@ -49,24 +49,24 @@ def folders_of(path: Path, sequences: Sequence[str]) -> list[Path]:
     first.
     """
     names = {folder: names_of(folder, path) for folder in sequence_folders(path)}
-    taken = set(names) if not sequences else set()
+    chosen = set(names) if not sequences else set()
     for name in sequences:
-        level = {folder: of.index(name) for folder, of in names.items() if name in of}
-        taken |= {folder for folder in level if level[folder] == min(level.values())}
-    return [folder for folder in names if folder in taken]
+        level = {folder: parts.index(name) for folder, parts in names.items() if name in parts}
+        chosen |= {folder for folder in level if level[folder] == min(level.values())}
+    return [folder for folder in names if folder in chosen]
 
 
 def sequence_names(path: Path, sequences: Sequence[str]) -> list[str]:
     """Names of the sequences and pairs that `open_scans` opens, however they were given."""
-    return [name for _, name in _named(path, sequences)]
+    return [name for _, name in _places_and_names(path, sequences)]
 
 
 def sequence_places(path: Path, sequences: Sequence[str]) -> dict[Path, str]:
     """Name of each of these by its resolved folder, or the resolved file of its pair."""
-    return {place.resolve(): name for place, name in _named(path, sequences)}
+    return {place.resolve(): name for place, name in _places_and_names(path, sequences)}
 
 
-def _named(path: Path, sequences: Sequence[str]) -> Iterator[tuple[Path, str]]:
+def _places_and_names(path: Path, sequences: Sequence[str]) -> Iterator[tuple[Path, str]]:
     yield from ((pair.path, pair.name) for pair in pairs_of(path, sequences))
     yield from ((folder, "/".join(names_of(folder, path))) for folder in folders_of(path, sequences))
 
@@ -81,5 +81,5 @@ def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSeque
     pairs = {pair.number for pair in found if isinstance(pair, ArrayPair)}
     missing = [name for name in sequences if name not in folders and not (name.isdecimal() and int(name) in pairs)]
     if missing:
-        there = sorted(folders) + sorted(str(pair.number) for pair in open_pairs(path))
-        raise UsageError(f"{path}: no sequence {missing[0]}; there are {', '.join(there) or 'none'}")
+        available = sorted(folders) + sorted(str(pair.number) for pair in open_pairs(path))
+        raise UsageError(f"{path}: no sequence {missing[0]}; there are {', '.join(available) or 'none'}")

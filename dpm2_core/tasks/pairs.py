@@ -32,12 +32,12 @@ from dpm2_core.tasks.scan import TaskScan
 
 SCALE = 120.0
 """Length that a value of one has in the preprocessed arrays, m."""
-_FOLDERS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
-_LOOKED_AT = 64
+_FOLDER_PAIRS = (("s", "d"), ("static", "dynamic"), ("static_out_npy", "dynamic_out_npy"))
+_SAMPLED_SCANS = 64
 """Scans of an array that are used for percentiles and azimuths: with all scans, gigabytes would be read."""
-_EVEN = 0.99
+_MIN_EVENNESS = 0.99
 """Least length of the mean of unit vectors that represent the columns' errors: 8 degrees, root mean square."""
-_NAMED = re.compile(r"(.*?)([sd])(\d+)")
+_FILE_NAME = re.compile(r"(.*?)([sd])(\d+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,20 +68,20 @@ def open_pairs(path: Path) -> list[ArrayPair]:
 def _pairs(path: Path) -> Iterator[tuple[int, Path, Path]]:
     """Number, static and dynamic file of each pair."""
     groups: list[tuple[dict[tuple[str, int], Path], dict[tuple[str, int], Path]]] = [
-        (_numbered(path / s), _numbered(path / d)) for s, d in _FOLDERS
+        (_arrays_by_number(path / s), _arrays_by_number(path / d)) for s, d in _FOLDER_PAIRS
     ]
     named: dict[str, dict[tuple[str, int], Path]] = {"s": {}, "d": {}}
     for file in path.glob("*.npy"):
-        if match := _NAMED.fullmatch(file.stem):
+        if match := _FILE_NAME.fullmatch(file.stem):
             named[match[2]][match[1], int(match[3])] = file
     for static, dynamic in [*groups, (named["s"], named["d"])]:
         for key in sorted(static.keys() ^ dynamic.keys()):
-            alone = static.get(key) or dynamic[key]
-            raise UsageError(f"{alone}: no {'dynamic' if key in static else 'static'} twin of the same number")
+            unpaired = static.get(key) or dynamic[key]
+            raise UsageError(f"{unpaired}: no {'dynamic' if key in static else 'static'} twin of the same number")
         yield from ((key[1], static[key], dynamic[key]) for key in sorted(static))
 
 
-def _numbered(folder: Path) -> dict[tuple[str, int], Path]:
+def _arrays_by_number(folder: Path) -> dict[tuple[str, int], Path]:
     """The arrays of a folder by the number at the end of their names."""
     found = {file: re.search(r"(\d+)$", file.stem) for file in folder.glob("*.npy")}
     return {("", int(match[1])): file for file, match in found.items() if match}
@@ -113,11 +113,11 @@ class ArrayPair:
         Raises:
             UsageError: as `open_pairs`.
         """
-        arrays = [_mapped(static), _mapped(dynamic)]
+        arrays = [_open_array(static), _open_array(dynamic)]
         if arrays[0].shape != arrays[1].shape:
             raise UsageError(f"{dynamic}: shape {arrays[1].shape}, its static twin {static.name} has {arrays[0].shape}")
         static_limits, limits = (_limits(array) for array in arrays)
-        columns = None if limits is None else _columns(np.concatenate([*map(_some, arrays)]), dynamic)
+        columns = None if limits is None else _column_order(np.concatenate([*map(_sample_points, arrays)]), dynamic)
         return ArrayPair(arrays[0], arrays[1], dynamic, number, root, limits, static_limits, columns)
 
     @property
@@ -146,7 +146,7 @@ class ArrayPair:
     def __getitem__(self, index: int) -> ImageScan:
         image, mask = self._image(self.dynamic, self.limits, index)
         static_image, static_mask = self._image(self.static, self.static_limits, index)
-        points, static = (_cloud(of, known) for of, known in ((image, mask), (static_image, static_mask)))
+        points, static = (_cloud(values, known) for values, known in ((image, mask), (static_image, static_mask)))
         return ImageScan(points, None, static, self.name, index, image, static_image, mask, static_mask)
 
     def _image(self, array: np.ndarray, limits: Array | None, index: int) -> tuple[Tensor, Tensor]:
@@ -160,51 +160,51 @@ class ArrayPair:
             values = values[:, self.columns]
         d = torch.hypot(values[..., 0], values[..., 1])
         low, high = torch.from_numpy(limits).to(values)
-        usual = ((values[..., :3] >= low) & (values[..., :3] <= high)).all(-1)
-        mask = (d >= RangeImageSettings().min_distance) & (d < SCALE) & usual
+        within_limits = ((values[..., :3] >= low) & (values[..., :3] <= high)).all(-1)
+        mask = (d >= RangeImageSettings().min_distance) & (d < SCALE) & within_limits
         image = torch.stack([d, values[..., 2]]) * mask / SCALE
         return fill(image, mask), mask
 
 
-def _preprocessed(array: np.ndarray) -> bool:
+def _is_preprocessed(array: np.ndarray) -> bool:
     return array.shape[1] == CHANNELS
 
 
 def _limits(array: np.ndarray) -> Array | None:
     """(2, 3) limits of 98 % of all x, of all y and of all z, empty slots included, as the authors do it."""
-    if _preprocessed(array):
+    if _is_preprocessed(array):
         return None
-    return np.asarray(np.nanpercentile(_some(array).reshape(-1, 3), [1, 99], axis=0))
+    return np.asarray(np.nanpercentile(_sample_points(array).reshape(-1, 3), [1, 99], axis=0))
 
 
-def _some(array: np.ndarray) -> Array:
+def _sample_points(array: np.ndarray) -> Array:
     """(n, rows, columns, 3) x, y, z of some scans of an array."""
-    return np.asarray(array[:: max(1, len(array) // _LOOKED_AT), ..., :3], np.float64)
+    return np.asarray(array[:: max(1, len(array) // _SAMPLED_SCANS), ..., :3], np.float64)
 
 
-def _columns(xyz: Array, path: Path) -> NDArray[np.intp] | None:
+def _column_order(xyz: Array, path: Path) -> NDArray[np.intp] | None:
     """(columns,) index of the column of x, y, z at each of `azimuths`; None if no slot has a point."""
     x, y = xyz[..., 0], xyz[..., 1]
-    there = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0)
-    if not there.any():
+    has_point = np.isfinite(x) & np.isfinite(y) & (np.hypot(x, y) > 0)
+    if not has_point.any():
         return None
-    count = there.shape[-1]
-    angle, middle = np.arctan2(y, x)[there], np.broadcast_to(azimuths(count).numpy(), there.shape)[there]
-    left, right = (np.exp(1j * (angle - way * middle)).mean() for way in (1, -1))
-    off = left if abs(left) >= abs(right) else right
-    if abs(off) < _EVEN:
+    count = has_point.shape[-1]
+    angle, centers = np.arctan2(y, x)[has_point], np.broadcast_to(azimuths(count).numpy(), has_point.shape)[has_point]
+    left, right = (np.exp(1j * (angle - direction * centers)).mean() for direction in (1, -1))
+    offset = left if abs(left) >= abs(right) else right
+    if abs(offset) < _MIN_EVENNESS:
         raise UsageError(f"{path}: its columns, or its twin's, are not in even steps of azimuth around the sensor")
-    start = round(float(np.angle(off)) / (2 * np.pi) * count)
+    start = round(float(np.angle(offset)) / (2 * np.pi) * count)
     column = np.arange(count)
-    return (column - start if off is left else start - 1 - column) % count
+    return (column - start if offset is left else start - 1 - column) % count
 
 
-def _mapped(path: Path) -> np.ndarray:
+def _open_array(path: Path) -> np.ndarray:
     try:
         array: np.ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise UsageError(f"{path}: no array of numbers: {str(error).splitlines()[0]}") from None
-    if array.ndim != 4 or array.dtype.kind != "f" or not (_preprocessed(array) or array.shape[3] in (3, 4)):
+    if array.ndim != 4 or array.dtype.kind != "f" or not (_is_preprocessed(array) or array.shape[3] in (3, 4)):
         raise UsageError(
             f"{path}: shape {array.shape} {array.dtype}; want floating-point (N, 2, rows, columns) of d and z "
             "or (N, rows, columns, 3 or 4) of x, y, z"

@@ -15,7 +15,7 @@ from dpm2_core.network.perception.range_image import RangeImageSettings, fill, p
 from dpm2_core.tasks.pairs import SCALE, ImageScan
 from dpm2_core.tasks.scan import TaskScan
 
-_KEPT = 2000
+_MAX_CACHED_SCANS = 2000
 """Scans whose images are cached: about 180 kB each, and projecting one takes as long as half a step of training."""
 
 
@@ -58,7 +58,7 @@ class RangeReader:
     def __init__(self, settings: RangeImageSettings) -> None:
         """Images of that geometry."""
         self._settings = settings
-        self._kept: dict[tuple[str, int, bool], tuple[Tensor, Tensor]] = {}
+        self._cache: dict[tuple[str, int, bool], tuple[Tensor, Tensor]] = {}
 
     def read(self, scans: Sequence[TaskScan], static: bool = False, keep: bool = False) -> RangeScans:
         """The scans, or their twins without moving objects.
@@ -71,31 +71,31 @@ class RangeReader:
             UsageError: a scan has no twin, or is an image of other rows and columns. A scan without any point in the
                 image is no error: this happens next to a truck, and all its slots are empty.
         """
-        pairs = [self._kept_or_made(scan, static) if keep else self._made(scan, static) for scan in scans]
+        pairs = [self._cached_image(scan, static) if keep else self._make_image(scan, static) for scan in scans]
         frames = [(scan.sequence, scan.number) for scan in scans]
         images, masks = (torch.stack(list(part)) for part in zip(*pairs, strict=True))
         return RangeScans(images, masks, frames, self._settings.scale)
 
-    def _kept_or_made(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
+    def _cached_image(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
         key = (scan.sequence, scan.number, static)
-        if key not in self._kept:
-            if len(self._kept) >= 2 * _KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._made(scan, static)
-        return self._kept[key]
+        if key not in self._cache:
+            if len(self._cache) >= 2 * _MAX_CACHED_SCANS:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[key] = self._make_image(scan, static)
+        return self._cache[key]
 
-    def _made(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
+    def _make_image(self, scan: TaskScan, static: bool) -> tuple[Tensor, Tensor]:
         where = f"{scan.sequence}, scan {scan.number}"
         if static and scan.static is None:
             raise UsageError(f"{where}: no static twin")
         if isinstance(scan, ImageScan):
             image, mask = (scan.static_image, scan.static_mask) if static else (scan.image, scan.mask)
-            return self._cut(image, mask, where)
+            return self._crop_stored(image, mask, where)
         points = scan.static if static and scan.static is not None else scan.points
         image, mask = project(points, self._settings)
         return fill(image, mask), mask
 
-    def _cut(self, image: Tensor, mask: Tensor, where: str) -> tuple[Tensor, Tensor]:
+    def _crop_stored(self, image: Tensor, mask: Tensor, where: str) -> tuple[Tensor, Tensor]:
         """The rows from `first` on, and the number of columns in the settings, evenly spaced."""
         s, (rows, columns) = self._settings, mask.shape
         if rows < s.first + s.rows or columns % s.columns:
@@ -103,11 +103,11 @@ class RangeReader:
                 f"{where}: an image of {rows} x {columns} has no rows {s.first} to {s.first + s.rows - 1} "
                 f"and every so many columns of {s.columns}"
             )
-        every = columns // s.columns
-        image, mask = image[:, s.first :, ::every][:, : s.rows], mask[s.first :, ::every][: s.rows]
+        step = columns // s.columns
+        image, mask = image[:, s.first :, ::step][:, : s.rows], mask[s.first :, ::step][: s.rows]
         image = image * (SCALE / s.scale)
-        near = image[0] < 1  # as in `project`: a network cannot output distances beyond the scale
-        return fill(image * near, near), mask & near
+        in_range = image[0] < 1  # as in `project`: a network cannot output distances beyond the scale
+        return fill(image * in_range, in_range), mask & in_range
 
 
 def image_error(made: Tensor, true: Tensor) -> Tensor:

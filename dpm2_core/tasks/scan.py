@@ -56,12 +56,12 @@ class TaskScans(Dataset[TaskScan]):
 
     def __init__(self, sequences: Sequence[ScanSequence]) -> None:
         """Join sequences."""
-        self._places = [(sequence, i) for sequence in sequences for i in range(len(sequence))]
+        self._scan_index = [(sequence, i) for sequence in sequences for i in range(len(sequence))]
         self.lengths = [len(sequence) for sequence in sequences]
 
     def __len__(self) -> int:
         """Scans in all."""
-        return len(self._places)
+        return len(self._scan_index)
 
     def __getitem__(self, index: int) -> TaskScan:
         """Read one scan.
@@ -69,7 +69,7 @@ class TaskScans(Dataset[TaskScan]):
         Raises:
             UsageError: a file is damaged, or was changed since it was opened.
         """
-        sequence, i = self._places[index]
+        sequence, i = self._scan_index[index]
         return sequence[i]
 
     def digest(self) -> str:

@@ -19,17 +19,17 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Points
 from dpm2_core.tasks.scan import RequiredData, TaskScan
 
-_BYTES = {"velodyne": 16, "static": 16, "labels": 4}
+_POINT_BYTES = {"velodyne": 16, "static": 16, "labels": 4}
 """Bytes of a point in a file of that folder."""
 
 
 def sequence_folders(path: Path) -> list[Path]:
     """Folders that contain velodyne/; these are not searched further."""
     found = []
-    for folder, inner, _ in os.walk(path, followlinks=True):
-        if "velodyne" in inner:
+    for folder, subfolders, _ in os.walk(path, followlinks=True):
+        if "velodyne" in subfolders:
             found.append(Path(folder))
-            inner.clear()
+            subfolders.clear()
     return sorted(found)
 
 
@@ -55,8 +55,8 @@ class _KittiRun:
 
     folder: Path
     name: str
-    labelled: bool
-    paired: bool
+    has_labels: bool
+    has_static: bool
     numbers: list[int]
 
     def __len__(self) -> int:
@@ -66,12 +66,12 @@ class _KittiRun:
         number = self.numbers[index]
         points, valid = self._points("velodyne", number)
         labels, static = None, None
-        if self.labelled:
+        if self.has_labels:
             classes = (self._values("labels", number, "<u4") & 0xFFFF).astype(np.int64)
             if len(classes) != len(valid):
                 raise UsageError(f"{self._path('labels', number)}: {len(classes)} labels for {len(valid)} points")
             labels = torch.from_numpy(classes[valid])
-        if self.paired:
+        if self.has_static:
             static = torch.from_numpy(self._points("static", number)[0])
         return TaskScan(torch.from_numpy(points), labels, static, self.name, number)
 
@@ -86,9 +86,9 @@ class _KittiRun:
     def check(self, number: int) -> None:
         """Raise UsageError unless the files of a scan exist and have the right length."""
         points = self._count("velodyne", number)
-        if self.paired:
+        if self.has_static:
             self._count("static", number)
-        if self.labelled and (labels := self._count("labels", number)) != points:
+        if self.has_labels and (labels := self._count("labels", number)) != points:
             raise UsageError(f"{self._path('labels', number)}: {labels} labels for {points} points")
 
     def _path(self, kind: str, number: int) -> Path:
@@ -100,11 +100,11 @@ class _KittiRun:
             size = path.stat().st_size
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from None
-        if size % _BYTES[kind]:
-            raise UsageError(f"{path}: {size} bytes are not whole points of {_BYTES[kind]}; damaged or cut off")
+        if size % _POINT_BYTES[kind]:
+            raise UsageError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES[kind]}; damaged or cut off")
         if size == 0:
             raise UsageError(f"{path}: the file is empty")
-        return size // _BYTES[kind]
+        return size // _POINT_BYTES[kind]
 
     def _values(self, kind: str, number: int, dtype: DTypeLike) -> np.ndarray:
         self._count(kind, number)

@@ -54,9 +54,9 @@ def figures_of(run: TaskRun) -> dict[str, float]:
     row: dict[str, float] = {}
     for kind, poses in {**run.poses, "still": np.tile(np.eye(4), (len(run.truth), 1, 1))}.items():
         figures = evaluate(run.truth, poses, stamps=np.array(run.stamps))
-        row[f"{kind}_ate_m"] = _number(figures.ape_rmse_m)
-        row[f"{kind}_rpe_m"] = _number(figures.rpe_trans_m)
-        row[f"{kind}_rpe_deg"] = _number(figures.rpe_rot_deg)
+        row[f"{kind}_ate_m"] = _nan_if_none(figures.ape_rmse_m)
+        row[f"{kind}_rpe_m"] = _nan_if_none(figures.rpe_trans_m)
+        row[f"{kind}_rpe_deg"] = _nan_if_none(figures.rpe_rot_deg)
     return row
 
 
@@ -68,22 +68,24 @@ def slam_runs(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[Task
         UsageError: as `slam_figures`.
     """
     found = False
-    for name, truth, scans in _with_poses(task, path, sequences):
+    for name, truth, scans in _sequences_with_poses(task, path, sequences):
         found = True
-        made, numbers = [], []
+        clouds, numbers = [], []
         for scan in map(scans.__getitem__, range(len(scans))):
-            made.append(task.clouds(scan.to(task.device)))
+            clouds.append(task.clouds(scan.to(task.device)))
             numbers.append(scan.number)
-        if not made[0]:
+        if not clouds[0]:
             raise UsageError(f"{task.name}: makes no clouds that SLAM could run on")
         stamps = stamps_of(np.array(numbers) - numbers[0] + 1).tolist()
-        poses = {kind: _odometry([of[kind].cpu().numpy() for of in made], stamps) for kind in made[0]}
+        poses = {
+            kind: _odometry([scan_clouds[kind].cpu().numpy() for scan_clouds in clouds], stamps) for kind in clouds[0]
+        }
         yield TaskRun(name, truth, poses, stamps)
     if not found:
         raise UsageError(f"{path}: no sequences with poses; want sequences/NN/velodyne and its poses")
 
 
-def _with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tuple[str, Array, TaskScans]]:
+def _sequences_with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tuple[str, Array, TaskScans]]:
     """Name, true poses (N, 4, 4) and scans of every sequence."""
     for pair in pairs_of(path, sequences):
         if (truth := pair.poses) is None:
@@ -106,5 +108,5 @@ def _odometry(clouds: list[np.ndarray], stamps: list[int]) -> Array:
     return np.stack(poses)
 
 
-def _number(value: float | None) -> float:
+def _nan_if_none(value: float | None) -> float:
     return float("nan") if value is None else value

@@ -46,11 +46,11 @@ def train_task(
     """
     settings = task.settings
     windows = ContiguousWindows(scans.lengths, settings.window, settings.every, settings.optimiser.seed)
-    epoch = max(1, len(windows) // settings.batch)
-    of_step = {**settings.optimiser.model_dump(), "drop_every": settings.optimiser.drop_every * epoch}
+    epoch_steps = max(1, len(windows) // settings.batch)
+    step_settings = {**settings.optimiser.model_dump(), "drop_every": settings.optimiser.drop_every * epoch_steps}
     optimizer = OptimizerSettings(
-        **of_step, steps=settings.epochs * epoch, compile=False, bf16=False,
-        save_every=epoch, validate_every=settings.validate_every * epoch,
+        **step_settings, steps=settings.epochs * epoch_steps, compile=False, bf16=False,
+        save_every=epoch_steps, validate_every=settings.validate_every * epoch_steps,
     )  # fmt: skip
 
     def batches(start: int, rank: int) -> Iterator[tuple[list[TaskScan], int]]:
@@ -62,7 +62,7 @@ def train_task(
         save_task(task, out / WEIGHTS, {"epochs": str(settings.epochs if until is None else until)})
 
     validate = None if val is None else partial(measure, scans=val)
-    Trainer(task, batches, optimizer, out, save, validate).run(None if until is None else until * epoch)
+    Trainer(task, batches, optimizer, out, save, validate).run(None if until is None else until * epoch_steps)
     return task.eval()
 
 
@@ -73,12 +73,12 @@ def measure(task: Task, scans: TaskScans) -> dict[str, float]:
     Raises:
         UsageError: there are no scans, or they lack what the task needs.
     """
-    was = task.training
+    was_training = task.training
     task.eval()
     try:
         return task.evaluate(scans)
     finally:
-        task.train(was)
+        task.train(was_training)
 
 
 @torch.no_grad()
