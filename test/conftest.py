@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # unless a test requests more: it
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # some hundred processes are started: compile their modules only once
 KITTI = Path(os.environ.get("DPM2_KITTI", Path(__file__).resolve().parents[2] / "shared" / "kitti"))
 
-gc.disable()  # until all is imported: a quarter of the collection time was spent on garbage collection
+gc.disable()  # until all is imported: a quarter of the time of test collection went to the garbage collector
 
 ROS = Path(__file__).resolve().parent / "dpm2_ros"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""setup.py declares exactly what the code imports, and packages of an extra are imported only where they are needed."""
+"""setup.py declares what the code imports, and packages of an extra are imported only where they are needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-WITH_ANOTHER_WAY = {"kiss_icp", "pypose", "small_gicp"}  # optional: a benchmark reports that they are missing
+WITH_ANOTHER_WAY = {"kiss_icp", "pypose", "small_gicp"}  # a benchmark reports itself if they are missing
 WITHOUT_DEPENDENCIES = {"ouster"}  # pip install --no-deps: its dependencies contradict the base install's
 FILES = sorted(
     path

@@ -58,7 +58,7 @@ def dpm2_process(*arguments: object, **options: object) -> subprocess.CompletedP
 def started(*arguments: object, until: Callable[[], object] = lambda: True) -> Iterator[subprocess.Popen[str]]:
     """Start the command in its own process and wait for `until`, for example to interrupt it. It is killed at the end
     of the block."""
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a test in the background may ignore it
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # it is ignored if the tests run in the background
     with subprocess.Popen(_command(arguments), stderr=subprocess.PIPE, text=True, preexec_fn=listen) as process:
         try:
             while not until():

@@ -40,8 +40,7 @@ class Listener(GuardedNode):
     """Makes frames as slam_node does, and publishes an odometry for each.
 
     Args:
-        second: topic of a second LiDAR. gnss: topic of fixes. busy: delay before a cloud is processed, s, as under
-    load.
+        second: topic of a second LiDAR. gnss: topic of fixes. busy: delay before a cloud is processed, s.
     """
 
     def __init__(self, second: str = "", gnss: str = "", busy: float = 0.0, **options: Any) -> None:

@@ -25,7 +25,7 @@ S, OTHER = "5f3a9c01", "00000bad"  # sessions
 
 
 class Wires:
-    """Publishers of a robot's keyframes: of their poses, payloads and clouds."""
+    """Publishers of a robot's keyframes: of their poses, descriptors and clouds."""
 
     def __init__(self, harness: Any, namespace: str = "") -> None:
         kinds = ((Odometry, "keyframe_odom"), (PointCloud2, "keyframe"), (UInt8MultiArray, "keyframe_cloud"))

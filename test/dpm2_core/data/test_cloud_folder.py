@@ -118,8 +118,8 @@ def test_names_of_several_numbers_are_in_the_order_of_all(tmp_path: Path, names:
 def test_numbers_that_are_missing_are_scans_that_are(
     tmp_path: Path, numbers: tuple[int, ...], scans: tuple[int, ...], missing: int
 ) -> None:
-    """Without their time, the odometry took a real drive, of which 78 of 175 scans were kept, for another one: 6 m
-    off."""
+    """Without the time of missing scans, a real drive of which 78 of 175 scans were kept looked like another drive to
+    the odometry: 6 m off."""
     for n, number in enumerate(numbers):
         write_ply(
             tmp_path / f"{'ab'[n % 2] * (len(set(numbers)) < len(numbers))}scan_{number}.ply",

@@ -140,7 +140,7 @@ def test_rays_along_the_axes_of_a_box_and_points_that_are_none() -> None:
 
 
 def test_dust_returns_its_share_of_pulses_from_near_by() -> None:
-    """The points stay on their rays. What 0.3 moves, 0.6 moves in the same way."""
+    """The points stay on their rays. The points that are moved at 0.3 are moved in the same way at 0.6."""
     clean = [frame.points for frame in Drive().frames()]
     some, many = ([frame.points for frame in corrupted(dust=fraction)] for fraction in (0.3, 0.6))
     for points, fewer, more in zip(clean, some, many, strict=True):

@@ -182,7 +182,7 @@ def test_images_of_two_cameras_each_join_the_nearest_cloud(bags: Any, tmp_path: 
 
 
 def test_a_second_camera_that_cannot_be_used_is_named(bags: Any, tmp_path: Path) -> None:
-    """It was requested, so this is an error, as for the first camera. Images that cannot be read cost only
+    """It was requested, so this is an error, as for any requested camera. Images that cannot be read cost only
     themselves."""
     first = [*clouds(bags, [1, 2]), *rig(bags), (1, IMAGE, bags.image(1, 7)), (2, IMAGE, bags.image(2, 8))]
     second = rear(bags, [1, 2])

@@ -195,7 +195,7 @@ def test_ground_truth_of_other_stamps_is_interpolated(gt_hz: float, est_hz: floa
 
 @pytest.mark.parametrize("est_hz", [10, 200])
 def test_a_slow_ground_truth_counts_at_its_own_stamps(est_hz: int) -> None:
-    """At 1 Hz it does not show a bend in between, where an exact estimate has 1 % of t_err on KITTI 00."""
+    """At 1 Hz it does not show a bend in between, where an exact estimate would have 1 % of t_err on KITTI 00."""
     gt = _clock(1, 5)
     true, found, stamps = matched(gt, _clock(est_hz, 7 * est_hz // 2, begin=0.047))
     np.testing.assert_array_equal(true, gt.poses)

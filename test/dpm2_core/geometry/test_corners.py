@@ -32,7 +32,7 @@ def test_corners_of_a_wall_lie_on_it() -> None:
 
 
 def test_they_meet_again_and_look_alike() -> None:
-    """From 1.5 m farther along a flat wall. By chance, 7 % would meet, and 1 % would be the most similar."""
+    """From 1.5 m farther along a flat wall. By chance, 7 % would coincide, and 1 % would be the most similar."""
     wall = paint(1)
     here, there = seen(wall, 2.0), seen(wall, 3.5)
     apart = np.linalg.norm((here.xyz - np.array([1.5, 0, 0], np.float32))[:, None] - there.xyz[None], axis=-1)

@@ -72,8 +72,8 @@ def test_a_file_is_followed_and_its_second_lap_uses_the_first_one_s_street(poses
 
 
 def test_the_car_heads_where_the_file_says(poses_file: Path, tmp_path: Path) -> None:
-    """In curves, a camera ahead of the rear axle does not look in the direction of travel; the file gives its
-    heading."""
+    """In curves, a camera ahead of the rear axle does not look in the direction of travel; the file has its
+    orientation."""
     road = make_road(str(poses_file), PRESETS["city"], np.random.default_rng(0))
     assert np.degrees(np.median(np.abs(road.slip))) < 1  # this file's car heads along its path
     rows = np.loadtxt(poses_file).reshape(-1, 3, 4)

@@ -72,7 +72,7 @@ def test_a_right_loop_comes_back_when_the_graph_has_improved() -> None:
     poses, graph = laps()
     graph = with_loops(graph, ENDS, right_loops(poses, ENDS))
     apart = np.sqrt(chain_chi2(graph, integrate(graph)))
-    result = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # rejects one loop
+    result = optimize(graph, RobustSettings(odometry_sigmas=float(apart.max()) - 1e-3))  # rejects one at first
     assert result.kept.all()
     assert result.rounds == 2
 
@@ -111,7 +111,8 @@ def test_a_trajectory_in_another_frame_is_joined_by_the_loops_that_agree() -> No
 
 @pytest.mark.parametrize("fixed", [[], [60]], ids=["nothing fixed", "one of the second fixed"])
 def test_a_trajectory_is_placed_by_its_loops_to_what_is_placed_however_they_are_numbered(fixed: list[int]) -> None:
-    """The last trajectory has three loops to the first one, and eight to the second one, which is placed later."""
+    """The last trajectory has three loops to the first one, and eight to the second one, whose position then
+    follows."""
     poses, graph = laps(150)
     chained, moved = graph.chained.copy(), graph.poses.copy()
     steps, covariances = graph.steps.copy(), graph.step_covariances.copy()

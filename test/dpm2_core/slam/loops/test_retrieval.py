@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The index returns similar places, whatever the order and number of descriptors, and never places without descriptors
-or that are not allowed."""
+"""The index returns similar places in any order and number, but never places without descriptors, nor places that are
+not allowed."""
 
 from __future__ import annotations
 

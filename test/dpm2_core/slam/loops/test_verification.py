@@ -35,8 +35,8 @@ from dpm2_core.slam.registration.icp import GeometricSettings
     ],
 )
 def test_a_place_must_fit_clearly_better_than_others(best: float, others: list[float], objection: str) -> None:
-    """The fraction of points that do not fit must be half of that at the next best place. A place that was not tried is
-    assumed to fit to 80 %."""
+    """The fraction of points that do not fit must be at most half of that at the next best place. A place that was not
+    tried is assumed to fit to 80 %."""
     fits = [Registration(np.eye(4), np.eye(6), confidence) for confidence in (best, *others)]
     assert objection_of_others(fits[0], fits[1:]) == objection
 

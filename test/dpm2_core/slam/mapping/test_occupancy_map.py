@@ -332,7 +332,7 @@ def test_how_far_a_map_is_tilted_shows_its_ground(recording: Path, degrees: floa
         [T_tilted_level @ se3.exp([0, 0, 0.1 * n, n, 0, 0]) @ se3.inverse(T_tilted_level) for n in range(9)]
     )
     assert ground_tilt(stored([cloud] * 9), poses) == pytest.approx(degrees, abs=2.0)
-    mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground, according to which no sensor is above the ground
+    mount = np.array([-0.6, 0.0, 1.7])  # above a base on the ground: no sensor at the base is above the ground
     on_base = [cloud + np.append(mount, 0).astype(np.float32)] * 9
     assert ground_tilt(stored(on_base, mount), poses) == pytest.approx(degrees, abs=2.0)
 

@@ -51,8 +51,8 @@ def folder(tmp_path: Path, data: MapData) -> Path:
 
 
 def test_every_keyframe_with_a_cloud_is_in_the_tile_of_its_place(folder: Path, data: MapData) -> None:
-    """A tile contains its pose, cloud and descriptors and the edges between its keyframes. Each tile is a valid map by
-    itself."""
+    """The tile contains the keyframe's pose, cloud and descriptors, and the edges between its keyframes. Each tile is a
+    valid map by itself."""
     found: dict[int, Path] = {}
     for path in folder.glob("*.dpm2map"):
         assert not check_map(path).problems
@@ -164,7 +164,7 @@ def test_a_full_disk_names_what_was_asked_for(tmp_path: Path) -> None:
 
 
 def test_nobody_is_looked_for_in_tiles_without_descriptors(tmp_path: Path, folder: Path) -> None:
-    """The same for a map without tiles. Previously, the drive continued to its end and was never localized."""
+    """As for a single map without descriptors. Previously, the drive continued to its end and was never localized."""
     write_tiles(ring(20, points=50), tmp_path / "bare", SIZE)
     with pytest.raises(UsageError, match="bare: no keyframe has descriptors"):
         open_for_localization(tmp_path / "bare", SlamSettings())

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""On a walking person or a legged robot, the velocity changes within a sweep: scans are deskewed with what they show of
-it."""
+"""On a walking person or a legged robot, the velocity changes within a sweep: scans are deskewed with the motion that
+they show."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def test_the_edge_between_keyframes_along_a_tunnel_covers_its_error(tunnel_drive
     assert keyframe is not None
     assert keyframe.edge is not None
     off = se3.log(se3.inverse(keyframe.edge.T_target_source) @ se3.inverse(truth[0]) @ truth[-1])[3]
-    assert abs(off) > 3.0  # so it is: nothing in the scans shows the motion
+    assert abs(off) > 3.0  # indeed: nothing in the scans shows the motion
     assert abs(off) < 3 * keyframe.edge.worst_sigma
 
 
@@ -227,7 +227,7 @@ def test_an_empty_second_scan_while_no_velocity_is_known(suburb_drive: Drive) ->
 
 @pytest.mark.slow
 def test_the_beginning_of_a_sweep_that_is_refused_does_not_become_the_map(skewed_drive: Drive) -> None:
-    """Many drivers send such a part first, with the times of its points. The next scan becomes the first."""
+    """Many drivers send such a part first, with the times of its points. The next scan becomes the first one."""
     frames, truth = skewed_drive[0][:12], skewed_drive[1][:12]
     first = frames[0]
     assert first.time_offset is not None

@@ -68,7 +68,8 @@ def test_braking_that_the_imu_feels_is_no_contradiction() -> None:
 
 @pytest.mark.parametrize("pull", [0.05, 0.15, 0.25, 0.4, 1.0, 3.0])
 def test_its_sigma_covers_scans_that_pull_to_one_side(pull: float) -> None:
-    """Scans pull by `pull` m/s for 5 s: unnoticed, or until the IMU leads. Sigma is not larger than its gains."""
+    """Scans pull by `pull` m/s for 5 s: unnoticed, or until the IMU leads. Without a pull, sigma is the sum of its
+    gains."""
     way, off, whole = OpenWay(np.eye(4), np.array([5.0, 0, 0])), 0.0, 0.0
     for n, lead in enumerate(driven(way, np.full(50, 0.5 - 0.1 * pull), 0.0)):
         off = abs(0.1 * pull * (n + 1) - lead)

@@ -45,8 +45,8 @@ def test_in_a_tunnel_it_tells_the_way(tunnel_drive: Drive) -> None:
 
 
 def test_one_that_repeats_its_last_pose_is_no_halt() -> None:
-    """As of a driver that keeps sending. Where all directions are open, the speed is soon unknown, and previously the
-    halt was accepted."""
+    """For example from a driver that keeps sending its last pose. Where all directions are open, the speed is soon
+    unknown, and previously the halt was accepted."""
     other, twist = OtherMotion(steadiness=10.0), np.array([0, 0, 0, 8.0, 0, 0])
     sent, sigmas = [0.0, 0.8, 0.8, 0.8, 1.6], [0.1, 0.1, 0.1, 1.0, 1.0]  # m; sigma: of the previous motion
     led = []

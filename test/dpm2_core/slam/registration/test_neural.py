@@ -191,7 +191,7 @@ def test_bad_frames_are_rejected_in_words_and_survived(weights: Path, noise: np.
 
 
 def test_another_place_is_no_answer(weights: Path, noise: np.random.Generator) -> None:
-    """Another scan of the same place is registered."""
+    """The same place is accepted, with another scan."""
     s = SlamSettings(registration="neural", neural=NeuralSettings(weights=str(weights)))
     registration = make_registration(s)
     here, elsewhere = (cloud(boxes(noise)) for _ in range(2))

@@ -80,7 +80,7 @@ def test_a_step_that_no_cloud_has_is_rejected(quantum: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [10, 1_000_000, 0xFFFFFFFF])
 def test_a_bomb_is_not_inflated(count: int) -> None:
-    """200 kB that would become 200 MB. At most as much memory is used as the claimed points need, whatever is
+    """200 kB that would become 200 MB: no more memory is used than a million points need, whatever number is
     claimed."""
     bomb = zlib.compress(bytes(200_000_000), 9)
     tracemalloc.start()

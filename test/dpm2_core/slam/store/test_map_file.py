@@ -65,8 +65,8 @@ def test_a_map_under_a_link_is_made_where_the_link_leads(
 def test_a_map_whose_name_has_the_log_of_another_one_is_not_made(
     tmp_path: Path, map_file: Path, keyframes: list[Keyframe], make: Callable[[Path, Path], None]
 ) -> None:
-    """The log of a killed map that was removed or moved. Previously, SQLite used it for the new map, which then
-    contained the keyframes of the old one, or was malformed."""
+    """The log of a map whose writer was killed, and that was removed or moved. Previously, SQLite used it for the new
+    map, which then contained the keyframes of the old one, or was malformed."""
     path = tmp_path / "new.dpm2map"
     log = path.with_name("new.dpm2map-wal")
     with MapStore.create(tmp_path / "killed") as store:

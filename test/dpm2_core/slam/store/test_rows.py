@@ -141,7 +141,7 @@ def test_rows_before_the_first_are_found(map_file: Path) -> None:
 
 def test_damage_within_descriptors_is_found_when_they_are_read(map_file: Path) -> None:
     """One bit, which SQLite does not notice. Previously, the descriptors were different then, and copies of the map
-    with them were valid."""
+    with them passed the check."""
     with closing(sqlite3.connect(map_file)) as db, db:
         node, packed = db.execute("SELECT node, descriptors FROM payloads WHERE descriptors NOT NULL").fetchone()
         wrong = packed[:-40] + bytes([packed[-40] ^ 1]) + packed[-39:]
