@@ -54,7 +54,7 @@ def hits(rays: Array, x: float, truck: bool) -> Array:
 
 
 def seen(x: float, paint: Paint, camera: Camera, gain: float = 1.0, truck: bool = False) -> Image:
-    """What a camera sees from `x` m along the corridor; `gain` is the exposure."""
+    """Image of a camera at `x` m along the corridor; `gain` is the exposure."""
     u, v = np.meshgrid(np.arange(640), np.arange(240))
     rays = np.c_[u.ravel(), v.ravel(), np.ones(u.size)] @ np.linalg.inv(camera.K).T @ camera.T_lidar_cam[:3, :3].T
     painted = with_truck(paint, x) if truck else paint

@@ -28,7 +28,7 @@ def test_agrees_with_numpy(angle: float) -> None:
 
 @pytest.mark.parametrize("angle", [0.0, 0.99e-4, 1e-3, 0.5, 3.0])
 def test_twice_differentiable(angle: float) -> None:
-    """A NaN behind a `where` would show here."""
+    """A NaN behind a `where` would be detected here."""
     xi = torch.from_numpy(tangent(angle)).requires_grad_()
     assert torch.autograd.gradcheck(se3_torch.exp, xi)
     assert torch.autograd.gradcheck(lambda xi: se3_torch.log(se3_torch.exp(xi)), xi, atol=1e-4 if angle > 2 else 1e-5)

@@ -18,7 +18,7 @@ def local(receiver: Receiver, places: np.ndarray) -> np.ndarray:
 
 def test_without_errors_it_is_where_the_antenna_is() -> None:
     receiver = Receiver(GnssConfig(noise=0, wander=0, antenna=(1, 2, 3)), np.random.default_rng(0))
-    poses = np.array([se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0])), np.eye(4)])  # the first looks to the north
+    poses = np.array([se3.exp(np.array([0, 0, np.pi / 2, 0, 0, 0])), np.eye(4)])  # the first faces north
     poses[:, :3, 3] = [[100, 0, 0], [0, 50, 5]]
     np.testing.assert_allclose(local(receiver, receiver.measure(poses)), [[98, 1, 3], [1, 52, 8]], atol=1e-4)
 

@@ -139,7 +139,7 @@ def test_a_turn_in_motion_is_undone_by_the_twist(tunnel: World) -> None:
     twist = np.array([0, 0, 0.5, 12.0, 0, 0])
     still = lidar.scan(world, T, 1.0, np.random.default_rng(0))
     moved = lidar.scan(world, T, 1.0, np.random.default_rng(0), twist)
-    assert moved.time_offset.min() >= np.float32(-0.05)  # which numpy before 2 does not take for -0.05
+    assert moved.time_offset.min() >= np.float32(-0.05)  # numpy before 2 does not treat it as equal to -0.05
     assert moved.time_offset.max() <= np.float32(0.05)
     ahead = np.abs(np.arctan2(moved.points[:, 1], moved.points[:, 0])) < 0.01
     assert np.abs(moved.time_offset[ahead]).max() < 0.001  # the stamp is the time at which it looks ahead

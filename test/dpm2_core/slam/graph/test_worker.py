@@ -43,7 +43,7 @@ def test_a_worker_that_is_closed_while_its_process_starts_leaves_none(monkeypatc
     popen = subprocess.Popen
 
     def slow(*args: Any, **options: Any) -> subprocess.Popen[bytes]:
-        time.sleep(0.2)  # longer than `close` needs to look
+        time.sleep(0.2)  # longer than `close` needs for its check
         started.append(popen(*args, **options))
         return started[-1]
 

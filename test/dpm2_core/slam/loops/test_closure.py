@@ -194,8 +194,8 @@ def test_a_loop_is_clear_among_all_stretches_of_a_broken_drive(away: float, clos
 @pytest.mark.weights
 @pytest.mark.parametrize(("things", "closed"), [(BOTH_ENDS, False), (np.concatenate([BOTH_ENDS, CABINET]), True)])
 def test_a_second_drive_in_a_room_that_looks_the_same_from_its_other_end(things: Array, closed: bool) -> None:
-    """A loop joins the second drive to the first where the ends can be distinguished. Previously, 3 of 8 were joined in
-    the wrong orientation."""
+    """A loop joins the second drive to the first if the ends can be distinguished. If not, 3 of 8 were previously
+    joined in the wrong orientation."""
     truth = np.array([standing(*place) for place in ROUND + ROUND])
     way, keyframes, clouds, loops = make_loops(SlamSettings()), list[Keyframe](), list[Points](), list[Edge]()
     for i, T in enumerate(truth):

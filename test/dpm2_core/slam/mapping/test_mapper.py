@@ -115,7 +115,7 @@ def test_a_lap_is_closed(lap: tuple[list[Keyframe], Array]) -> None:
 
 @pytest.mark.slow
 def test_look_alikes_are_rejected_with_a_reason(lap: tuple[list[Keyframe], Array]) -> None:
-    """The odometry claims to be back at the start, but the points come from elsewhere."""
+    """By the odometry the drive is back at the start, but the points come from elsewhere."""
     keyframes, _ = lap
     mapper = make_mapper(BY_POSE)
     for keyframe in keyframes[:-4]:

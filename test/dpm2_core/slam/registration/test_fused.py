@@ -197,9 +197,8 @@ def test_while_no_motion_is_known_the_network_gives_one_more_start(case: Case) -
 @pytest.mark.parametrize(("off", "method"), [([0.05, 0.02], "refined"), ([0.6, 0.2], "geometric")])
 @pytest.mark.parametrize("known", [0.01, 4.0])
 def test_where_two_disagree_the_likelier_is_taken(case: Case, off: list[float], method: str, known: float) -> None:
-    """From a start 9 m off, the points fit somewhere, but not as well as from the network's pose. This is so even if
-    the network is 0.6 m off with a small covariance, and whether the motion is assumed to be known to 10 m or to 0.5
-    m."""
+    """From a start 9 m off, points fit somewhere, but not as well as from the network's pose: even if the network is
+    0.6 m off with a small covariance, and whether the motion is assumed to be known to 10 m or to 0.5 m."""
     start = case.truth @ se3.exp([0, 0, 0, 9, 0, 0])
     case.prediction = Prediction([start], widen=2.0, information=known * np.eye(6))
     somewhere, error = case.register([0, 0, 0, 0, 0, 0], size=0)
@@ -305,7 +304,7 @@ def test_points_that_fit_just_where_the_motion_leads_are_enough(suburb_drive: Dr
     contradicted, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.35, 0, 0])
     assert contradicted.reason.startswith("neural and geometric 0.35 m")
     assert error < 0.02
-    assert contradicted.worst_sigma > 0.3  # half of the points fit, and the network excludes them
+    assert contradicted.worst_sigma > 0.3  # half of the points fit, and the network contradicts them
     hardly, error = Case(([*frames[:5], noisy], truth)).register([0, 0, 0, -0.2, 0, 0])  # 3.7 standard deviations
     assert hardly.reason.startswith("neural and geometric 0.20 m")
     assert error < 0.02
