@@ -19,14 +19,14 @@ from dpm2_core.slam.registration.neural import NeuralScanRegistration
 from dpm2_core.slam.registration.protocol import CHI2_95, Prediction, agree, near
 from dpm2_core.slam.registration.swept import Beginning, Swept
 
-_LED = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
+_START_INFORMATION = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
 
-_UNCONFIRMED = isotropic(np.radians(1), 0.3)
+_UNCONFIRMED_COVARIANCE = isotropic(np.radians(1), 0.3)
 """Covariance added to that of a network pose if the points fit nowhere near it: hovering above a town, such poses have
 errors of 0.27 m and report 0.06 m."""
-_MUCH_BETTER = 0.1  # confidence: gain in fitting points that counts while a direction is unconstrained
-_SURE_SIGMA = 0.08  # m, standard deviation of a position that is constrained in all directions
+_MIN_CONFIDENCE_GAIN = 0.1  # confidence: gain in fitting points that counts while a direction is unconstrained
+_CONSTRAINED_SIGMA = 0.08  # m, standard deviation of a position that is constrained in all directions
 
 
 class FusedScanRegistration:
@@ -71,81 +71,83 @@ class FusedScanRegistration:
         points = None if self._always else self._geometric.located(scan, prediction)
         if points is not None:
             doubted = self._geometric.doubted(scan, prediction, points)
-            if _sure(doubted, prediction) and not prediction.strays(doubted):
+            if _is_reliable(doubted, prediction) and not prediction.strays(doubted):
                 return doubted
         # Compare with the result before the doubt: with the doubt's large covariance everything agrees.
-        return self._geometric.doubted(scan, prediction, self._with_network(scan, prediction, points))
+        return self._geometric.doubted(scan, prediction, self._combine_with_network(scan, prediction, points))
 
     def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
         return self._geometric.swept(scan, result, beginning)
 
-    def _with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
+    def _combine_with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
         """Combine with the network's registration; `points` is None if they are not registered yet (`always`)."""
         neural = self._neural.register(scan, prediction) if len(self._neural) else None
         if neural is not None and neural.ok and not prediction.possible(neural.T_target_source):
             neural = neural.rejected("found a pose that no vehicle can have reached")
         if neural is not None and neural.ok and not prediction.known:
-            points, prediction = self._from_both(scan, neural, prediction, points)
+            points, prediction = self._register_from_both_poses(scan, neural, prediction, points)
         points = points or self._geometric.located(scan, prediction)
         if neural is None:
             return points.because("neural: no descriptors yet")
         if not neural.ok:
             return points.because(f"neural: {neural.reason}")
         if not points.ok:
-            return self._led(scan, neural, prediction)
-        return self._weighed(scan, prediction, points, neural)
+            return self._fall_back_on_network(scan, neural, prediction)
+        return self._select_or_combine(scan, prediction, points, neural)
 
-    def _from_both(
+    def _register_from_both_poses(
         self, scan: Scan, neural: Registration, prediction: Prediction, points: Registration | None
     ) -> tuple[Registration, Prediction]:
         """Register the points from the network's pose as well; returns result and prediction, unless that misleads."""
-        also = _also_from(neural, prediction)
-        found = self._geometric.located(scan, also)
-        if prediction.information is not None and not self._seen(scan):
+        extended = _with_network_start(neural, prediction)
+        found = self._geometric.located(scan, extended)
+        if prediction.information is not None and not self._has_images(scan):
             points = points or self._geometric.located(scan, prediction)
-            if _lures(found, points):
+            if _is_misleading(found, points):
                 return points, prediction
-        return found, also
+        return found, extended
 
-    def _weighed(self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration) -> Registration:
+    def _select_or_combine(
+        self, scan: Scan, prediction: Prediction, points: Registration, neural: Registration
+    ) -> Registration:
         """Select or combine two results."""
         if prediction.expects(points.T_target_source) and not agree(points, neural, CHI2_95):
-            return _outvoting(points, neural, prediction)
-        agreed, together = agree(points, neural), near(points.T_target_source, neural.T_target_source)
+            return _contradicting_network(points, neural, prediction)
+        agreed, close = agree(points, neural), near(points.T_target_source, neural.T_target_source)
         # A wrong pose that both agree on may leave a direction unconstrained that the right pose constrains.
-        if prediction.known and not (agreed and (points.worst_sigma <= _SURE_SIGMA or together)):
+        if prediction.known and not (agreed and (points.worst_sigma <= _CONSTRAINED_SIGMA or close)):
             starts = [points.T_target_source, neural.T_target_source]
             likelier = self._geometric.located(scan, replace(prediction, starts=starts))
-            decides = not agreed or likelier.worst_sigma <= _SURE_SIGMA
-            if likelier.ok and decides and agree(likelier, neural):
+            conclusive = not agreed or likelier.worst_sigma <= _CONSTRAINED_SIGMA
+            if likelier.ok and conclusive and agree(likelier, neural):
                 return _confirmed(likelier)
             points = likelier if likelier.ok and not agreed else points
         if not agreed:
-            if not prediction.known and points.worst_sigma > _SURE_SIGMA and self._seen(scan):
+            if not prediction.known and points.worst_sigma > _CONSTRAINED_SIGMA and self._has_images(scan):
                 # Where points fit anywhere, they fit best at a pose without motion.
-                return self._led(scan, neural, prediction)
-            return _outvoting(points, neural, prediction)
+                return self._fall_back_on_network(scan, neural, prediction)
+            return _contradicting_network(points, neural, prediction)
         if prediction.strays(points):  # the motion has changed and the points are stuck at the predicted pose
-            led = self._points_from(scan, neural)
-            points = led if led.ok and agree(led, neural) else points
-        if not self._always and _sure(points, prediction):
+            from_network = self._register_from_network_pose(scan, neural)
+            points = from_network if from_network.ok and agree(from_network, neural) else points
+        if not self._always and _is_reliable(points, prediction):
             return points  # they needed the network only for the start
         return _confirmed(points)
 
-    def _led(self, scan: Scan, neural: Registration, prediction: Prediction) -> Registration:
+    def _fall_back_on_network(self, scan: Scan, neural: Registration, prediction: Prediction) -> Registration:
         """Register the points from the network's pose, after the prediction did not lead to a result."""
-        points = self._points_from(scan, neural)
+        points = self._register_from_network_pose(scan, neural)
         if not points.ok:
-            unsure = replace(neural, covariance=neural.covariance + _UNCONFIRMED)
-            return _drawn_to(prediction, unsure).because(f"not refined: {points.reason}")
+            uncertain = replace(neural, covariance=neural.covariance + _UNCONFIRMED_COVARIANCE)
+            return _fused_with_prediction(prediction, uncertain).because(f"not refined: {points.reason}")
         if agree(points, neural):
             return _confirmed(points)
-        return _instead(neural, points)
+        return _covering_both(neural, points)
 
-    def _points_from(self, scan: Scan, neural: Registration) -> Registration:
-        return self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _LED))
+    def _register_from_network_pose(self, scan: Scan, neural: Registration) -> Registration:
+        return self._geometric.located(scan, Prediction([neural.T_target_source], 1.0, _START_INFORMATION))
 
-    def _seen(self, scan: Scan) -> bool:
+    def _has_images(self, scan: Scan) -> bool:
         return self.uses_images and bool(scan.images)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
@@ -165,56 +167,56 @@ def _confirmed(points: Registration) -> Registration:
     return replace(points, method="refined")
 
 
-def _drawn_to(prediction: Prediction, neural: Registration) -> Registration:
+def _fused_with_prediction(prediction: Prediction, neural: Registration) -> Registration:
     """A network pose that no points confirm, fused with the prediction by their covariances if the two are apart.
 
     In a fast rotation, with a LiDAR 70 degrees wide, such a pose was 0.5 m off, and the prediction 0.03 m.
     """
-    T, T_predicted, of_motion = neural.T_target_source, prediction.starts[0], prediction.information
-    if of_motion is None or not prediction.known or near(T_predicted, T):
+    T, T_predicted, information = neural.T_target_source, prediction.starts[0], prediction.information
+    if information is None or not prediction.known or near(T_predicted, T):
         return neural
-    between = neural.covariance + np.linalg.inv(of_motion)
-    xi = neural.covariance @ np.linalg.solve(between, se3.way(T, T_predicted))
+    covariance = neural.covariance + np.linalg.inv(information)
+    xi = neural.covariance @ np.linalg.solve(covariance, se3.way(T, T_predicted))
     return replace(neural, T_target_source=se3.orthonormalized(T @ se3.exp(xi)))
 
 
-def _lures(found: Registration, points: Registration) -> bool:
+def _is_misleading(found: Registration, points: Registration) -> bool:
     """Whether `found` is no reason to leave `points`: it fits hardly better, and leaves a direction unconstrained.
 
     A scan fits best where the map has the same density: on a highway with 16 beams up to 6 m away, by up to 0.06.
     """
-    return points.ok and found.worst_sigma >= OPEN and found.confidence <= points.confidence + _MUCH_BETTER
+    return points.ok and found.worst_sigma >= OPEN and found.confidence <= points.confidence + _MIN_CONFIDENCE_GAIN
 
 
-def _also_from(neural: Registration, prediction: Prediction) -> Prediction:
+def _with_network_start(neural: Registration, prediction: Prediction) -> Prediction:
     """Add the network's pose to the starts: as the first, preferred among equals, only without other information."""
     start, starts = neural.T_target_source, prediction.starts
     return replace(prediction, starts=[start, *starts] if prediction.information is None else [*starts, start])
 
 
-def _sure(points: Registration, prediction: Prediction) -> bool:
+def _is_reliable(points: Registration, prediction: Prediction) -> bool:
     """Whether points fit well and constrain all directions; exactly at the predicted pose any accepted result will do.
 
     Much of a scan after a large motion matches nothing in a young map of few beams. Both the network and the likelihood
     of the points then prefer the pose where the map was made, since the beams hit the same pattern there.
     """
     fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
-    return points.ok and fits and points.worst_sigma <= _SURE_SIGMA
+    return points.ok and fits and points.worst_sigma <= _CONSTRAINED_SIGMA
 
 
-def _outvoting(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
+def _contradicting_network(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
     """The points' result, which contradicts the network; with a doubt unless the points fit well by themselves."""
     if prediction.convinced(points):
-        return points.because(_apart(points, neural))
-    return _instead(points, neural)
+        return points.because(_difference_text(points, neural))
+    return _covering_both(points, neural)
 
 
-def _instead(result: Registration, other: Registration) -> Registration:
+def _covering_both(result: Registration, other: Registration) -> Registration:
     """One of two contradicting results, with a covariance that covers both: nothing shows which one is right."""
-    way = se3.way(result.T_target_source, other.T_target_source)
-    return result.doubted(way).because(_apart(result, other))
+    difference = se3.way(result.T_target_source, other.T_target_source)
+    return result.doubted(difference).because(_difference_text(result, other))
 
 
-def _apart(a: Registration, b: Registration) -> str:
+def _difference_text(a: Registration, b: Registration) -> str:
     xi = se3.way(a.T_target_source, b.T_target_source)
     return f"neural and geometric {np.linalg.norm(xi[3:]):.2f} m, {np.degrees(np.linalg.norm(xi[:3])):.1f} deg apart"

@@ -16,10 +16,10 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.registration.occupied_voxels import OccupiedVoxels
 from dpm2_core.slam.registration.point_to_plane import distances
 
-_YOUNG = 3  # scans
+_MAX_YOUNG_SCANS = 3
 _SIGHT = (0.99, 1.1)  # quantile of the ranges of a scan, and factor on it: beyond, the map has no information
 _NEIGHBORS = 15  # points that a plane is fitted to
-_SCANS = 25  # scans after which points are dropped: it bounds memory, and traces of moving objects
+_MAX_SCANS = 25  # scans after which points are dropped: it bounds memory, and traces of moving objects
 _CELL = 3.0  # voxels: edge of the cells in which neighbors are searched
 
 
@@ -39,11 +39,11 @@ class LocalMap:
         """voxel: edge of the cells that contain one point each, m."""
         self._settings, self._voxel = settings, voxel
         self.points: Array = np.zeros((0, 3))
-        self._entered: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._scan_of_point: NDArray[np.int32] = np.zeros(0, np.int32)
         self._inserted = 0
         self._T_last: Array | None = None
-        self._taken = np.zeros((0, 4, 4))
-        self._sights = np.zeros(0)  # m, range of the scans that have entered
+        self._scan_poses = np.zeros((0, 4, 4))
+        self._sight_ranges = np.zeros(0)  # m, range of the scans that have entered
         self._voxels: OccupiedVoxels | None = None  # computed when needed
 
     def fresh(self) -> LocalMap:
@@ -56,7 +56,7 @@ class LocalMap:
     @property
     def is_young(self) -> bool:
         """Whether few scans have entered: a new scan may show much that none of them did."""
-        return self._inserted <= _YOUNG
+        return self._inserted <= _MAX_YOUNG_SCANS
 
     def wants(self, T_odom_lidar: Array) -> bool:
         """Whether a scan at that pose shows enough that is new."""
@@ -70,13 +70,13 @@ class LocalMap:
 
         When fog lifts or a door opens, most points of a scan are farther away and do not determine its pose.
         """
-        squared, sight = np.einsum("ij,ij->i", source, source), _SIGHT[1] * self._sights.max(initial=0.0)
+        squared, sight = np.einsum("ij,ij->i", source, source), _SIGHT[1] * self._sight_ranges.max(initial=0.0)
         return source if squared.max(initial=0.0) <= sight * sight else source[squared <= sight * sight]
 
     def from_nearest_scan(self, T_odom_lidar: Array) -> Array:
         """A pose (4, 4) relative to the nearest pose of a scan in the map."""
-        away = self._taken[:, :3, 3] - T_odom_lidar[:3, 3]
-        return se3.inverse(self._taken[np.einsum("ij,ij->i", away, away).argmin()]) @ T_odom_lidar
+        away = self._scan_poses[:, :3, 3] - T_odom_lidar[:3, 3]
+        return se3.inverse(self._scan_poses[np.einsum("ij,ij->i", away, away).argmin()]) @ T_odom_lidar
 
     def insert(self, points: NDArray[np.floating], T_odom_lidar: Array, taken: Array | None = None) -> None:
         """Add the (N, 3+) points of a scan where the map has none yet; drop those that are far away or old.
@@ -86,19 +86,19 @@ class LocalMap:
         """
         away = np.linalg.norm(points[:, :3], axis=1)
         sight = np.quantile(away, _SIGHT[0]) if len(away) else 0.0
-        self._sights = np.append(self._sights, sight)[-_SCANS:]
+        self._sight_ranges = np.append(self._sight_ranges, sight)[-_MAX_SCANS:]
         taken = T_odom_lidar @ (np.eye(4)[None] if taken is None else taken)
-        self._taken = np.concatenate([self._taken, taken])[-max(_SCANS, len(taken)) :]
+        self._scan_poses = np.concatenate([self._scan_poses, taken])[-max(_MAX_SCANS, len(taken)) :]
         new = points[:, :3].astype(np.float64) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3]
         joined = np.concatenate([self.points, new])
-        entered = np.concatenate([self._entered, np.full(len(new), self._inserted, np.int32)])
+        entered = np.concatenate([self._scan_of_point, np.full(len(new), self._inserted, np.int32)])
         away = joined - T_odom_lidar[:3, 3]
         kept = np.einsum("ij,ij->i", away, away) < self._settings.radius**2
-        kept &= entered > self._inserted - _SCANS
+        kept &= entered > self._inserted - _MAX_SCANS
         joined, entered = joined[kept], entered[kept]
         first = voxel_first(joined, self._voxel)
         self._grid = PointGrid(joined[first], _CELL * self._voxel)
-        self.points, self._entered = self._grid.points, entered[first][self._grid.order]
+        self.points, self._scan_of_point = self._grid.points, entered[first][self._grid.order]
         self._inserted += 1
         self._T_last, self._voxels = T_odom_lidar, None
         self._normals = np.empty((len(self.points), 3))
@@ -124,9 +124,9 @@ class LocalMap:
 
     def _fit_planes(self, index: NDArray[np.int32]) -> None:
         """Fit planes at these map points, if not done yet."""
-        asked = np.zeros(len(self.points), bool)
-        asked[index] = True
-        requested = np.flatnonzero(asked & np.isnan(self._variances))
+        mask = np.zeros(len(self.points), bool)
+        mask[index] = True
+        requested = np.flatnonzero(mask & np.isnan(self._variances))
         if len(requested):
             k = min(_NEIGHBORS, len(self.points))
             around = self._grid.neighbors(self.points[requested], k)

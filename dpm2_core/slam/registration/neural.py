@@ -51,7 +51,7 @@ class NeuralSettings(Settings):
 
 _RADIUS = 20.0  # m: frames farther than this from the predicted pose are not used, unless all are farther
 _MAX_SIGMA = 0.6  # m, standard deviation of the position in its worst direction
-_PLACE = 0.6
+_MIN_SEARCH_CONFIDENCE = 0.6
 """Minimum confidence in a search for a place, as after a pause: nothing contradicts a wrong pose there, and wrong poses
 agree with each other."""
 
@@ -98,16 +98,16 @@ class NeuralScanRegistration:
 
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         T_predicted = prediction.starts[0]
-        result = self._registered(scan, T_predicted, self._settings.frames)
+        result = self._register_near(scan, T_predicted, self._settings.frames)
         if not result.ok:
             return result
         self._spacing.registered(result.rmse)
         if self._settings.refined and self._map.wants(result.T_target_source):
-            second = self._registered(scan, result.T_target_source, self._settings.refined)
+            second = self._register_near(scan, result.T_target_source, self._settings.refined)
             if second.ok and second.worst_sigma < result.worst_sigma:
                 result = second
-        least = self._settings.min_confidence
-        if result.confidence < (max(least, _PLACE) if prediction.unique else least):
+        min_confidence = self._settings.min_confidence
+        if result.confidence < (max(min_confidence, _MIN_SEARCH_CONFIDENCE) if prediction.unique else min_confidence):
             return result.rejected(f"right with a probability of only {result.confidence:.0%}")
         if (sigma := result.worst_sigma) > _MAX_SIGMA:
             return result.rejected(f"position uncertain by {sigma:.2f} m")
@@ -120,7 +120,7 @@ class NeuralScanRegistration:
     def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
         return None
 
-    def _registered(self, scan: Scan, T_near: Array, frames: int) -> Registration:
+    def _register_near(self, scan: Scan, T_near: Array, frames: int) -> Registration:
         """T_odom_lidar by the merged descriptors of the frames nearest to a pose (4, 4)."""
         if scan.descriptors is None:
             return Registration.failed("neural", self.rejection(scan), T_near)
@@ -145,8 +145,8 @@ class NeuralScanRegistration:
         description = scan.description
         if not description.made:  # do not keep the whole scan and its images, megabytes that may never be needed
             network = self._model.settings
-            few = scan.points[voxel_first(scan.points, network.points.voxel)]
+            subset = scan.points[voxel_first(scan.points, network.points.voxel)]
             images = scan.images if self.uses_images else ()
             small = tuple(small_image(image, network.image) for image in images)
-            description = LazyDescriptors(partial(self.describe, few, small, scan.up))
+            description = LazyDescriptors(partial(self.describe, subset, small, scan.up))
         self._map.insert(description, T_odom_lidar)

@@ -12,7 +12,7 @@ from dpm2_core.frame import Array
 
 _VOXEL = 0.5  # m
 _RANGE, _HEIGHT = 60.0, 15.0  # m from the center: points farther away hardly constrain the position
-_INSIDE, _BESIDE = 2, 1  # value of a point in an occupied voxel, and in one next to it
+_OCCUPIED_VALUE, _NEIGHBOR_VALUE = 2, 1  # value of a point in an occupied voxel, and in one next to it
 
 
 class OccupiedVoxels:
@@ -29,8 +29,8 @@ class OccupiedVoxels:
         for dx in (-1, 0, 1):
             for dy in (-1, 0, 1):
                 for dz in (-1, 0, 1):
-                    self._value[x + dx, y + dy, z + dz] = _BESIDE
-        self._value[x, y, z] = _INSIDE
+                    self._value[x + dx, y + dy, z + dz] = _NEIGHBOR_VALUE
+        self._value[x, y, z] = _OCCUPIED_VALUE
 
     def fit(self, source: Array, poses: Array) -> Array:
         """Mean value of the voxels that contain the points (N, 3) of a scan, at each of the poses (P, 4, 4)."""

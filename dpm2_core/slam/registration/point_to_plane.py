@@ -35,7 +35,7 @@ def distances(
 
 
 @compiled("void(f8[::1], f8[:, ::1], f8[::1], f8[::1])")
-def _slope(point: Array, R: Array, normal: Array, J: Array) -> None:
+def _distance_jacobian(point: Array, R: Array, normal: Array, J: Array) -> None:
     """Write the derivative of a point's (3,) distance along a normal (3,) to J (6,), for a step on the right of a pose
     with the rotation R (3, 3)."""
     for i in range(3):
@@ -64,7 +64,7 @@ def linearize(
     for n in range(len(source)):
         if np.isnan(residual[n]):
             continue
-        _slope(source[n], R, normals[n], J)
+        _distance_jacobian(source[n], R, normals[n], J)
         squared = residual[n] * residual[n]
         weight = 1 / (variances[n] + squared)
         for row in range(6):
@@ -93,7 +93,7 @@ def moments(
     for n in range(len(source)):
         if np.isnan(residual[n]):
             continue
-        _slope(source[n], R, normals[n], J)
+        _distance_jacobian(source[n], R, normals[n], J)
         weight = 1 / (variances[n] + residual[n] * residual[n])
         for k in range(2 * ORDER + 1):
             for row in range(6):

@@ -15,10 +15,10 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.swept import Beginning, Swept
 
-_EXPECTED = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
-_EXACT = 0.1  # m
-_NEARLY_ALL = 0.9  # confidence
-_BETTER = 0.02  # confidence: by this much more points must fit at a pose away from the predicted one
+_NEAR_LIMITS = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
+_EXACT_DISTANCE = 0.1  # m
+_HIGH_CONFIDENCE = 0.9
+_MIN_CONFIDENCE_GAIN = 0.02  # confidence: by this much more points must fit at a pose away from the predicted one
 CHI2, CHI2_95 = 22.46, 12.59
 """99.9 and 95 % quantile of chi2 with 6 degrees of freedom: two poses that are farther apart than the first contradict
 each other; if they are farther apart than the second, they hardly agree."""
@@ -36,7 +36,7 @@ def agree(a: Registration, b: Registration, most: float = CHI2) -> bool:
     return se3.squared_sigmas(a.T_target_source, b.T_target_source, covariance) <= most
 
 
-def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> bool:
+def near(T: Array, T_other: Array, most: tuple[float, float] = _NEAR_LIMITS) -> bool:
     """Whether two poses (4, 4) are within `most`, m and degrees; by default a vehicle's change between scans."""
     meters, degrees = se3.apart(T, T_other)
     return meters <= most[0] and degrees <= most[1]
@@ -44,7 +44,7 @@ def near(T: Array, T_other: Array, most: tuple[float, float] = _EXPECTED) -> boo
 
 def fits_better(result: Registration, other: Registration) -> bool:
     """Whether `result` is better than `other`, the result from the expected pose of the scan."""
-    return result.ok and (not other.ok or result.confidence > other.confidence + _BETTER)
+    return result.ok and (not other.ok or result.confidence > other.confidence + _MIN_CONFIDENCE_GAIN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +76,11 @@ class Prediction:
         return self.information is not None and float(np.linalg.eigvalsh(self.information[3:, 3:])[0]) >= 1.0
 
     def expects(self, T_odom_lidar: Array) -> bool:
-        """Whether a pose (4, 4) is the predicted one: within one standard deviation, and at most `_EXACT` away."""
+        """Whether a pose (4, 4) is the predicted one: within one standard deviation and `_EXACT_DISTANCE`."""
         if self.information is None or not self.known or not near(self.starts[0], T_odom_lidar):
             return False
         xi = se3.way(self.starts[0], T_odom_lidar)
-        return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT)
+        return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT_DISTANCE)
 
     def convinced(self, points: Registration) -> bool:
         """Whether a point registration fits well enough to be accepted, if it leaves no direction unconstrained.
@@ -96,8 +96,8 @@ class Prediction:
         After a jolt the points may be matched to the wrong walls: after a rotation of 10 degrees between scans 77 %
         fitted, at a pose that was 2.6 degrees off.
         """
-        beside = self.known and not near(self.starts[0], points.T_target_source)
-        return beside and points.confidence < _NEARLY_ALL
+        is_away = self.known and not near(self.starts[0], points.T_target_source)
+        return is_away and points.confidence < _HIGH_CONFIDENCE
 
 
 class ScanRegistration(Protocol):

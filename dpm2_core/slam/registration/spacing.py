@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-_LEAST = 1.0  # m
-_MOST = 2.0  # of the distance
+_MIN_METERS = 1.0
+_MAX_RATIO = 2.0  # of the distance
 
 
 class Spacing:
@@ -23,5 +23,5 @@ class Spacing:
         """Update by the residual of a registration, m."""
         if self._residual:
             wanted = 2 * (1 - min(rmse / self._residual, 1.0)) ** 2
-            self._ratio = min(0.9 * self._ratio + 0.1 * wanted, _MOST)
-            self.meters = max(self._distance * self._ratio, _LEAST)
+            self._ratio = min(0.9 * self._ratio + 0.1 * wanted, _MAX_RATIO)
+            self.meters = max(self._distance * self._ratio, _MIN_METERS)

@@ -25,11 +25,11 @@ _ITERATIONS = 12
 _CHI2 = 21.03
 """95 % quantile of chi2 with 12 degrees of freedom. Of sweeps on foot, on legs and of cars the largest was 10; with
 times that run backwards in a driver it is 30 on average."""
-_END = (3e-4, 3e-3)  # rad and m: iterations end at smaller changes of the pose, and of the ends of the sweep
+_STEP_LIMITS = (3e-4, 3e-3)  # rad and m: iterations end at smaller changes of the pose, and of the ends of the sweep
 JOINT = np.diag(np.repeat([np.radians(0.05), 0.005, 0.1, 0.1], 3) ** 2)
 """Covariance (12, 12) [rad, m, rad/s, m/s] of the difference between the end of a sweep and the start of the next."""
 
-_GYROSCOPE = 0.07
+_GYROSCOPE_SIGMA = 0.07
 """Standard deviation of a measured rotation rate next to the points, rad/s, as that of a rotation between scans."""
 
 Matched = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -57,7 +57,7 @@ class Beginning:
         """The same with the rotation during the sweep measured by an IMU, its derivatives (ORDER, 3)."""
         expected, deviation = self.expected.copy(), self.deviation.copy()
         expected[:, :3] = measured
-        deviation[:, :3] = _GYROSCOPE / self.half ** np.arange(ORDER)[:, None]
+        deviation[:, :3] = _GYROSCOPE_SIGMA / self.half ** np.arange(ORDER)[:, None]
         return replace(self, expected=expected, deviation=deviation)
 
 
@@ -79,23 +79,27 @@ class Swept:
     def placed(self, result: Registration) -> Swept:
         """Take the pose of a result, which may use more than the points; the motion changes by the correlated part."""
         T = result.T_target_source
-        off = se3.way(self.T, T)
+        difference = se3.way(self.T, T)
         gain = np.linalg.solve(self.covariance[:6, :6] + result.of_scene, self.covariance[:6]).T
-        motion = self.motion + (gain @ off)[6:].reshape(ORDER, 6)
+        motion = self.motion + (gain @ difference)[6:].reshape(ORDER, 6)
         return replace(self, T=T, motion=motion, covariance=self.covariance - gain @ self.covariance[:6])
 
     def next(self, seconds: float, half: float, steadiness: float) -> Beginning:
         """The prior of a sweep whose middle is `seconds` later."""
         pause = max(seconds - self.half - half, 0.0)
-        of_end = _at(self.half)
-        go_on = np.eye(12)
-        go_on[:6, 6:] = pause * np.eye(6)
-        change = go_on @ of_end
-        lost = np.repeat([steadiness * pause * pause / 2, steadiness * pause], 6) ** 2
-        twist = _twist(of_end, self.motion)
+        J_end = _state_jacobian(self.half)
+        propagation = np.eye(12)
+        propagation[:6, 6:] = pause * np.eye(6)
+        J_next = propagation @ J_end
+        added_variance = np.repeat([steadiness * pause * pause / 2, steadiness * pause], 6) ** 2
+        twist = _twist(J_end, self.motion)
         T = self.T @ curve.poses(self.half, self.motion) @ se3.exp(pause * twist)
         return Beginning(
-            T, twist, change @ self.covariance @ change.T + np.diag(lost) + JOINT, half, *_steady(half, steadiness)
+            T,
+            twist,
+            J_next @ self.covariance @ J_next.T + np.diag(added_variance) + JOINT,
+            half,
+            *_steady_prior(half, steadiness),
         )
 
 
@@ -104,7 +108,9 @@ def begun_steadily(T_before: Array, twist: Array, seconds: float, half: float, s
     two is known."""
     sigma = steadiness * seconds / 2
     covariance = np.diag(np.repeat([sigma * half, sigma], 6) ** 2)
-    return Beginning(T_before @ se3.exp((seconds - half) * twist), twist, covariance, half, *_steady(half, steadiness))
+    return Beginning(
+        T_before @ se3.exp((seconds - half) * twist), twist, covariance, half, *_steady_prior(half, steadiness)
+    )
 
 
 def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning, shared: float) -> Swept | None:
@@ -118,22 +124,24 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
     motion = np.concatenate([beginning.twist[None], np.zeros((ORDER - 1, 6))])
     information = np.linalg.inv(beginning.covariance)
     expected = np.concatenate([np.zeros(6), beginning.expected.ravel()])
-    alone = np.concatenate([np.zeros(6), beginning.deviation.ravel() ** -2])
-    start = _at(-beginning.half)
+    motion_information = np.concatenate([np.zeros(6), beginning.deviation.ravel() ** -2])
+    J_start = _state_jacobian(-beginning.half)
     for _ in range(_ITERATIONS):
         points = curve.moved(scan.seen, scan.times, partial(curve.poses, motion=motion))
         H, gradient = _normal_equations(points, scan.times, T, matched(points, T), shared)
         T_start = T @ curve.poses(-beginning.half, motion)
-        off = np.concatenate([se3.way(beginning.T, T_start), _twist(start, motion) - beginning.twist])
-        H += start.T @ information @ start + np.diag(alone + 1e-9)
-        gradient += start.T @ information @ off + alone * (np.concatenate([np.zeros(6), motion.ravel()]) - expected)
+        difference = np.concatenate([se3.way(beginning.T, T_start), _twist(J_start, motion) - beginning.twist])
+        H += J_start.T @ information @ J_start + np.diag(motion_information + 1e-9)
+        gradient += J_start.T @ information @ difference + motion_information * (
+            np.concatenate([np.zeros(6), motion.ravel()]) - expected
+        )
         step = np.linalg.solve(H, -gradient)
         T, change = T @ se3.exp(step[:6]), step[6:].reshape(ORDER, 6)
         motion = motion + change
         moved = np.abs([step[:6], beginning.half * change[0]]).reshape(4, 3).max(1)
-        if max(moved[0], moved[2]) < _END[0] and max(moved[1], moved[3]) < _END[1]:
+        if max(moved[0], moved[2]) < _STEP_LIMITS[0] and max(moved[1], moved[3]) < _STEP_LIMITS[1]:
             break
-    if off @ information @ off > _CHI2:
+    if difference @ information @ difference > _CHI2:
         return None
     T = se3.orthonormalized(T)  # removes accumulated rounding errors
     return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), beginning.half)
@@ -149,20 +157,20 @@ def _normal_equations(
     return np.vstack(rows) / shared, (np.array(weight)[:, None] * gradient).ravel() / shared
 
 
-def _steady(half: float, steadiness: float) -> tuple[Array, Array]:
+def _steady_prior(half: float, steadiness: float) -> tuple[Array, Array]:
     """`expected` and `deviation` of a `Beginning`: an acceleration with this standard deviation (m/s2 and rad/s2),
     which may reverse in half a sweep."""
     deviation = [np.inf, *(steadiness * (2 / half) ** k for k in range(ORDER - 1))]
     return np.zeros((ORDER, 6)), np.repeat(np.array(deviation)[:, None], 6, 1)
 
 
-def _at(time: float) -> Array:
+def _state_jacobian(time: float) -> Array:
     """(12, 6 + 6 ORDER) Jacobian of pose and twist at a time, s, with respect to the pose at 0 and the motion; to first
     order in the motion."""
-    of_pose = [time**k / factorial(k) for k in range(ORDER + 1)]
-    return np.concatenate([np.kron(of_pose, np.eye(6)), np.kron([0.0, *of_pose[:-1]], np.eye(6))])
+    powers = [time**k / factorial(k) for k in range(ORDER + 1)]
+    return np.concatenate([np.kron(powers, np.eye(6)), np.kron([0.0, *powers[:-1]], np.eye(6))])
 
 
-def _twist(at: Array, motion: Array) -> Array:
-    """(6,) twist at the time of `at`, which is `_at`."""
-    return np.asarray(at[6:, 6:] @ motion.ravel())
+def _twist(J: Array, motion: Array) -> Array:
+    """(6,) twist at the time of J, a `_state_jacobian`."""
+    return np.asarray(J[6:, 6:] @ motion.ravel())

@@ -37,17 +37,17 @@ class VisualSettings(Settings):
 
 
 _WIDTH = 640  # pixels: images are reduced to it
-_POINTS = 1500  # maximum number of compared points
-_NEAR, _FAR = 2.0, 50.0  # m ahead of the camera: the compared points
+_MAX_POINTS = 1500  # compared points
+_MIN_DEPTH, _MAX_DEPTH = 2.0, 50.0  # m ahead of the camera: the compared points
 _STEPS = (0.1, 0.02)  # m, between the offsets that are tried: everywhere, then around the best
-_GLANCE, _FEW = 0.2, 3  # m, between the offsets of a quick search, with every third point
+_GLANCE_STEP, _GLANCE_STRIDE = 0.2, 3  # m, between the offsets of a quick search, with every third point
 _BLUR = (2.5, 1.0)  # pixels: so that no maximum is missed between two offsets
-_BESIDE = 1.0  # m, before and behind: structure that is the same there does not constrain the offset
-_LOCAL = 12.0  # pixels: brightness that changes more slowly is no texture
-_LEAST = 100  # points that both images must show
+_NEIGHBOR_DISTANCE = 1.0  # m, before and behind: structure that is the same there does not constrain the offset
+_LOCAL_SCALE = 12.0  # pixels: brightness that changes more slowly is no texture
+_MIN_POINTS = 100  # points that both images must show
 _CORRELATED = 100  # neighboring pixels, and the points between them, that count as one independent value
 _COARSE_MARGIN = 0.3  # candidates within it of the best coarse correlation are refined at the fine level
-_APART = 0.6  # m: a separate peak, not the slope of the best one
+_PEAK_SEPARATION = 0.6  # m: a separate peak, not the slope of the best one
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Texture:
 
     def project(self, points: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Pixels (..., N, 2) of points (..., N, 3) in the camera frame, m, and a mask of those inside the image."""
-        ahead = points[..., 2] > _NEAR / 2
+        ahead = points[..., 2] > _MIN_DEPTH / 2
         image = points @ self.K.T
         uv = np.asarray(image[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None], np.float32)
         height, width = self.levels[0].shape
@@ -107,7 +107,7 @@ def textured(image: Image) -> Texture:
         gray = cv2.undistort(gray, camera.K, np.array(camera.distortion))
     scale = min(1.0, _WIDTH / camera.size[0])
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
-    detail = local_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _LOCAL)
+    detail = local_contrast(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _LOCAL_SCALE)
     blurred = tuple(cv2.GaussianBlur(detail, (0, 0), blur) for blur in _BLUR)
     return Texture(blurred, camera.resized(*size).K, se3.inverse(camera.T_lidar_cam))
 
@@ -119,12 +119,12 @@ def reference(points: Points, image: Texture, axis: Array) -> Reference:
         axis: (3,) in the LiDAR frame, the unconstrained direction; either sign.
     """
     in_camera = se3.transform(image.T_cam_lidar, points[:, :3].astype(np.float64))
-    kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _NEAR) & (in_camera[:, 2] < _FAR))
-    kept = kept[:: max(1, len(kept) // _POINTS)]
+    kept = np.flatnonzero(image.project(in_camera)[1] & (in_camera[:, 2] > _MIN_DEPTH) & (in_camera[:, 2] < _MAX_DEPTH))
+    kept = kept[:: max(1, len(kept) // _MAX_POINTS)]
     step = image.T_cam_lidar[:3, :3] @ axis
-    here = [_changes(image, in_camera[kept], step, np.zeros(1), level) for level in range(len(_BLUR))]
-    shown = here[0][1][0]
-    return Reference(points[kept[shown], :3], tuple(texture[0, shown] for texture, _ in here))
+    changes = [_texture_changes(image, in_camera[kept], step, np.zeros(1), level) for level in range(len(_BLUR))]
+    shown = changes[0][1][0]
+    return Reference(points[kept[shown], :3], tuple(texture[0, shown] for texture, _ in changes))
 
 
 def along(
@@ -161,12 +161,14 @@ def _search(
     s: VisualSettings, known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float
 ) -> Peak | str:
     """The offset along `axis` of the LiDAR frame, or why it is unknown."""
-    if len(known.points) < _LEAST:
+    if len(known.points) < _MIN_POINTS:
         return f"image: only {len(known.points)} points in it"
     best, *others = peaks(s, known, image, T_ref_lidar, axis, reach) or [Peak(0.0, np.inf, 0.0)]
     if best.correlation < s.min_correlation:
         return f"image: no place correlates by {s.min_correlation:.2f}"
-    if any(p.correlation > best.correlation - s.distinct and abs(p.offset - best.offset) > _APART for p in others):
+    if any(
+        p.correlation > best.correlation - s.distinct and abs(p.offset - best.offset) > _PEAK_SEPARATION for p in others
+    ):
         return "image: several places are alike"
     return best
 
@@ -181,50 +183,53 @@ def peaks(
         reach: search range to either side, m.
     """
     offsets = np.arange(-reach, reach + _STEPS[0] / 2, _STEPS[0])
-    correlation = _correlated(known, image, T_ref_lidar, axis, offsets, 0)
+    correlation = _correlation_at_offsets(known, image, T_ref_lidar, axis, offsets, 0)
     candidates = _maxima(correlation, max(s.min_correlation / 2, float(correlation.max()) - _COARSE_MARGIN))
     around = np.arange(-_STEPS[0], _STEPS[0] + _STEPS[1] / 2, _STEPS[1])
     found = []
     for middle in offsets[candidates]:
-        fine = _correlated(known, image, T_ref_lidar, axis, middle + around, 1)
+        fine = _correlation_at_offsets(known, image, T_ref_lidar, axis, middle + around, 1)
         found.append(peak(middle + around, fine, len(known.points) / _CORRELATED))
     return sorted(found, key=lambda one: -one.correlation)
 
 
 def glance(known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, reach: float) -> Peak:
     """Approximately the best of `peaks`, with fewer points and coarser steps: a tenth of the time."""
-    few = Reference(known.points[::_FEW], tuple(level[::_FEW] for level in known.texture))
-    offsets = np.arange(-reach, reach + _GLANCE / 2, _GLANCE)
-    correlation = _correlated(few, image, T_ref_lidar, axis, offsets, 0)
+    subset = Reference(known.points[::_GLANCE_STRIDE], tuple(level[::_GLANCE_STRIDE] for level in known.texture))
+    offsets = np.arange(-reach, reach + _GLANCE_STEP / 2, _GLANCE_STEP)
+    correlation = _correlation_at_offsets(subset, image, T_ref_lidar, axis, offsets, 0)
     best = int(correlation.argmax())
-    return Peak(float(offsets[best]), _GLANCE, float(correlation[best]))
+    return Peak(float(offsets[best]), _GLANCE_STEP, float(correlation[best]))
 
 
-def _correlated(
+def _correlation_at_offsets(
     known: Reference, image: Texture, T_ref_lidar: Array, axis: Array, offsets: Array, level: int
 ) -> NDArray[np.float32]:
     """Correlation (S,) of the texture with the image for each offset (S,), m, of the LiDAR."""
-    there = se3.transform(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
+    in_camera = se3.transform(image.T_cam_lidar @ se3.inverse(T_ref_lidar), known.points.astype(np.float64))
     step = image.T_cam_lidar[:3, :3] @ axis
-    return _correlations(known.texture[level], *_changes(image, there, step, offsets, level))
+    return _correlations(known.texture[level], *_texture_changes(image, in_camera, step, offsets, level))
 
 
-def _changes(
+def _texture_changes(
     image: Texture, points: Array, step: Array, offsets: Array, level: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Texture (S, N) at points (N, 3) minus `offsets` (S,) times `step` (3,): only its changes along that step.
 
     Rails and the edges of roads and walls look the same everywhere along them. Therefore the texture is relative to
-    that at the points `_BESIDE` m before and behind, which lie on the same surfaces.
+    that at the points `_NEIGHBOR_DISTANCE` m before and behind, which lie on the same surfaces.
     """
-    every = float(offsets[1] - offsets[0]) if len(offsets) > 1 else _BESIDE
-    k = round(_BESIDE / every)
+    spacing = float(offsets[1] - offsets[0]) if len(offsets) > 1 else _NEIGHBOR_DISTANCE
+    k = round(_NEIGHBOR_DISTANCE / spacing)
     if len(offsets) > 2 * k:  # the positions before and behind are among the offsets
-        wide = offsets[0] + every * np.arange(-k, len(offsets) + k)
-        found, shown = image.sample(points - wide[:, None, None] * step, level)
+        extended = offsets[0] + spacing * np.arange(-k, len(offsets) + k)
+        found, shown = image.sample(points - extended[:, None, None] * step, level)
         parts = [(found[a : a + len(offsets)], shown[a : a + len(offsets)]) for a in (0, k, 2 * k)]
     else:
-        parts = [image.sample(points - (offsets + a)[:, None, None] * step, level) for a in (-_BESIDE, 0.0, _BESIDE)]
+        parts = [
+            image.sample(points - (offsets + a)[:, None, None] * step, level)
+            for a in (-_NEIGHBOR_DISTANCE, 0.0, _NEIGHBOR_DISTANCE)
+        ]
     (before, in_before), (here, in_here), (behind, in_behind) = parts
     changes = np.asarray(here - (before + behind) / 2, np.float32)
     return changes, in_before & in_here & in_behind
@@ -245,7 +250,7 @@ def _correlations(
     x = (values - (weight @ values / np.maximum(count, 1))[:, None]) * weight
     y = (found - ((found * weight).sum(1) / np.maximum(count, 1))[:, None]) * weight
     spread = np.sqrt((x * x).sum(1) * (y * y).sum(1))
-    return np.where(count >= _LEAST, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
+    return np.where(count >= _MIN_POINTS, (x * y).sum(1) / np.maximum(spread, 1e-6), 0.0)
 
 
 def peak(offsets: NDArray[np.floating[Any]], correlation: NDArray[np.floating[Any]], independent: float) -> Peak:
@@ -257,7 +262,7 @@ def peak(offsets: NDArray[np.floating[Any]], correlation: NDArray[np.floating[An
     i = int(np.clip(correlation.argmax(), 1, len(offsets) - 2))
     before, top, after = correlation[i - 1 : i + 2].astype(float)
     step = offsets[1] - offsets[0]
-    bend = max((2 * top - before - after) / step**2, 1e-3)
-    offset = offsets[i] + float(np.clip((after - before) / (2 * bend * step), -step, step))
-    information = independent * bend * max(top, 1e-6) / max(1 - top * top, 1e-3)
+    curvature = max((2 * top - before - after) / step**2, 1e-3)
+    offset = offsets[i] + float(np.clip((after - before) / (2 * curvature * step), -step, step))
+    information = independent * curvature * max(top, 1e-6) / max(1 - top * top, 1e-3)
     return Peak(offset, float(max(0.01, information**-0.5)), float(correlation.max()))
