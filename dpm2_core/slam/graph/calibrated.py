@@ -20,15 +20,15 @@ from dpm2_core.slam.graph.graph_data import GraphData, chain_chi2, integrate, lo
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
 _SETTINGS = RobustSettings(odometry_sigmas=5.0)  # tighter than by default, where the covariances are used as given
-_STEPS = 10  # solver steps that reveal most wrong loops; converging to an optimum with them takes minutes
-_QUANTILE, _AMONG_RIGHT = 0.2, 0.3  # quantile of all loops, and among the right ones if a third is wrong
-_LEAST = 8  # loops; fewer do not show how large the covariances are
-_APART = 10  # nodes; loops between nearer ones often repeat the odometry
-_ROOM = 2.0  # factor on chi2 per degree of freedom of the loops that passed, which lacks the tail of its distribution
-_AGAIN = 0.05  # rejected loops that are tried again, as a fraction of the kept ones; few, as each may slow the solver
-_STAGES = 6
-_TOO_FIRM = 4.0  # a larger factor means that the covariances are too small, unless most loops are wrong
-_SHARE = 0.35  # of chi2 in the loops; about half where they check each other
+_SOLVER_STEPS = 10  # reveal most wrong loops; converging to an optimum with them takes minutes
+_QUANTILE, _QUANTILE_OF_RIGHT = 0.2, 0.3  # quantile of all loops, and among the right ones if a third is wrong
+_MIN_LOOPS = 8  # fewer do not show how large the covariances are
+_MIN_NODES_APART = 10  # nodes; loops between nearer ones often repeat the odometry
+_CHI2_FACTOR = 2.0  # on chi2 per degree of freedom of the loops that passed, which lacks the distribution's tail
+_RETRIED_RATIO = 0.05  # of rejected loops that are tried again to kept ones; few, as each may slow the solver
+_MAX_STAGES = 6
+_MAX_SCALE = 4.0  # a larger factor means that the covariances are too small, unless most loops are wrong
+_MIN_LOOP_SHARE = 0.35  # of chi2 in the loops; about half where they check each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,56 +69,59 @@ def optimize_calibrated(graph: GraphData, dof: int, report: Callable[[str], None
         Dpm2Error: the system is singular.
     """
     odometry = integrate(graph)
-    first = _chain_scale(graph, odometry, dof)
-    loose, solution, scale = False, None, 1.0
-    if first is not None:
-        loose = _others_pass(graph, odometry, first)
-        solution, scale = _stages(graph, dof, first, report)
-        if loose and first > _TOO_FIRM and not _agree(graph, solution, scale / first):
+    chain_scale = _chain_scale(graph, odometry, dof)
+    accepts_wrong, solution, scale = False, None, 1.0
+    if chain_scale is not None:
+        accepts_wrong = _accepts_wrong_loops(graph, odometry, chain_scale)
+        solution, scale = _optimize_in_stages(graph, dof, chain_scale, report)
+        if accepts_wrong and chain_scale > _MAX_SCALE and not _most_loops_agree(graph, solution, scale / chain_scale):
             solution = None  # with such large covariances any loop passes: perhaps all are wrong
     if solution is None:
         solution, scale = optimize(graph, RobustSettings()), 1.0
-        loose = bool(solution.kept.any()) and _others_pass(graph, odometry, scale)
-    return Calibrated(solution, scale, loose and _loop_share(graph, solution) < _SHARE)
+        accepts_wrong = bool(solution.kept.any()) and _accepts_wrong_loops(graph, odometry, scale)
+    return Calibrated(solution, scale, accepts_wrong and _loop_share(graph, solution) < _MIN_LOOP_SHARE)
 
 
-def _agree(graph: GraphData, solution: Solution, grown: float) -> bool:
+def _most_loops_agree(graph: GraphData, solution: Solution, growth: float) -> bool:
     """Whether most loops are kept, more than one per place, with covariances that have not grown much beyond those that
     the odometry suggests: wrong loops alone do not achieve that."""
-    most = solution.kept.sum() > max(len(np.unique(graph.ends)), len(graph.ends) / 2)
-    return bool(grown < _TOO_FIRM and most)
+    majority = solution.kept.sum() > max(len(np.unique(graph.ends)), len(graph.ends) / 2)
+    return bool(growth < _MAX_SCALE and majority)
 
 
-def _stages(graph: GraphData, dof: int, first: float, report: Callable[[str], None]) -> tuple[Solution, float]:
-    scale, poses, used = first, graph.poses, None
-    most = np.inf if first > _TOO_FIRM else max(first, 1.0)  # wrong loops that were kept would let in others
-    for stage in range(_STAGES):
+def _optimize_in_stages(
+    graph: GraphData, dof: int, chain_scale: float, report: Callable[[str], None]
+) -> tuple[Solution, float]:
+    scale, poses, used = chain_scale, graph.poses, None
+    # Wrong loops that were kept would let in others.
+    max_scale = np.inf if chain_scale > _MAX_SCALE else max(chain_scale, 1.0)
+    for stage in range(_MAX_STAGES):
         report(f"stage {stage + 1}: covariances times {scale:.3g}")
-        solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used, _STEPS)
-        fitting = min(most, _ROOM * chi2_per_dof(graph, solution.poses, solution.kept, dof))
-        if not 0 < fitting < np.inf or (stage and 0.5 < fitting / scale < 1.25) or stage == _STAGES - 1:
+        solution = optimize(scaled(replace(graph, poses=poses), scale), _SETTINGS, used, _SOLVER_STEPS)
+        new_scale = min(max_scale, _CHI2_FACTOR * chi2_per_dof(graph, solution.poses, solution.kept, dof))
+        if not 0 < new_scale < np.inf or (stage and 0.5 < new_scale / scale < 1.25) or stage == _MAX_STAGES - 1:
             break
-        near = min(len(solution.sigmas) - 1, int((1 + _AGAIN) * solution.kept.sum()))
-        scale, poses, used = fitting, solution.poses, solution.sigmas <= np.sort(solution.sigmas)[near]
+        last = min(len(solution.sigmas) - 1, int((1 + _RETRIED_RATIO) * solution.kept.sum()))
+        scale, poses, used = new_scale, solution.poses, solution.sigmas <= np.sort(solution.sigmas)[last]
     return solution, scale
 
 
 def _chain_scale(graph: GraphData, odometry: Array, dof: int) -> float | None:
     """Factor on all covariances with which the right loops agree with the odometry; None with too few loops."""
-    far = np.abs(graph.ends[:, 1] - graph.ends[:, 0]) > _APART
-    apart = chain_chi2(graph, odometry)[far]
-    apart = apart[np.isfinite(apart)]
-    if len(apart) < _LEAST:
+    far = np.abs(graph.ends[:, 1] - graph.ends[:, 0]) > _MIN_NODES_APART
+    chi2 = chain_chi2(graph, odometry)[far]
+    chi2 = chi2[np.isfinite(chi2)]
+    if len(chi2) < _MIN_LOOPS:
         return None
-    factor = float(np.quantile(apart, _QUANTILE) / chdtri(dof, 1 - _AMONG_RIGHT))
+    factor = float(np.quantile(chi2, _QUANTILE) / chdtri(dof, 1 - _QUANTILE_OF_RIGHT))
     return factor if factor > 0 else None  # without noise there is nothing to calibrate
 
 
-def _others_pass(graph: GraphData, odometry: Array, factor: float) -> bool:
+def _accepts_wrong_loops(graph: GraphData, odometry: Array, factor: float) -> bool:
     """Whether the odometry would accept most loops with one end moved by half of the graph."""
-    other = np.stack([graph.ends[:, 0], (graph.ends[:, 1] + len(graph) // 2) % len(graph)], -1)
-    apart = np.sqrt(chain_chi2(scaled(replace(graph, ends=other), factor), odometry))
-    return bool((apart < _SETTINGS.odometry_sigmas).mean() > 0.5)
+    wrong_ends = np.stack([graph.ends[:, 0], (graph.ends[:, 1] + len(graph) // 2) % len(graph)], -1)
+    sigmas = np.sqrt(chain_chi2(scaled(replace(graph, ends=wrong_ends), factor), odometry))
+    return bool((sigmas < _SETTINGS.odometry_sigmas).mean() > 0.5)
 
 
 def _loop_share(graph: GraphData, solution: Solution) -> float:

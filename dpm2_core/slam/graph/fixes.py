@@ -20,16 +20,16 @@ from dpm2_core.geometry.sampling import evenly
 from dpm2_core.slam.graph.graph_data import GraphData, Index
 from dpm2_core.slam.graph.lag import STRETCH, Stretch, lag_of, moved_by
 
-_FEWEST = 5
-_HEADING = np.radians(2.0)  # standard deviation up to which the heading counts as known
+_MIN_FIXES = 5
+_MAX_HEADING_SIGMA = np.radians(2.0)  # standard deviation up to which the heading counts as known
 _KERNEL = 3.0  # standard deviations beyond which a fix hardly counts for the start
 _SLACK, _DRIFT = 0.05, 0.02  # m, and m per m from the middle: error of the odometry
 _TRIALS = 100  # headings
-_NEAR = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
-_TILT = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
-_ANY_TURN, _ANY_PLACE = 1e2, 1e6  # rad and m, standard deviations of values that are not measured
-_SLOWEST = 5.0  # s, maximum between two fixes that give a speed
-_FLAT = 100.0  # m, standard deviation from which on a height counts as not measured
+_MAX_DISTANCE = 10_000.0  # m from the median of all: farther fixes are wrong, and none of them is the origin
+_TILT_SIGMA = np.radians(5.0)  # standard deviation of the map's level: a drive may begin on a hill
+_FREE_ROTATION, _FREE_POSITION = 1e2, 1e6  # rad and m, standard deviations of values that are not measured
+_MAX_FIX_INTERVAL = 5.0  # s, maximum between two fixes that give a speed
+_MAX_HEIGHT_SIGMA = 100.0  # m, standard deviation from which on a height counts as not measured
 
 
 class Fixes:
@@ -47,7 +47,7 @@ class Fixes:
         self._solved = 0  # fixes at the last optimization
         self.georeference: Georeference | None = None
         self.uncertain = np.zeros((6, 6))
-        self._lag = self._located_with = 0.0  # s, lag of the stamps of the fixes, as far as it is known
+        self._lag = self._lag_of_georeference = 0.0  # s, lag of the stamps of the fixes, as far as it is known
 
     def __len__(self) -> int:
         return len(self._fixes)
@@ -80,22 +80,22 @@ class Fixes:
 
         `poses`: (N, 4, 4). `placed`: as in `chosen`.
         """
-        which = np.array([placed[node] for node, _ in self._fixes], np.bool_)
-        if which.sum() < _FEWEST:
+        mask = np.array([placed[node] for node, _ in self._fixes], np.bool_)
+        if mask.sum() < _MIN_FIXES:
             return
-        here, velocities = self._antennas(poses)
-        here = (here - self._lag * velocities)[which]
-        there, sigmas = (part[which] for part in self._measured())
-        middle = np.linalg.norm(here - np.median(here, axis=0), axis=1)
-        sigmas = np.hypot(sigmas, _SLACK + _DRIFT * middle)
-        near = np.linalg.norm(there - np.median(there, axis=0), axis=1) < _NEAR
-        origin = self._fixes[np.flatnonzero(which)[np.argmax(near)]][1].geodetic
+        in_map, velocities = self._antenna_states(poses)
+        in_map = (in_map - self._lag * velocities)[mask]
+        on_earth, sigmas = (part[mask] for part in self._measured_positions())
+        from_middle = np.linalg.norm(in_map - np.median(in_map, axis=0), axis=1)
+        sigmas = np.hypot(sigmas, _SLACK + _DRIFT * from_middle)
+        near = np.linalg.norm(on_earth - np.median(on_earth, axis=0), axis=1) < _MAX_DISTANCE
+        origin = self._fixes[np.flatnonzero(mask)[np.argmax(near)]][1].geodetic
         if self.georeference is not None:
             origin, T = self.georeference.origin, self.georeference.T_enu_map
-            apart = np.linalg.norm((se3.transform(T, here) - _local(origin, there))[:, :2], axis=1)
-            if np.median(apart / sigmas) < 2 * _KERNEL and self._lag == self._located_with:
+            errors = np.linalg.norm((se3.transform(T, in_map) - _to_enu(origin, on_earth))[:, :2], axis=1)
+            if np.median(errors / sigmas) < 2 * _KERNEL and self._lag == self._lag_of_georeference:
                 return
-        T_enu_map, self._located_with = fitted(here, _local(origin, there), sigmas), self._lag
+        T_enu_map, self._lag_of_georeference = fitted(in_map, _to_enu(origin, on_earth), sigmas), self._lag
         if T_enu_map is None:  # most fixes contradict the old one, as those of another robot; no other fits
             self.georeference = None
         else:
@@ -104,38 +104,38 @@ class Fixes:
     def find_lag(self, odometry: Array, placed: NDArray[np.bool_]) -> None:
         """Estimate the lag of the fixes; `odometry`: (N, 4, 4), each trajectory as driven. `placed`: as in `chosen`."""
         assert self.georeference is not None
-        T_enu_map, (here, velocities) = self.georeference.T_enu_map, self._antennas(odometry)
+        T_enu_map, (here, velocities) = self.georeference.T_enu_map, self._antenna_states(odometry)
         here, moving = se3.transform(T_enu_map, here), velocities @ T_enu_map[:3, :3].T
-        there, sigmas = self._measured()
-        there, stretches = _local(self.georeference.origin, there), []
+        there, sigmas = self._measured_positions()
+        there, stretches = _to_enu(self.georeference.origin, there), []
         for row in self._rows.values():
             timed = [k for k in row if velocities[k].any() and placed[self._fixes[k][0]]]
             for k in (timed[first : first + STRETCH] for first in range(0, len(timed), STRETCH)):
                 stretches.append(Stretch(here[k], there[k], moving[k], sigmas[k]))
         lag = lag_of(stretches)
-        late = lag.seconds if lag.known else 0.0
-        if abs(late - self._lag) > lag.sigma:
-            self._lag = late
+        seconds = lag.seconds if lag.known else 0.0
+        if abs(seconds - self._lag) > lag.sigma:
+            self._lag = seconds
         moves = moved_by(stretches)
-        beyond_chance = max(0.0, (lag.seconds - self._lag) ** 2 - lag.sigma**2)
-        self.uncertain = beyond_chance * np.outer(moves, moves)
+        excess = max(0.0, (lag.seconds - self._lag) ** 2 - lag.sigma**2)
+        self.uncertain = excess * np.outer(moves, moves)
 
     def loaded(self) -> None:
         """The georeference is that of an optimized map with these fixes."""
-        self._located_with, self._solved = self._lag, len(self)
+        self._lag_of_georeference, self._solved = self._lag, len(self)
 
-    def _antennas(self, poses: Array) -> tuple[Array, Array]:
+    def _antenna_states(self, poses: Array) -> tuple[Array, Array]:
         """(K, 3) m, antenna positions in the map at the stamps of the fixes, and (K, 3) m/s, their velocities since the
         previous fix, 0 if unknown; `poses`: (N, 4, 4)."""
-        here = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in self._fixes])[:, :3]
-        stamps, velocities = np.array([fix.stamp for _, fix in self._fixes], np.int64), np.zeros_like(here)
+        positions = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in self._fixes])[:, :3]
+        stamps, velocities = np.array([fix.stamp for _, fix in self._fixes], np.int64), np.zeros_like(positions)
         for row in self._rows.values():
             seconds = np.diff(stamps[row])[:, None] * 1e-9
-            tells = (seconds > 0) & (seconds < _SLOWEST)
-            velocities[row[1:]] = np.where(tells, np.diff(here[row], axis=0) / np.where(tells, seconds, 1.0), 0.0)
-        return here, velocities
+            valid = (seconds > 0) & (seconds < _MAX_FIX_INTERVAL)
+            velocities[row[1:]] = np.where(valid, np.diff(positions[row], axis=0) / np.where(valid, seconds, 1.0), 0.0)
+        return positions, velocities
 
-    def _measured(self) -> tuple[Array, Array]:
+    def _measured_positions(self) -> tuple[Array, Array]:
         """(K, 3) m, antenna positions on Earth by the fixes, and (K,) m, their horizontal standard deviations."""
         sigmas = np.array([np.sqrt(np.trace(fix.covariance[:2, :2]) / 2) for _, fix in self._fixes])
         return geodesy.ecef([fix.geodetic for _, fix in self._fixes]), sigmas
@@ -153,19 +153,23 @@ class Fixes:
         fixes = [self._fixes[k][1] for k in chosen]
         T = self.georeference.T_enu_map @ data.poses[at]  # with the current rotations: a fix measures none
         R = T[:, :3, :3]
-        arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
+        lever_arms = (R @ np.array([fix.antenna for fix in fixes])[..., None])[..., 0]
         if self._lag:
-            arms -= self._lag * self._antennas(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
-        local = _local(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
+            lever_arms -= (
+                self._lag * self._antenna_states(data.poses[places])[1][chosen] @ self.georeference.T_enu_map[:3, :3].T
+            )
+        local = _to_enu(self.georeference.origin, geodesy.ecef([fix.geodetic for fix in fixes]))
         measured = np.array([fix.covariance for fix in fixes])
         # A residual is the logarithm of a pose: unconstrained large height errors would affect east and north.
-        flat = measured[:, 2, 2] > _FLAT**2
-        local[flat, 2] = (T[:, :3, 3] + arms)[flat, 2]
-        measured[flat, 2], measured[flat, :, 2], measured[flat, 2, 2] = 0.0, 0.0, _FLAT**2
-        T[:, :3, 3] = local - arms
-        covariances = np.tile(np.eye(6) * _ANY_TURN**2, (len(at) + 1, 1, 1))
+        no_height = measured[:, 2, 2] > _MAX_HEIGHT_SIGMA**2
+        local[no_height, 2] = (T[:, :3, 3] + lever_arms)[no_height, 2]
+        measured[no_height, 2], measured[no_height, :, 2], measured[no_height, 2, 2] = 0.0, 0.0, _MAX_HEIGHT_SIGMA**2
+        T[:, :3, 3] = local - lever_arms
+        covariances = np.tile(np.eye(6) * _FREE_ROTATION**2, (len(at) + 1, 1, 1))
         covariances[:-1, 3:, 3:] = np.swapaxes(R, 1, 2) @ measured @ R
-        covariances[-1] = np.diag([_TILT, _TILT, _ANY_TURN, _ANY_PLACE, _ANY_PLACE, _ANY_PLACE]) ** 2
+        covariances[-1] = (
+            np.diag([_TILT_SIGMA, _TILT_SIGMA, _FREE_ROTATION, _FREE_POSITION, _FREE_POSITION, _FREE_POSITION]) ** 2
+        )
         yaw = np.arctan2(T_map_enu[1, 0], T_map_enu[0, 0])
         level = se3.make(se3.rotation(np.array([0.0, 0.0, yaw])), T_map_enu[:3, 3])
         return replace(
@@ -202,25 +206,25 @@ def fitted(here: Array, there: Array, sigmas: Array) -> Array | None:
     a, b = here[:, :2] @ [1, 1j], there[:, :2] @ [1, 1j]  # as complex numbers a rotation is a factor
     half = len(a) // 2
     first = evenly(half, _TRIALS)
-    turns = np.exp(1j * np.angle((b[first + half] - b[first]) * np.conj(a[first + half] - a[first])))
-    moved = turns[:, None] * a
+    rotations = np.exp(1j * np.angle((b[first + half] - b[first]) * np.conj(a[first + half] - a[first])))
+    moved = rotations[:, None] * a
     offsets = np.median((b - moved).real, axis=1) + 1j * np.median((b - moved).imag, axis=1)
-    apart = np.abs(b - moved - offsets[:, None]) / (_KERNEL * sigmas)
-    best = int(np.argmin(np.log1p(apart**2).sum(1)))
-    turn, offset = turns[best], offsets[best]
+    errors = np.abs(b - moved - offsets[:, None]) / (_KERNEL * sigmas)
+    best = int(np.argmin(np.log1p(errors**2).sum(1)))
+    rotation, offset = rotations[best], offsets[best]
     for _ in range(10):
-        weights = 1 / sigmas**2 / (1 + (np.abs(b - turn * a - offset) / (_KERNEL * sigmas)) ** 2)
+        weights = 1 / sigmas**2 / (1 + (np.abs(b - rotation * a - offset) / (_KERNEL * sigmas)) ** 2)
         middle_a, middle_b = np.average(a, weights=weights), np.average(b, weights=weights)
-        turn = np.exp(1j * np.angle(np.sum(weights * (b - middle_b) * np.conj(a - middle_a))))
-        offset = middle_b - turn * middle_a
-    lever = np.sum(weights * np.abs(a - middle_a) ** 2)
-    agree = np.mean(np.abs(b - turn * a - offset) < _KERNEL * sigmas)
-    if lever * _HEADING**2 < 1 or agree <= 0.5:
+        rotation = np.exp(1j * np.angle(np.sum(weights * (b - middle_b) * np.conj(a - middle_a))))
+        offset = middle_b - rotation * middle_a
+    spread = np.sum(weights * np.abs(a - middle_a) ** 2)
+    agree = np.mean(np.abs(b - rotation * a - offset) < _KERNEL * sigmas)
+    if spread * _MAX_HEADING_SIGMA**2 < 1 or agree <= 0.5:
         return None
     up = np.median(there[:, 2] - here[:, 2])
-    return se3.make(se3.rotation(np.array([0.0, 0.0, np.angle(turn)])), [offset.real, offset.imag, up])
+    return se3.make(se3.rotation(np.array([0.0, 0.0, np.angle(rotation)])), [offset.real, offset.imag, up])
 
 
-def _local(origin: Array, ecef: Array) -> Array:
+def _to_enu(origin: Array, ecef: Array) -> Array:
     """(K, 3) from the Earth's frame to east, north, up about a geodetic origin (3,)."""
     return np.asarray(se3.transform(se3.inverse(geodesy.enu_frame(origin)), ecef))

@@ -26,9 +26,9 @@ from dpm2_core.slam.graph.graph_data import GraphData, components, integrate
 
 _VERTEX = {"VERTEX_SE2": 4, "VERTEX_SE3:QUAT": 8}  # numbers on a line
 _EDGE = {"EDGE_SE2": 11, "EDGE_SE3:QUAT": 30}
-_MOST_STARTS = 0.1  # of the nodes: in an order with more breaks, edges between neighbors are chance, perhaps loops
-_FARTHEST = 1e9  # m: beyond, float64 is off by tenths of micrometers, and squares of much larger values are infinite
-_TANGENT = {True: np.array([3, 4, 2]), False: np.array([3, 4, 5, 0, 1, 2])}  # of the file's order, by planar
+_MAX_STARTS_RATIO = 0.1  # of the nodes: in an order with more breaks, edges between neighbors are chance, perhaps loops
+_MAX_DISTANCE = 1e9  # m: beyond, float64 is off by tenths of micrometers, and squares of larger values are infinite
+_TANGENT_ORDER = {True: np.array([3, 4, 2]), False: np.array([3, 4, 5, 0, 1, 2])}  # of the file's order, by planar
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,34 +65,39 @@ def read_g2o(path: Path) -> G2o:
     vertices, edges = lines.get(f"VERTEX_{suffix}", _Lines()), lines.get(f"EDGE_{suffix}", _Lines())
     if not edges.numbers:
         raise UsageError(f"{path}: no EDGE_SE2 or EDGE_SE3:QUAT line in it")
-    values, named = _checked(path, edges), np.array(edges.ids, np.int64)
+    values, edge_ids = _finite_numbers(path, edges), np.array(edges.ids, np.int64)
     T = _poses(path, edges, values, planar)
     covariances = _covariances(path, edges, values[:, (3 if planar else 7) :], planar)
-    ids, poses = np.unique(named), None
+    ids, poses = np.unique(edge_ids), None
     if vertices.numbers:
-        given = _checked(path, vertices)
-        own = np.array(vertices.ids, np.int64)[:, 0]
-        order = np.argsort(own, kind="stable")
-        if len(repeated := np.flatnonzero(np.diff(own[order]) == 0)):
-            raise UsageError(
-                f"{path}:{vertices.at[order[repeated[0] + 1]]}: vertex {own[order[repeated[0]]]} is defined again"
-            )
-        if len(missing := np.setdiff1d(ids, own)):
-            line = edges.at[int(np.flatnonzero((named == missing[0]).any(1))[0])]
+        vertex_values = _finite_numbers(path, vertices)
+        vertex_ids = np.array(vertices.ids, np.int64)[:, 0]
+        order = np.argsort(vertex_ids, kind="stable")
+        if len(repeated := np.flatnonzero(np.diff(vertex_ids[order]) == 0)):
+            line, vertex = vertices.line_numbers[order[repeated[0] + 1]], vertex_ids[order[repeated[0]]]
+            raise UsageError(f"{path}:{line}: vertex {vertex} is defined again")
+        if len(missing := np.setdiff1d(ids, vertex_ids)):
+            line = edges.line_numbers[int(np.flatnonzero((edge_ids == missing[0]).any(1))[0])]
             raise UsageError(f"{path}:{line}: edge of vertex {missing[0]}, which has no VERTEX line")
-        ids, poses = own[order], _poses(path, vertices, given, planar)[order]
-    ends = np.searchsorted(ids, named)
-    as_named = np.searchsorted(ids, own) if vertices.numbers else np.argsort(np.unique(ends, return_index=True)[1])
+        ids, poses = vertex_ids[order], _poses(path, vertices, vertex_values, planar)[order]
+    ends = np.searchsorted(ids, edge_ids)
+    file_order = (
+        np.searchsorted(ids, vertex_ids) if vertices.numbers else np.argsort(np.unique(ends, return_index=True)[1])
+    )
     if len(same := np.flatnonzero(ends[:, 0] == ends[:, 1])):
-        raise UsageError(f"{path}:{edges.at[same[0]]}: edge from vertex {named[same[0], 0]} to itself")
+        raise UsageError(f"{path}:{edges.line_numbers[same[0]]}: edge from vertex {edge_ids[same[0], 0]} to itself")
     if unknown := sorted(set(fixed_ids) - set(ids.tolist())):
         raise UsageError(f"{path}: FIX {unknown[0]}: no such vertex")
     fixed = np.searchsorted(ids, np.array(sorted(set(fixed_ids)), np.int64))
-    if _starts(as_named, ends) < min(_starts(np.arange(len(ids)), ends), len(ids) * _MOST_STARTS):
-        place = np.argsort(as_named)
-        ids, ends, fixed = ids[as_named], place[ends], np.sort(place[fixed])
-        poses = None if poses is None else poses[as_named]
-    graph = _graph(poses if poses is not None else np.tile(np.eye(4), (len(ids), 1, 1)), ends, T, covariances, fixed)
+    if _count_trajectories(file_order, ends) < min(
+        _count_trajectories(np.arange(len(ids)), ends), len(ids) * _MAX_STARTS_RATIO
+    ):
+        position = np.argsort(file_order)
+        ids, ends, fixed = ids[file_order], position[ends], np.sort(position[fixed])
+        poses = None if poses is None else poses[file_order]
+    graph = _to_graph_data(
+        poses if poses is not None else np.tile(np.eye(4), (len(ids), 1, 1)), ends, T, covariances, fixed
+    )
     if poses is None:
         graph = replace(graph, poses=integrate(graph))
     return G2o(graph, ids, planar, ignored)
@@ -121,16 +126,16 @@ def write_g2o(path: Path, file: G2o, loops: NDArray[np.bool_] | None = None) -> 
     ends = np.concatenate([graph.odometry_ends, graph.ends[chosen]])
     T = np.concatenate([graph.steps[steps], graph.T_from_to[chosen]])
     covariances = np.concatenate([graph.step_covariances[steps], graph.covariances[chosen]])
-    order = _TANGENT[file.planar]
+    order = _TANGENT_ORDER[file.planar]
     information = np.linalg.inv(covariances[:, order[:, None], order])
     upper = np.triu_indices(len(order))
     with atomic_write(path) as out:
-        for id, pose in zip(file.ids, _numbers(graph.poses, file.planar), strict=True):
-            out.write(f"VERTEX_{suffix} {id} {_text(pose)}\n")
+        for id, pose in zip(file.ids, _pose_numbers(graph.poses, file.planar), strict=True):
+            out.write(f"VERTEX_{suffix} {id} {_format_numbers(pose)}\n")
         for node in graph.fixed:
             out.write(f"FIX {file.ids[node]}\n")
-        for (a, b), pose, matrix in zip(file.ids[ends], _numbers(T, file.planar), information, strict=True):
-            out.write(f"EDGE_{suffix} {a} {b} {_text(pose)} {_text(matrix[upper])}\n")
+        for (a, b), pose, matrix in zip(file.ids[ends], _pose_numbers(T, file.planar), information, strict=True):
+            out.write(f"EDGE_{suffix} {a} {b} {_format_numbers(pose)} {_format_numbers(matrix[upper])}\n")
 
 
 class _Lines:
@@ -139,7 +144,7 @@ class _Lines:
     def __init__(self) -> None:
         self.ids: list[list[int]] = []  # separate from the numbers: gtsam's 64-bit keys do not fit into float64
         self.numbers: list[list[float]] = []
-        self.at: list[int] = []
+        self.line_numbers: list[int] = []
 
 
 def _read_lines(path: Path) -> tuple[dict[str, _Lines], dict[str, int], list[int]]:
@@ -156,20 +161,20 @@ def _read_lines(path: Path) -> tuple[dict[str, _Lines], dict[str, int], list[int
         words = line.partition("#")[0].split()
         if not words:
             continue
-        tag, want = words[0], _VERTEX.get(words[0]) or _EDGE.get(words[0])
+        tag, expected = words[0], _VERTEX.get(words[0]) or _EDGE.get(words[0])
         try:
             if tag == "FIX":
                 fixed += [_id(word) for word in words[1:]]
-            elif want is None:
+            elif expected is None:
                 ignored[tag] = ignored.get(tag, 0) + 1
             else:
-                if len(words) - 1 != want:
-                    raise UsageError(f"{tag} with {len(words) - 1} numbers, want {want}")
+                if len(words) - 1 != expected:
+                    raise UsageError(f"{tag} with {len(words) - 1} numbers, want {expected}")
                 ids = 1 if tag in _VERTEX else 2
                 rows = lines.setdefault(tag, _Lines())
                 rows.ids.append([_id(word) for word in words[1 : 1 + ids]])
                 rows.numbers.append([float(word) for word in words[1 + ids :]])
-                rows.at.append(number)
+                rows.line_numbers.append(number)
         except UsageError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
         except ValueError:
@@ -184,28 +189,28 @@ def _id(word: str) -> int:
     return number
 
 
-def _checked(path: Path, lines: _Lines) -> Array:
+def _finite_numbers(path: Path, lines: _Lines) -> Array:
     values = np.array(lines.numbers)
     if len(bad := np.flatnonzero(~np.isfinite(values).all(1))):
-        raise UsageError(f"{path}:{lines.at[bad[0]]}: a number that is not finite")
+        raise UsageError(f"{path}:{lines.line_numbers[bad[0]]}: a number that is not finite")
     return values
 
 
 def _poses(path: Path, lines: _Lines, values: Array, planar: bool) -> Array:
     """Leading numbers of (N, 3+) x y yaw or (N, 7+) x y z qx qy qz qw to (N, 4, 4)."""
-    if len(bad := np.flatnonzero(np.abs(values[:, : 2 if planar else 3]).max(1) > _FARTHEST)):
-        raise UsageError(f"{path}:{lines.at[bad[0]]}: farther than {_FARTHEST / 1000:.0f} km")
+    if len(bad := np.flatnonzero(np.abs(values[:, : 2 if planar else 3]).max(1) > _MAX_DISTANCE)):
+        raise UsageError(f"{path}:{lines.line_numbers[bad[0]]}: farther than {_MAX_DISTANCE / 1000:.0f} km")
     if planar:
         R = Rotation.from_rotvec(values[:, 2:3] * [0, 0, 1]).as_matrix()
         return se3.make(R, np.column_stack([values[:, :2], np.zeros(len(values))]))
     if len(bad := np.flatnonzero(np.abs(np.linalg.norm(values[:, 3:7], axis=1) - 1) > 1e-2)):
-        raise UsageError(f"{path}:{lines.at[bad[0]]}: the quaternion is not of unit length")
+        raise UsageError(f"{path}:{lines.line_numbers[bad[0]]}: the quaternion is not of unit length")
     return se3.make(Rotation.from_quat(values[:, 3:7]).as_matrix(), values[:, :3])
 
 
 def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array:
     """(E, 6, 6) [rotation, translation] from the upper triangles in the file's order."""
-    order = _TANGENT[planar]
+    order = _TANGENT_ORDER[planar]
     size = len(order)
     rows, columns = np.triu_indices(size)
     information = np.zeros((len(upper), size, size))
@@ -217,36 +222,38 @@ def _covariances(path: Path, lines: _Lines, upper: Array, planar: bool) -> Array
     if len(bad := np.flatnonzero(weights[:, 0] <= 1e-12)):
         least = np.linalg.eigvalsh(information[bad[0]])[0]
         raise UsageError(
-            f"{path}:{lines.at[bad[0]]}: information matrix not positive definite, least value {least:.3g}"
+            f"{path}:{lines.line_numbers[bad[0]]}: information matrix not positive definite, least value {least:.3g}"
         )
-    inner = np.linalg.inv(information)
+    covariances = np.linalg.inv(information)
     out = np.zeros((len(upper), 6, 6))
-    out[:, order[:, None], order] = (inner + np.swapaxes(inner, -1, -2)) / 2
+    out[:, order[:, None], order] = (covariances + np.swapaxes(covariances, -1, -2)) / 2
     if planar:  # nothing ever moves in these three; variances like the others' keep the matrix well conditioned
         out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2]
         out[:, 5, 5] = (out[:, 3, 3] + out[:, 4, 4]) / 2
     return out
 
 
-def _starts(order: NDArray[np.intp], ends: NDArray[np.intp]) -> int:
+def _count_trajectories(order: NDArray[np.intp], ends: NDArray[np.intp]) -> int:
     """Number of trajectories if nodes are in this order."""
-    place = np.argsort(order)
-    pairs = np.sort(place[ends], axis=1)
+    position = np.argsort(order)
+    pairs = np.sort(position[ends], axis=1)
     return len(order) - len(np.unique(pairs[pairs[:, 1] - pairs[:, 0] == 1, 1]))
 
 
-def _graph(poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, fixed: NDArray[np.intp]) -> GraphData:
+def _to_graph_data(
+    poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, fixed: NDArray[np.intp]
+) -> GraphData:
     """Separate the odometry from the loops: the first edge between two neighboring nodes is odometry."""
     count = len(poses)
     backward = ends[:, 0] - ends[:, 1] == 1
-    flipped = se3.adjoint(T)  # the covariance of T_b_a is that of T_a_b, seen from the other end
+    adjoint = se3.adjoint(T)  # the covariance of T_b_a is that of T_a_b, seen from the other end
     T = np.where(backward[:, None, None], se3.inverse(T), T)
-    turned = flipped @ covariances @ np.swapaxes(flipped, -1, -2)
-    covariances = np.where(backward[:, None, None], turned, covariances)
+    flipped_covariances = adjoint @ covariances @ np.swapaxes(adjoint, -1, -2)
+    covariances = np.where(backward[:, None, None], flipped_covariances, covariances)
     ends = np.where(backward[:, None], ends[:, ::-1], ends)
-    near = np.flatnonzero(ends[:, 1] - ends[:, 0] == 1)
-    nodes, first = np.unique(ends[near, 1], return_index=True)
-    odometry = near[first]
+    neighboring = np.flatnonzero(ends[:, 1] - ends[:, 0] == 1)
+    nodes, first = np.unique(ends[neighboring, 1], return_index=True)
+    odometry = neighboring[first]
     chained, steps = np.zeros(count, np.bool_), np.tile(np.eye(4), (count, 1, 1))
     step_covariances = np.zeros((count, 6, 6))
     chained[nodes], steps[nodes], step_covariances[nodes] = True, T[odometry], covariances[odometry]
@@ -254,12 +261,12 @@ def _graph(poses: Array, ends: NDArray[np.intp], T: Array, covariances: Array, f
     return GraphData(poses, chained, steps, step_covariances, ends[loops], T[loops], covariances[loops], fixed)
 
 
-def _numbers(T: Array, planar: bool) -> Array:
+def _pose_numbers(T: Array, planar: bool) -> Array:
     """(N, 3) x y yaw or (N, 7) x y z qx qy qz qw with qw >= 0."""
     if planar:
         return np.column_stack([T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
     return np.column_stack([T[:, :3, 3], se3.quaternion(T)])
 
 
-def _text(numbers: Iterable[float] | Sequence[float]) -> str:
+def _format_numbers(numbers: Iterable[float] | Sequence[float]) -> str:
     return " ".join(f"{x:.17g}" for x in numbers)

@@ -96,9 +96,9 @@ class CondensedOdometry:
 
     Attributes:
         nodes: (K,) chosen nodes, ascending, with the first and the last of each trajectory.
-        T: (K, 4, 4) T_before_this between each and the previous chosen one; identity where `tied` is False.
-        covariances: (K, 6, 6) of `T`; identity where `tied` is False.
-        tied: (K,) whether odometry connects it with the previous chosen one.
+        T: (K, 4, 4) T_before_this between each and the previous chosen one; identity where `chained` is False.
+        covariances: (K, 6, 6) of `T`; identity where `chained` is False.
+        chained: (K,) whether odometry connects it with the previous chosen one.
     """
 
     def __init__(self, graph: GraphData, odometry: Array, chosen: Index) -> None:
@@ -106,17 +106,18 @@ class CondensedOdometry:
         starts = np.flatnonzero(~graph.chained)
         lasts = np.append(starts[1:], len(graph)) - 1
         self.nodes: Index = np.unique(np.concatenate([chosen, starts, lasts]))
-        self.tied = graph.chained[self.nodes]
-        before = np.where(self.tied, np.arange(len(self.nodes)) - 1, np.arange(len(self.nodes)))
+        self.chained = graph.chained[self.nodes]
+        before = np.where(self.chained, np.arange(len(self.nodes)) - 1, np.arange(len(self.nodes)))
         ends = odometry[self.nodes]
         self.T = se3.inverse(ends[before]) @ ends
         self._owner = np.searchsorted(self.nodes, np.arange(len(graph)))  # the chosen node at or after each node
         self._T_owner_node = se3.inverse(ends[self._owner]) @ odometry
         A = se3.adjoint(self._T_owner_node)
-        self._parts = A @ graph.step_covariances @ np.swapaxes(A, -1, -2)  # of each step, at the end of its stretch
+        # Covariance of each step, at the end of its stretch.
+        self._step_parts = A @ graph.step_covariances @ np.swapaxes(A, -1, -2)
         first = np.concatenate([[0], self.nodes[:-1] + 1])
-        self.covariances = np.add.reduceat(self._parts, first, axis=0)
-        self.covariances[~self.tied] = np.eye(6)
+        self.covariances = np.add.reduceat(self._step_parts, first, axis=0)
+        self.covariances[~self.chained] = np.eye(6)
         self._first = first
 
     def spread(self, poses: Array) -> Array:
@@ -125,16 +126,16 @@ class CondensedOdometry:
         The error of the odometry between two chosen nodes is distributed to its steps by their covariances, as least
         squares does, to first order.
         """
-        k = np.flatnonzero(self.tied)
+        k = np.flatnonzero(self.chained)
         errors = np.zeros((len(self.nodes), 6))
         errors[k] = se3.log(se3.inverse(self.T[k]) @ se3.inverse(poses[k - 1]) @ poses[k])
-        pull = np.linalg.solve(self.covariances, errors[..., None])
-        ratio = (self._parts @ pull[self._owner])[..., 0]
-        moved = np.cumsum(ratio, axis=0)
-        moved -= (moved - ratio)[self._first][self._owner]
+        weighted_errors = np.linalg.solve(self.covariances, errors[..., None])
+        corrections = (self._step_parts @ weighted_errors[self._owner])[..., 0]
+        accumulated = np.cumsum(corrections, axis=0)
+        accumulated -= (accumulated - corrections)[self._first][self._owner]
         ends = poses.copy()
         ends[k] = poses[k - 1] @ self.T[k]  # by the odometry alone
-        out = ends[self._owner] @ se3.exp(moved) @ self._T_owner_node
+        out = ends[self._owner] @ se3.exp(accumulated) @ self._T_owner_node
         out[self.nodes] = poses
         return out
 
@@ -144,14 +145,14 @@ def chain_chi2(graph: GraphData, odometry: Array) -> Array:
 
     nan if the ends are in two trajectories. `odometry`: (N, 4, 4) of `integrate`.
     """
-    number = trajectories(graph)[graph.ends]
+    trajectory = trajectories(graph)[graph.ends]
     out = np.full(len(graph.ends), np.nan)
-    same = np.flatnonzero(number[:, 0] == number[:, 1])
+    same = np.flatnonzero(trajectory[:, 0] == trajectory[:, 1])
     A = se3.adjoint(odometry)
     summed = np.cumsum(A @ graph.step_covariances @ np.swapaxes(A, -1, -2), axis=0)  # in the map frame: steps add up
     ends = graph.ends[same]
-    back = se3.adjoint(se3.inverse(odometry[ends[:, 1]]))
-    between = back @ (summed[ends.max(1)] - summed[ends.min(1)]) @ np.swapaxes(back, -1, -2)
+    A_end = se3.adjoint(se3.inverse(odometry[ends[:, 1]]))
+    odometry_covariances = A_end @ (summed[ends.max(1)] - summed[ends.min(1)]) @ np.swapaxes(A_end, -1, -2)
     errors = loop_errors(odometry, ends, graph.T_from_to[same])
-    out[same] = mahalanobis(errors, between + graph.covariances[same])
+    out[same] = mahalanobis(errors, odometry_covariances + graph.covariances[same])
     return out

@@ -26,10 +26,10 @@ from dpm2_core.slam.graph.worker import GraphWorker
 _log = logging.getLogger(__name__)
 SHORT = 50
 """Number of loops; a graph with fewer is solved in about 20 ms, faster than it is sent to another process."""
-_TOGETHER = 40  # pairs of nodes whose covariances are computed at once
-_FIXES = 10, 20
+_BATCH = 40  # pairs of nodes whose covariances are computed at once
+_FIXES_DUE = 10, 20
 """Fixes that may wait for an optimization: this number, or one in this number of all fixes."""
-_ATTEMPTS = 2  # worker processes that may fail on one graph
+_MAX_ATTEMPTS = 2  # worker processes that may fail on one graph
 
 
 class PoseGraph:
@@ -46,11 +46,11 @@ class PoseGraph:
         self._steps: list[Edge | None] = []  # the odometry to each node; None at the start of a trajectory
         self._trajectories = Trajectories()
         self._loops: list[Edge] = []
-        self._held: list[int] = []
+        self._fixed_nodes: list[int] = []
         self._worker = GraphWorker()
-        self._moved = False  # whether a part was moved since a graph was sent, so that its solution is invalid
+        self._part_moved = False  # whether a part was moved since a graph was sent, so that its solution is invalid
         self._fixes, self._sent_fixes = Fixes(), list[int]()
-        self._sent = 0  # loops in the graph that is being solved
+        self._sent_loops = 0  # loops in the graph that is being solved
         self._failures = 0
         self.problem = ""
 
@@ -84,7 +84,7 @@ class PoseGraph:
     @property
     def fixes(self) -> tuple[int, int]:
         """Number of fixes that constrain the poses, and of all."""
-        return self._fixes.used(self._chosen()), len(self._fixes)
+        return self._fixes.used(self._chosen_fixes()), len(self._fixes)
 
     @property
     def unsolved(self) -> bool:
@@ -106,11 +106,11 @@ class PoseGraph:
             Dpm2Error: the pose or the edge is invalid; nothing was appended.
         """
         node = len(self)
-        _check("node", node, T_map_kf)
+        _check_valid("node", node, T_map_kf)
         if odometry is None:
             self._trajectories.begin()
         else:
-            _check("edge to node", node, odometry.T_from_to, odometry.covariance)
+            _check_valid("edge to node", node, odometry.T_from_to, odometry.covariance)
             if odometry.to_node != node:
                 raise ValueError(f"the edge leads to node {odometry.to_node}, not to {node}")
             self._trajectories.extend(odometry.from_node)
@@ -126,12 +126,12 @@ class PoseGraph:
         Raises:
             Dpm2Error: the loop is invalid; nothing was added.
         """
-        _check("loop to node", loop.to_node, loop.T_from_to, loop.covariance)
+        _check_valid("loop to node", loop.to_node, loop.T_from_to, loop.covariance)
         a, b = self.part(loop.from_node), self.part(loop.to_node)
         if a != b:
             T_to = self._poses[loop.from_node] @ loop.T_from_to  # pose of that node by the loop
             T = T_to @ se3.inverse(self._poses[loop.to_node])
-            self._move(max(a, b), T if b > a else se3.inverse(T))
+            self._move_part(max(a, b), T if b > a else se3.inverse(T))
             self._trajectories.loops_changed()
         self._loops.append(loop)
 
@@ -141,30 +141,30 @@ class PoseGraph:
         if self._fixes.georeference is None:
             self._fixes.locate(self.poses, self.placed)
             return self._fixes.georeference is not None
-        least, share = _FIXES
-        return self._fixes.due >= max(least, len(self._fixes) // share)
+        min_count, divisor = _FIXES_DUE
+        return self._fixes.due >= max(min_count, len(self._fixes) // divisor)
 
     def set_georeference(self, georeference: Georeference) -> None:
         """Set the pose of a loaded map on Earth."""
         self._fixes.georeference = georeference
         self._find_lag()
         self._fixes.loaded()
-        chosen, first = self._chosen(), len(self._loops)
+        chosen, first = self._chosen_fixes(), len(self._loops)
         if chosen:
-            data = self._data()
+            data = self._graph_data()
             errors = loop_errors(data.poses, data.ends[first:], data.T_from_to[first:])
             kept = mahalanobis(errors, data.covariances[first:]) <= self._settings.loop_sigmas**2
             self._fixes.solved(chosen, data.poses[-1], kept)
 
     def place(self, node: int, T_map_kf: Array) -> None:
         """Set the pose (4, 4) of a node, as the start of the next optimization."""
-        _check("node", node, T_map_kf)
+        _check_valid("node", node, T_map_kf)
         self._poses[node] = T_map_kf
 
     def hold(self, node: int, T_map_kf: Array) -> None:
         """Set the pose (4, 4) of a node and keep it fixed."""
         self.place(node, T_map_kf)
-        self._held.append(node)
+        self._fixed_nodes.append(node)
 
     def part(self, node: int) -> int:
         """Number of a node's part of the graph: nodes of different parts have no constraints between them."""
@@ -192,7 +192,7 @@ class PoseGraph:
             if not self.busy:
                 self._submit()
             return
-        self._apply(robust.optimize(self._sending(), self._settings))
+        self._apply(robust.optimize(self._prepare_graph(), self._settings))
         self.problem = ""
 
     def collect(self, wait: bool = False) -> bool:
@@ -213,18 +213,18 @@ class PoseGraph:
             except Dpm2Error as error:
                 self.problem = str(error)
                 self._failures += 1
-                _log.warning("%s%s", error, ": started again" if self._failures < _ATTEMPTS else "")
-                if self._failures < _ATTEMPTS:
+                _log.warning("%s%s", error, ": started again" if self._failures < _MAX_ATTEMPTS else "")
+                if self._failures < _MAX_ATTEMPTS:
                     self._submit()
                 continue
             if solution is None:
                 break
-            if self._moved:
+            if self._part_moved:
                 self._submit()
                 continue
             self._apply(solution)
             self.problem, self._failures, changed = "", 0, True
-            if len(self._loops) > self._sent or (wait and self.unsolved):
+            if len(self._loops) > self._sent_loops or (wait and self.unsolved):
                 self._submit()
         return changed
 
@@ -234,11 +234,11 @@ class PoseGraph:
 
     def georeference_covariance(self) -> Array | None:
         """(6, 6) of xi in T_map_enu @ Exp(xi), about and along east, north, up; None if there are too few fixes."""
-        if not self._chosen():
+        if not self._chosen_fixes():
             return None
-        data = self._data()
+        data = self._graph_data()
         try:
-            return robust.joint_covariance(data, self._kept(), np.array([len(self)])) + self._fixes.uncertain
+            return robust.joint_covariance(data, self._kept_edges(), np.array([len(self)])) + self._fixes.uncertain
         except RuntimeError:  # gtsam's: the system is singular, as with one fix, which does not give the heading
             return None
 
@@ -252,12 +252,12 @@ class PoseGraph:
         """
         if same := [a for a, b in pairs if a == b]:
             raise ValueError(f"covariance of node {same[0]} relative to itself")
-        out, data, places = np.zeros((len(pairs), 6, 6)), self._data(), self._trajectories.places()
-        for first in range(0, len(pairs), _TOGETHER):
-            part = pairs[first : first + _TOGETHER]
-            nodes = sorted({node for pair in part for node in pair})
-            joint = robust.joint_covariance(data, self._kept(), places[nodes])
-            for number, (a, b) in enumerate(part, first):
+        out, data, places = np.zeros((len(pairs), 6, 6)), self._graph_data(), self._trajectories.places()
+        for first in range(0, len(pairs), _BATCH):
+            batch = pairs[first : first + _BATCH]
+            nodes = sorted({node for pair in batch for node in pair})
+            joint = robust.joint_covariance(data, self._kept_edges(), places[nodes])
+            for number, (a, b) in enumerate(batch, first):
                 rows = [6 * nodes.index(node) + k for node in (a, b) for k in range(6)]
                 J = np.hstack([-se3.adjoint(se3.inverse(self._poses[b]) @ self._poses[a]), np.eye(6)])
                 out[number] = J @ joint[np.ix_(rows, rows)] @ J.T
@@ -268,19 +268,19 @@ class PoseGraph:
 
         With fixes the local frame east, north, up is the last vertex.
         """
-        data = self._data()
+        data = self._graph_data()
         ids = np.append(self._trajectories.order(), np.arange(len(self), len(data)))
-        write_g2o(path, G2o(data, ids, planar=False), self._kept())
+        write_g2o(path, G2o(data, ids, planar=False), self._kept_edges())
 
-    def _kept(self) -> NDArray[np.bool_]:
+    def _kept_edges(self) -> NDArray[np.bool_]:
         """(E,) which loops, then which fixes, constrain the poses."""
-        return np.array([*(loop.ok for loop in self._loops), *self._fixes.kept(self._chosen())], np.bool_)
+        return np.array([*(loop.ok for loop in self._loops), *self._fixes.kept(self._chosen_fixes())], np.bool_)
 
-    def _chosen(self) -> list[int]:
+    def _chosen_fixes(self) -> list[int]:
         """Indices of the fixes that are used."""
         return self._fixes.chosen(self.placed) if len(self._fixes) else []
 
-    def _data(self) -> GraphData:
+    def _graph_data(self) -> GraphData:
         order, places, steps = self._trajectories.order(), self._trajectories.places(), self._steps
         ends = np.array([(loop.from_node, loop.to_node) for loop in self._loops], np.intp).reshape(-1, 2)
         data = GraphData(
@@ -293,17 +293,17 @@ class PoseGraph:
             places[ends],
             np.array([loop.T_from_to for loop in self._loops]).reshape(-1, 4, 4),
             np.array([loop.covariance for loop in self._loops]).reshape(-1, 6, 6),
-            places[self._held],
+            places[self._fixed_nodes],
         )
-        return self._fixes.joined(data, places, self._chosen())
+        return self._fixes.joined(data, places, self._chosen_fixes())
 
-    def _sending(self) -> GraphData:
+    def _prepare_graph(self) -> GraphData:
         """The graph for the next optimization."""
         self._find_lag()
         self._fixes.locate(self.poses, self.placed)
-        self._sent, self._sent_fixes = len(self._loops), self._chosen()
+        self._sent_loops, self._sent_fixes = len(self._loops), self._chosen_fixes()
         self._fixes.sent()
-        return self._data()
+        return self._graph_data()
 
     def _find_lag(self) -> None:
         """Estimate the lag of the fixes, once the georeference is known."""
@@ -315,19 +315,19 @@ class PoseGraph:
                 odometry[node] = odometry[step.from_node] @ step.T_from_to
         self._fixes.find_lag(odometry, self.placed)
 
-    def _move(self, part: int, T: Array) -> None:
+    def _move_part(self, part: int, T: Array) -> None:
         """Move a part: all its poses become T @ T_map_kf."""
         T = se3.orthonormalized(T)  # from poses of this graph: else rounding errors double with each part that is moved
         for node in np.flatnonzero(self.parts == part):
             self._poses[node] = T @ self._poses[node]
-        self._moved = True
+        self._part_moved = True
 
     def _submit(self) -> None:
-        self._moved = False
-        self._worker.submit(self._sending(), self._settings)
+        self._part_moved = False
+        self._worker.submit(self._prepare_graph(), self._settings)
 
     def _apply(self, solution: Solution) -> None:
-        loops, fixes = self._sent, self._sent_fixes
+        loops, fixes = self._sent_loops, self._sent_fixes
         count = len(solution.poses) - bool(fixes)
         self._poses[:count] = list(solution.poses[self._trajectories.places(count)])
         if fixes:
@@ -341,7 +341,7 @@ class PoseGraph:
         self._trajectories.loops_changed()
 
 
-def _check(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
+def _check_valid(what: str, node: int, T: Array, covariance: Array | None = None) -> None:
     """Reject invalid values: one NaN would reach every pose in the next optimization."""
     if not se3.is_rigid(T):
         raise Dpm2Error(f"pose graph: {what} {node}: not a finite rigid transform")

@@ -37,13 +37,13 @@ from dpm2_core.slam.graph.graph_data import (
 )
 
 _FIX_KERNEL = 1.0  # as `loop_kernel`: many consecutive fixes may have the same error; none may outvote the odometry
-_SHARED = 0.6
+_MIN_LOOP_DENSITY = 0.6
 """Loops per end node, above which a linear start is tried: at 0.5 no two loops share a node, and wrong ones may
 dominate where all are solved at once."""
-_WORTH = 5.0  # maximum ratio of its error to that of the given poses, which the kernel limits; 13 with wrong loops
-_ROUNDS = 8  # maximum number of rounds of solving and checking
-_STEPS = 50  # maximum number of Levenberg-Marquardt steps per round
-_FIXED = 1e-6  # rad and m, standard deviation of a fixed pose
+_MAX_ERROR_RATIO = 5.0  # of its error to that of the given poses, which the kernel limits; 13 with wrong loops
+_MAX_ROUNDS = 8  # of solving and checking
+_MAX_STEPS = 50  # Levenberg-Marquardt steps per round
+_FIXED_SIGMA = 1e-6  # rad and m, standard deviation of a fixed pose
 
 
 class RobustSettings(Settings):
@@ -97,7 +97,7 @@ def _solvable() -> Iterator[None]:
 
 @_solvable()
 def optimize(
-    graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_] | None = None, steps: int = _STEPS
+    graph: GraphData, settings: RobustSettings, used: NDArray[np.bool_] | None = None, steps: int = _MAX_STEPS
 ) -> Solution:
     """Optimize and check the loops; deterministic.
 
@@ -110,28 +110,28 @@ def optimize(
         Dpm2Error: the system is singular.
     """
     odometry = integrate(graph)
-    apart = np.sqrt(chain_chi2(graph, odometry))
-    afar = used is None and len(graph.ends) > _SHARED * len(np.unique(graph.ends))
+    chain_sigmas = np.sqrt(chain_chi2(graph, odometry))
+    linear_first = used is None and len(graph.ends) > _MIN_LOOP_DENSITY * len(np.unique(graph.ends))
     if used is None:
-        used = ~(apart > settings.odometry_sigmas)
-    start = _aligned(graph, graph.poses, used, settings.loop_kernel)
+        used = ~(chain_sigmas > settings.odometry_sigmas)
+    aligned = _align_trajectories(graph, graph.poses, used, settings.loop_kernel)
     condensed = CondensedOdometry(graph, odometry, np.concatenate([graph.ends.ravel(), graph.fixed]))
     ends = np.searchsorted(condensed.nodes, graph.ends)
-    poses = start[condensed.nodes]
+    poses = aligned[condensed.nodes]
     settled, count = False, 0
-    while not settled and count < _ROUNDS:
+    while not settled and count < _MAX_ROUNDS:
         count += 1
         factors = _factors(graph, condensed, ends, poses, used, settings.loop_kernel)
         starts = [poses]
-        if afar and count == 1:
-            starts += _linear(factors, poses, next(_anchors(graph, condensed, ends[used])))
-        poses = _solved(factors, starts, steps)
+        if linear_first and count == 1:
+            starts += _linear_start(factors, poses, next(_anchors(graph, condensed, ends[used])))
+        poses = _solve(factors, starts, steps)
         sigmas = np.sqrt(mahalanobis(loop_errors(poses, ends, graph.T_from_to), graph.covariances))
         kept = sigmas <= settings.loop_sigmas
         settled = bool((kept == used).all())
-        if not settled and count < _ROUNDS:
+        if not settled and count < _MAX_ROUNDS:
             used = kept
-    return Solution(condensed.spread(poses), used, sigmas, apart, count, settled)
+    return Solution(condensed.spread(poses), used, sigmas, chain_sigmas, count, settled)
 
 
 @_solvable()
@@ -142,7 +142,7 @@ def least_squares(graph: GraphData, kept: NDArray[np.bool_]) -> Array:
         Dpm2Error: the system is singular.
     """
     condensed = CondensedOdometry(graph, integrate(graph), np.arange(len(graph)))
-    return _solved(_factors(graph, condensed, graph.ends, graph.poses, kept, None), [graph.poses], _STEPS)
+    return _solve(_factors(graph, condensed, graph.ends, graph.poses, kept, None), [graph.poses], _MAX_STEPS)
 
 
 def joint_covariance(graph: GraphData, kept: NDArray[np.bool_], nodes: Index) -> Array:
@@ -151,8 +151,8 @@ def joint_covariance(graph: GraphData, kept: NDArray[np.bool_], nodes: Index) ->
     ends = graph.ends[kept].ravel()
     condensed = CondensedOdometry(graph, integrate(graph), np.concatenate([ends, graph.fixed, nodes]))
     ends = np.searchsorted(condensed.nodes, graph.ends)  # wrong for loops that are not kept; these are not read
-    at = graph.poses[condensed.nodes]
-    marginals = gtsam.Marginals(_factors(graph, condensed, ends, at, kept, None), _values(at))
+    poses = graph.poses[condensed.nodes]
+    marginals = gtsam.Marginals(_factors(graph, condensed, ends, poses, kept, None), _values(poses))
     keys = np.searchsorted(condensed.nodes, nodes)
     if len(keys) == 1:
         return np.asarray(marginals.marginalCovariance(int(keys[0])))
@@ -172,7 +172,7 @@ def _factors(
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
     by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.enu)).any(axis=1))
-    for k in np.flatnonzero(condensed.tied):
+    for k in np.flatnonzero(condensed.chained):
         noise = gaussian(condensed.covariances[k])
         factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
     for loop in np.flatnonzero(used):
@@ -182,16 +182,16 @@ def _factors(
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(width), noise)
         a, b = ends[loop].tolist()
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
-    still = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
+    fixed_noise = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
     for anchor in _anchors(graph, condensed, ends[used]):
-        factors.add(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(poses[anchor]), still))
+        factors.add(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(poses[anchor]), fixed_noise))
     return factors
 
 
 def _anchors(graph: GraphData, condensed: CondensedOdometry, ends: Index) -> Iterator[int]:
     """The fixed nodes, and one node in each part of the graph without any."""
-    tied = np.flatnonzero(condensed.tied)
-    part = components(len(condensed.nodes), np.concatenate([np.stack([tied - 1, tied], -1), ends]))
+    chained = np.flatnonzero(condensed.chained)
+    part = components(len(condensed.nodes), np.concatenate([np.stack([chained - 1, chained], -1), ends]))
     fixed = np.searchsorted(condensed.nodes, graph.fixed)
     yield from np.unique(fixed).tolist()
     first = np.unique(part, return_index=True)[1]
@@ -205,61 +205,69 @@ def _values(poses: Array) -> Any:
     return values
 
 
-def _linear(factors: Any, poses: Array, anchor: int) -> list[Array]:
+def _linear_start(factors: Any, poses: Array, anchor: int) -> list[Array]:
     """The poses (N, 4, 4) from a linear problem for all rotations at once; none if their error is far larger.
 
     From far away a solver may converge to a local optimum that contains whole rotations and contradicts right loops. L.
     Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015 (chordal relaxation).
     """
     try:
-        linear = _poses(gtsam.InitializePose3.initialize(factors), len(poses))
+        linear = _to_array(gtsam.InitializePose3.initialize(factors), len(poses))
     except RuntimeError:  # a singular system
         return []
     linear = se3.orthonormalized(poses[anchor] @ se3.inverse(linear[anchor]) @ linear)
-    return [linear] if factors.error(_values(linear)) < _WORTH * factors.error(_values(poses)) else []
+    return [linear] if factors.error(_values(linear)) < _MAX_ERROR_RATIO * factors.error(_values(poses)) else []
 
 
-def _solved(factors: Any, starts: Sequence[Array], steps: int) -> Array:
+def _solve(factors: Any, starts: Sequence[Array], steps: int) -> Array:
     """The best solution of those from the starts (N, 4, 4)."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(steps)
     solvers = [gtsam.LevenbergMarquardtOptimizer(factors, _values(start), parameters) for start in starts]
     solved = [solver.optimize() for solver in solvers]
-    return _poses(min(solved, key=factors.error), len(starts[0]))
+    return _to_array(min(solved, key=factors.error), len(starts[0]))
 
 
-def _poses(values: Any, count: int) -> Array:
+def _to_array(values: Any, count: int) -> Array:
     return np.array([values.atPose3(node).matrix() for node in range(count)])
 
 
-def _aligned(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:
+def _align_trajectories(graph: GraphData, poses: Array, used: NDArray[np.bool_], kernel: float) -> Array:
     """The poses, with each trajectory moved rigidly to where most of its loops to those placed before agree.
 
     Otherwise a trajectory whose own frame is far away or rotated would need many small steps. Trajectories are placed
     from fixed nodes on, each time the one with most loops to those that are placed.
     """
-    number = trajectories(graph)
-    if number[-1] == 0:
+    trajectory = trajectories(graph)
+    if trajectory[-1] == 0:
         return poses
-    poses, ends_number = poses.copy(), number[graph.ends]
-    used = used & ~np.isin(ends_number, number[graph.enu]).any(1) & (ends_number[:, 0] != ends_number[:, 1])
-    known = np.isin(np.arange(number[-1] + 1), number[graph.fixed])
-    while not known.all():
-        new = used & (known[ends_number].sum(1) == 1)
+    poses, loop_trajectories = poses.copy(), trajectory[graph.ends]
+    used = (
+        used
+        & ~np.isin(loop_trajectories, trajectory[graph.enu]).any(1)
+        & (loop_trajectories[:, 0] != loop_trajectories[:, 1])
+    )
+    placed = np.isin(np.arange(trajectory[-1] + 1), trajectory[graph.fixed])
+    while not placed.all():
+        new = used & (placed[loop_trajectories].sum(1) == 1)
         if not new.any():  # another part of the graph begins
-            known[np.argmin(known)] = True
+            placed[np.argmin(placed)] = True
             continue
-        ends = ends_number[new]
-        this = int(np.bincount(ends[~known[ends]]).argmax())
-        ties = np.flatnonzero(new & (ends_number == this).any(1))
-        poses[number == this] = _move(graph, poses, ties, ends_number[ties, 0] == this, kernel) @ poses[number == this]
-        known[this] = True
+        ends = loop_trajectories[new]
+        moving = int(np.bincount(ends[~placed[ends]]).argmax())
+        loops = np.flatnonzero(new & (loop_trajectories == moving).any(1))
+        poses[trajectory == moving] = (
+            _best_move(graph, poses, loops, loop_trajectories[loops, 0] == moving, kernel) @ poses[trajectory == moving]
+        )
+        placed[moving] = True
     return poses
 
 
-def _move(graph: GraphData, poses: Array, ties: NDArray[np.intp], swap: NDArray[np.bool_], kernel: float) -> Array:
-    """(4, 4) that moves a trajectory to where most of its `ties` agree; `swap`: ties that start in it."""
-    ends, T = graph.ends[ties], graph.T_from_to[ties]
+def _best_move(
+    graph: GraphData, poses: Array, loops: NDArray[np.intp], swap: NDArray[np.bool_], kernel: float
+) -> Array:
+    """(4, 4) that moves a trajectory to where most of its loops (indices) agree; `swap`: loops that start in it."""
+    ends, T = graph.ends[loops], graph.T_from_to[loops]
     before, after = np.where(swap, ends[:, 1], ends[:, 0]), np.where(swap, ends[:, 0], ends[:, 1])
     T_before_after = np.where(swap[:, None, None], se3.inverse(T), T)
     moves = se3.orthonormalized(poses[before] @ T_before_after @ se3.inverse(poses[after]))  # else rounding doubles
@@ -267,6 +275,6 @@ def _move(graph: GraphData, poses: Array, ties: NDArray[np.intp], swap: NDArray[
     costs = []
     for move in trials:
         moved = se3.inverse(T_before_after) @ se3.inverse(poses[before]) @ move @ poses[after]
-        chi2 = mahalanobis(se3.log(moved), graph.covariances[ties])
+        chi2 = mahalanobis(se3.log(moved), graph.covariances[loops])
         costs.append(np.log1p(chi2 / kernel**2).sum())
     return np.asarray(trials[int(np.argmin(costs))])

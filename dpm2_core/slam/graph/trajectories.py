@@ -49,13 +49,13 @@ class Trajectories:
     def part(self, node: int, loops: Sequence[Edge]) -> int:
         """A node's part of the graph by the accepted loops, numbered from 0 with the oldest: nodes of two parts have no
         constraints between them."""
-        return int(self._tied(loops)[self.of[node]])
+        return int(self._trajectory_parts(loops)[self.of[node]])
 
     def parts(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
         """(N,) the part of each node."""
-        return self._tied(loops)[self.of]
+        return self._trajectory_parts(loops)[self.of]
 
-    def _tied(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
+    def _trajectory_parts(self, loops: Sequence[Edge]) -> NDArray[np.int32]:
         """The part of each trajectory."""
         if self._parts is None:
             ends = [(self.of[loop.from_node], self.of[loop.to_node]) for loop in loops if loop.ok]

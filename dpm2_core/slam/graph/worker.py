@@ -21,7 +21,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.slam.graph.graph_data import GraphData
 from dpm2_core.slam.graph.robust import RobustSettings, Solution, optimize
 
-_NICE = 10  # lower priority than the odometry, for machines with few processors
+_NICENESS = 10  # lower priority than the odometry, for machines with few processors
 
 
 class GraphWorker:
@@ -125,7 +125,7 @@ def _serve(requests: IO[bytes], results: IO[bytes]) -> None:
 
 
 if __name__ == "__main__":
-    os.nice(_NICE)
+    os.nice(_NICENESS)
     solutions = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of libraries must not get between the solutions
     try:
