@@ -31,9 +31,9 @@ from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, looks_elsewh
 if TYPE_CHECKING:  # torch takes seconds to import
     from dpm2_core.network.model import DeepPointMap2
 
-_SEEN = 40.0  # m, maximum distance of two keyframes that see the same; rooms are enlarged
+_MAX_VIEW_DISTANCE = 40.0  # m, maximum distance of two keyframes that see the same; rooms are enlarged
 _DRIFT = 0.01  # m per m of path, drift of the odometry: added to the radius of the search by pose
-_MERGED = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
+_MERGE_DISTANCE = 6.0  # m, path around a keyframe whose descriptors are merged with its own; rooms are enlarged
 
 
 class LoopSettings(Settings):
@@ -65,10 +65,10 @@ class LoopSettings(Settings):
 class LoopCloser:
     """Finds and verifies the loops of each new keyframe. A node is the index of a keyframe in the map."""
 
-    def __init__(self, ways: ByScale[tuple[LoopSettings, Verifier]], network: DeepPointMap2 | None = None) -> None:
-        """`ways`: settings and verifier, by the type of scene that a keyframe shows."""
-        self._ways = ways
-        self._settings, self._verifier = ways.outdoor
+    def __init__(self, by_scene: ByScale[tuple[LoopSettings, Verifier]], network: DeepPointMap2 | None = None) -> None:
+        """`by_scene`: settings and verifier, by the type of scene that a keyframe shows."""
+        self._by_scene = by_scene
+        self._settings, self._verifier = by_scene.outdoor
         self._places = PlaceRecognition(network) if network is not None else None
         self._path = OdometryChain()
         self._consistency = Consistency(self._path)
@@ -79,7 +79,7 @@ class LoopCloser:
         return None if self._places is None else self._places.channels
 
     @property
-    def _by_head(self) -> bool:
+    def _decided_by_overlap(self) -> bool:
         """Whether the overlap head alone decides, as in the paper: then it is computed for every candidate."""
         return self._settings.decided_by == "overlap"
 
@@ -119,49 +119,49 @@ class LoopCloser:
         own = np.ones(len(keyframes), np.bool_) if own is None else own
         if not self._settings.enabled or node < 1 or not own[node]:
             return []
-        self._settings, self._verifier = self._ways.suited_to(clouds[node])
+        self._settings, self._verifier = self._by_scene.suited_to(clouds[node])
         self._consistency.update(poses, parts)
         since = self._path.since(node)
-        tried, proposals = self._proposals(since, keyframes, poses, own)
-        if self._by_head:
-            return tried + proposals[:1]
-        most, failed = self._settings.verified, list[Edge]()
-        for number, proposal in enumerate(proposals[:most]):
-            loop = self._verified(proposal, keyframes, clouds, poses)
+        rejections, proposals = self._propose(since, keyframes, poses, own)
+        if self._decided_by_overlap:
+            return rejections + proposals[:1]
+        max_verified, failed = self._settings.verified, list[Edge]()
+        for number, proposal in enumerate(proposals[:max_verified]):
+            loop = self._verify(proposal, keyframes, clouds, poses)
             if not loop.ok:
                 failed.append(loop)
                 continue
             if self._consistency.is_first(loop, self._settings.consistency):
                 others = [f for f in failed if _is_elsewhere(f, loop, poses)]
                 unseen = [p for p in proposals[number + 1 :] if _is_elsewhere(p, loop, poses)]
-                others += [self._verified(p, keyframes, clouds, poses) for p in unseen]
+                others += [self._verify(p, keyframes, clouds, poses) for p in unseen]
                 if objection := objection_of_others(loop.registration, [o.registration for o in others]):
-                    return [*tried, *failed, loop.rejected(objection)]
-            return tried + failed + self._consistency.check(loop, self._settings.consistency)
-        return tried + failed + [proposal.rejected("others are more likely") for proposal in proposals[most:]]
+                    return [*rejections, *failed, loop.rejected(objection)]
+            return rejections + failed + self._consistency.check(loop, self._settings.consistency)
+        return rejections + failed + [p.rejected("others are more likely") for p in proposals[max_verified:]]
 
-    def _proposals(
+    def _propose(
         self, since: Array, keyframes: Sequence[Keyframe], poses: Array, own: NDArray[np.bool_]
     ) -> tuple[list[Edge], list[Edge]]:
         """Candidates that the network rejected, and those to verify by their points, the most likely first."""
         node, s = len(keyframes) - 1, self._settings
         descriptors = keyframes[node].descriptors
         distance = np.linalg.norm(poses[:, :3, 3] - poses[node, :3, 3], axis=1)
-        nearest = None if self._by_head else self._nearest(since, distance)
+        nearest = None if self._decided_by_overlap else self._nearest_by_pose(since, distance)
         rejections: list[Edge] = []
         proposals: list[Edge] = []
         if self._places is not None and descriptors is not None:
             allowed = own & (since > s.gap)
-            if not self._by_head:  # leave out what the odometry check would reject in any case
-                allowed &= distance <= _SEEN / descriptors.scale + margin(since, s.consistency)
+            if not self._decided_by_overlap:  # leave out what the odometry check would reject in any case
+                allowed &= distance <= _MAX_VIEW_DISTANCE / descriptors.scale + margin(since, s.consistency)
             similar = self._places.similar(descriptors, allowed, s.candidates)
-            found = self._registered(node, similar, keyframes)
-            rank = "overlap" if self._by_head else "confidence"
+            found = self._register(node, similar, keyframes)
+            rank = "overlap" if self._decided_by_overlap else "confidence"
             for loop in sorted(found, key=lambda loop: -getattr(loop.registration, rank)):
                 r = loop.registration
                 if not r.ok:
                     rejections.append(loop)
-                elif self._by_head and np.isnan(r.overlap):
+                elif self._decided_by_overlap and np.isnan(r.overlap):
                     rejections.append(loop.rejected("the overlap head of these weights is not trained"))
                 elif r.overlap < s.min_overlap:  # NaN of an untrained head rejects nothing
                     rejections.append(loop.rejected(f"the places overlap with a probability of only {r.overlap:.2f}"))
@@ -173,25 +173,25 @@ class LoopCloser:
             proposals.insert(min(len(proposals), 1), Edge("loop", nearest, node, by_pose))
         return rejections, proposals
 
-    def _registered(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Edge]:
+    def _register(self, node: int, candidates: Sequence[int], keyframes: Sequence[Keyframe]) -> list[Edge]:
         """The network's registration of each candidate."""
         assert self._places is not None
         source = keyframes[node].descriptors
         targets = [keyframes[c].descriptors for c in candidates]
         assert source is not None
         known = [t for t in targets if t is not None]
-        results = self._places.register(source, known, 0.0 if self._by_head else AGREEING)
+        results = self._places.register(source, known, 0.0 if self._decided_by_overlap else AGREEING)
         return [Edge("loop", c, node, result) for c, result in zip(candidates, results, strict=True)]
 
-    def _nearest(self, since: Array, distance: Array) -> int | None:
+    def _nearest_by_pose(self, since: Array, distance: Array) -> int | None:
         """The keyframe nearest by its pose, if it is near enough for the drift since then."""
         s = self._settings
         near = np.flatnonzero((since > s.gap) & np.isfinite(since) & (distance < s.radius + _DRIFT * since))
         return int(near[np.argmin(distance[near])]) if len(near) else None
 
-    def _verified(self, proposal: Edge, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Edge:
+    def _verify(self, proposal: Edge, keyframes: Sequence[Keyframe], clouds: Sequence[Points], poses: Array) -> Edge:
         """Verify by the points; if that fails, again from the pose by the merged descriptors around both ends."""
-        nodes = self._around(proposal.from_node, proposal.to_node, self._settings.surroundings)
+        nodes = self._nodes_around(proposal.from_node, proposal.to_node, self._settings.surroundings)
         T_candidate_kf = se3.inverse(poses[proposal.from_node]) @ poses[nodes]
         around = self._verifier.surroundings([clouds[n] for n in nodes], T_candidate_kf)
         proposed = proposal.registration
@@ -199,25 +199,25 @@ class LoopCloser:
         cloud = clouds[proposal.to_node]
         result = self._verifier.verify(cloud, around, proposed.T_target_source, 2.0 if by_pose else 1.0)
         if not result.ok and not by_pose:
-            again = self._map_to_map(proposal, keyframes, poses)
+            again = self._register_map_to_map(proposal, keyframes, poses)
             if again.ok:
                 second = self._verifier.verify(cloud, around, again.T_target_source)
                 result = second if second.ok else result
         return replace(proposal, registration=result)
 
-    def _map_to_map(self, proposal: Edge, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
+    def _register_map_to_map(self, proposal: Edge, keyframes: Sequence[Keyframe], poses: Array) -> Registration:
         """T_from_to by the descriptors of the keyframes around both ends."""
         assert self._places is not None
         a, b = proposal.from_node, proposal.to_node
         own = keyframes[b].descriptors
         assert own is not None
-        reach = _MERGED / own.scale
+        reach = _MERGE_DISTANCE / own.scale
         before = np.flatnonzero(self._path.since(b) <= reach)
         source = merged(keyframes, poses, before.tolist(), b)
-        target = merged(keyframes, poses, self._around(a, b, reach), a)
+        target = merged(keyframes, poses, self._nodes_around(a, b, reach), a)
         return self._places.register(source, [target])[0]
 
-    def _around(self, candidate: int, node: int, reach: float) -> list[int]:
+    def _nodes_around(self, candidate: int, node: int, reach: float) -> list[int]:
         """The candidate and the nodes within `reach` m of it along the path, without those just before the new one."""
         near = (self._path.since(candidate) <= reach) & (self._path.since(node) > self._settings.gap / 2)
         return np.flatnonzero(near).tolist()
@@ -228,5 +228,5 @@ def _is_elsewhere(one: Edge, other: Edge, poses: Array) -> bool:
 
     A place that is not connected to the map yet counts as different: if it fits as well, both are doubtful.
     """
-    here, there = (poses[loop.from_node] @ loop.T_from_to for loop in (one, other))
-    return bool(np.linalg.norm(here[:3, 3] - there[:3, 3]) > SAME_PLACE) or looks_elsewhere(here, there)
+    T_one, T_other = (poses[loop.from_node] @ loop.T_from_to for loop in (one, other))
+    return bool(np.linalg.norm(T_one[:3, 3] - T_other[:3, 3]) > SAME_PLACE) or looks_elsewhere(T_one, T_other)

@@ -20,15 +20,15 @@ from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
 UNCERTAIN = 0.5  # m, sigma of an odometry edge beyond drift: a direction was unconstrained, or nothing fitted
-_STOREY = 2.0
+_STOREY_CORRECTION = 2.0
 """A loop that corrects the odometry by more than this, m, may lead to another storey that looks alike..."""
-_MOST_SIGMAS = 3.0
+_MAX_SIGMAS = 3.0
 """...unless the correction is at most this many standard deviations of the odometry. Loops to the next storey of a car
 park have 3.7 to 5.1. The odometry's covariance is cautious: correct loops of drives have 0.2, real ones perhaps 1."""
 _SLACK, _DRIFT = 1.0, 0.02  # m, and per meter of path: error of the odometry without such an edge
-_TURN = 3.0, 0.02  # degrees, and per meter of path: allowed correction of the odometry by a loop
-_CIRCLE = 0.01  # m, per meter of path: added to the allowed error of the circle of two loops
-_COMPARED = 200  # loops, the newest: one that is farther along the path than `reach` agrees with none; 5 ms
+_MAX_ROTATION = 3.0, 0.02  # degrees, and per meter of path: allowed correction of the odometry by a loop
+_CIRCLE_DRIFT = 0.01  # m, per meter of path: added to the allowed error of the circle of two loops
+_MAX_COMPARED = 200  # loops, the newest: one that is farther along the path than `reach` agrees with none; 5 ms
 
 
 class ConsistencySettings(Settings):
@@ -57,7 +57,7 @@ class OdometryChain:
     def __init__(self) -> None:
         self._segment = np.zeros(256, np.int64)
         self._meters = np.zeros(256)  # path since the start of the segment
-        self._doubt = np.zeros(256)  # since then: three deviations of all uncertain edges, m or degrees, the larger
+        self._uncertainty = np.zeros(256)  # since then: three sigmas of all uncertain edges, m or degrees, the larger
         self._covariances: list[Array] = []  # (6, 6) of the motion since then, in the odometry frame
         self._T_odom_kf: list[Array] = []
         self._last: dict[str, int] = {}  # by robot
@@ -67,21 +67,21 @@ class OdometryChain:
 
     def append(self, keyframe: Keyframe) -> None:
         """Add the next node."""
-        node, before = len(self), self._last.get(keyframe.robot)
+        node, previous = len(self), self._last.get(keyframe.robot)
         if node == len(self._segment):
-            of_nodes = self._segment, self._meters, self._doubt
-            self._segment, self._meters, self._doubt = (np.concatenate([a, np.zeros_like(a)]) for a in of_nodes)
+            arrays = self._segment, self._meters, self._uncertainty
+            self._segment, self._meters, self._uncertainty = (np.concatenate([a, np.zeros_like(a)]) for a in arrays)
         self._last[keyframe.robot] = node
         self._T_odom_kf.append(keyframe.T_odom_kf)
-        if before is None or keyframe.edge is None:
+        if previous is None or keyframe.edge is None:
             self._segment[node] = node
             self._covariances.append(np.zeros((6, 6)))
             return
-        step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[before][:3, 3])
-        self._segment[node], self._meters[node] = self._segment[before], self._meters[before] + step
-        self._doubt[node] = self._doubt[before] + _doubt(keyframe.edge)
+        step = np.linalg.norm(keyframe.T_odom_kf[:3, 3] - self._T_odom_kf[previous][:3, 3])
+        self._segment[node], self._meters[node] = self._segment[previous], self._meters[previous] + step
+        self._uncertainty[node] = self._uncertainty[previous] + _uncertainty(keyframe.edge)
         A = se3.adjoint(keyframe.T_odom_kf)
-        self._covariances.append(self._covariances[before] + A @ keyframe.edge.covariance @ A.T)
+        self._covariances.append(self._covariances[previous] + A @ keyframe.edge.covariance @ A.T)
 
     def since(self, node: int) -> Array:
         """(N,) meters of path between each node and this one; inf if the odometry between them is unknown."""
@@ -92,8 +92,8 @@ class OdometryChain:
         return float(self._known_meters(a, b))
 
     def _known_meters(self, nodes: int | slice, node: int) -> Array:
-        meters, doubt = (np.abs(sums[nodes] - sums[node]) for sums in (self._meters, self._doubt))
-        known = (self._segment[nodes] == self._segment[node]) & (doubt <= _SLACK + _DRIFT * meters)
+        meters, uncertainty = (np.abs(sums[nodes] - sums[node]) for sums in (self._meters, self._uncertainty))
+        known = (self._segment[nodes] == self._segment[node]) & (uncertainty <= _SLACK + _DRIFT * meters)
         return np.where(known, meters, np.inf)
 
     def of_one_drive(self, a: int, b: int) -> bool:
@@ -107,8 +107,8 @@ class OdometryChain:
     def sigmas(self, loop: Edge) -> float:
         """Distance of a loop within a segment from the odometry, in standard deviations of both together."""
         a, b = sorted((loop.from_node, loop.to_node))
-        back = se3.adjoint(se3.inverse(self._T_odom_kf[loop.to_node]))
-        covariance = back @ (self._covariances[b] - self._covariances[a]) @ back.T + loop.covariance
+        A = se3.adjoint(se3.inverse(self._T_odom_kf[loop.to_node]))
+        covariance = A @ (self._covariances[b] - self._covariances[a]) @ A.T + loop.covariance
         T_odometry = self.T(loop.from_node, loop.to_node)
         return float(np.sqrt(se3.squared_sigmas(loop.T_from_to, T_odometry, covariance)))
 
@@ -118,12 +118,12 @@ def margin(since: Array | float, settings: ConsistencySettings) -> Array | float
     return _SLACK + settings.drift * since
 
 
-def _doubt(edge: Registration) -> float:
+def _uncertainty(edge: Registration) -> float:
     """Three standard deviations, m or degrees, the larger, of an edge if it is uncertain; else 0."""
     if edge.worst_sigma <= UNCERTAIN:
         return 0.0
-    turn = np.degrees(np.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]))
-    return 3 * max(edge.worst_sigma, float(turn))
+    degrees = np.degrees(np.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1]))
+    return 3 * max(edge.worst_sigma, float(degrees))
 
 
 class Consistency:
@@ -160,19 +160,19 @@ class Consistency:
         meters, degrees = se3.apart(T_expected, loop.T_from_to)
         confirmed = [w for w in self._waiting if self._agree(loop, w, s)]
         if np.isfinite(since):
-            if meters > margin(since, s) or degrees > _TURN[0] + _TURN[1] * since:
+            if meters > margin(since, s) or degrees > _MAX_ROTATION[0] + _MAX_ROTATION[1] * since:
                 return [loop.rejected(f"{meters:.1f} m, {degrees:.1f} deg from the odometry")]
             if meters <= s.certain and degrees <= s.certain:
                 return self._accept([loop, *confirmed])
-            if meters > _STOREY and (sigmas := self._path.sigmas(loop)) > _MOST_SIGMAS:
+            if meters > _STOREY_CORRECTION and (sigmas := self._path.sigmas(loop)) > _MAX_SIGMAS:
                 return [loop.rejected(f"{meters:.1f} m, {sigmas:.0f} standard deviations from the odometry")]
         if confirmed or self._agrees_with_accepted(loop, s):
             return self._accept([loop, *confirmed])
-        self._waiting = [*self._waiting, loop][-_COMPARED:]
+        self._waiting = [*self._waiting, loop][-_MAX_COMPARED:]
         return [loop.rejected(f"{meters:.1f} m from the odometry: waits for a second loop that agrees")]
 
     def _agrees_with_accepted(self, loop: Edge, s: ConsistencySettings) -> bool:
-        return any(self._agree(loop, accepted, s) for accepted in self._accepted[-_COMPARED:])
+        return any(self._agree(loop, accepted, s) for accepted in self._accepted[-_MAX_COMPARED:])
 
     def _accept(self, loops: Sequence[Edge]) -> list[Edge]:
         self._accepted += loops
@@ -183,17 +183,17 @@ class Consistency:
         """Whether the circle of both loops closes."""
         if one.to_node == other.to_node:
             return False
-        there, T_there = self._way(one.from_node, other.from_node)
-        if there > s.reach:  # true for most pairs of a long drive
+        path_from, T_from = self._motion_between(one.from_node, other.from_node)
+        if path_from > s.reach:  # true for most pairs of a long drive
             return False
-        back, T_back = self._way(other.to_node, one.to_node)
-        if back > s.reach:
+        path_to, T_to = self._motion_between(other.to_node, one.to_node)
+        if path_to > s.reach:
             return False
-        meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ T_there @ other.T_from_to @ T_back)
-        allowed = s.circle + _CIRCLE * (there + back)
+        meters, degrees = se3.magnitude(se3.inverse(one.T_from_to) @ T_from @ other.T_from_to @ T_to)
+        allowed = s.circle + _CIRCLE_DRIFT * (path_from + path_to)
         return meters <= allowed and degrees <= 3 * allowed
 
-    def _way(self, a: int, b: int) -> tuple[float, Array]:
+    def _motion_between(self, a: int, b: int) -> tuple[float, Array]:
         """Meters and T_a_b (4, 4) from one node to another: by odometry; for two drives through the map if both are in
         one part of it, else inf."""
         if self._path.of_one_drive(a, b):

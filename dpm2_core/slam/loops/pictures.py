@@ -30,14 +30,14 @@ from dpm2_core.slam.registration.texture import (
 )
 
 BETWEEN = 6.0  # m to either side of a keyframe: beyond, the next one is nearer
-_CLEARLY = 0.6  # maximum ratio of 1 - correlation at the best place to that at the second best
-_ELSEWHERE = 0.45  # correlation that a place which is not in the map is assumed to have
-_CORRELATED = 1 - _CLEARLY * (1 - _ELSEWHERE)  # at least, at the right place
-_EACH = 2  # every second point is registered, to a single keyframe
+_MAX_RATIO = 0.6  # of 1 - correlation at the best place to that at the second best
+_ASSUMED_CORRELATION = 0.45  # correlation that a place which is not in the map is assumed to have
+_MIN_CORRELATION = 1 - _MAX_RATIO * (1 - _ASSUMED_CORRELATION)  # at least, at the right place
+_POINT_STRIDE = 2  # every second point is registered, to a single keyframe
 _WIDEN = 2.0  # factor on the search range: the robot can be in another lane
-_CLOSER = 8  # number of keyframes that are compared closely, with their neighbors
-_APART = 1.0  # m: places farther apart are different
-_KEPT = 1000  # references in memory, 30 kB each
+_COMPARED = 8  # number of keyframes that are compared closely, with their neighbors
+_SEPARATION = 1.0  # m: places farther apart are different
+_MAX_REFERENCES = 1000  # references in memory, 30 kB each
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class PicturedPlaces:
     """The keyframes of a map that have images."""
 
     def __init__(self, settings: VisualSettings, known: KnownMap) -> None:
-        self._settings = settings.model_copy(update={"min_correlation": _CORRELATED})
+        self._settings = settings.model_copy(update={"min_correlation": _MIN_CORRELATION})
         self._known, self._poses = known, known.poses
         self._references: dict[int, Reference | None] = {}
 
@@ -89,7 +89,7 @@ class PicturedPlaces:
         The first of `nodes` with a usable image is used; `nodes[0]` is the target of the registration.
         """
 
-        def nearest(result: Registration) -> Registration:
+        def move_along(result: Registration) -> Registration:
             for node in nodes:
                 T_ref_target = se3.inverse(self._poses[node]) @ self._poses[nodes[0]]
                 known = self._reference(node, T_ref_target @ result.T_target_source, result.open_direction)
@@ -97,7 +97,7 @@ class PicturedPlaces:
                     return along(self._settings, result, known, picture, T_ref_target, reach)
             return result
 
-        return nearest
+        return move_along
 
     def find(
         self, cloud: Points, picture: Texture, nodes: Sequence[int], verifier: Verifier, T_across: Array
@@ -110,20 +110,20 @@ class PicturedPlaces:
             nodes: neighbors of the likely ones are added.
             T_across: (4, 4) T_kf_lidar, except for the position along the road.
         """
-        view = _View(np.ascontiguousarray(verifier.source(cloud)[::_EACH]), picture, verifier, T_across)
-        seen = {node: self._seen(node, view) for node in nodes}
-        likely = sorted(nodes, key=lambda node: max((r.confidence for r in seen[node]), default=0.0), reverse=True)
-        beside = {node + step for node in likely[:_CLOSER] for step in (-1, 0, 1)} & set(range(len(self._poses)))
-        places = [place for node in sorted(beside) for place in self._seen(node, view, closely=True)]
+        view = _View(np.ascontiguousarray(verifier.source(cloud)[::_POINT_STRIDE]), picture, verifier, T_across)
+        matches = {node: self._matching_poses(node, view) for node in nodes}
+        likely = sorted(nodes, key=lambda node: max((r.confidence for r in matches[node]), default=0.0), reverse=True)
+        compared = {node + step for node in likely[:_COMPARED] for step in (-1, 0, 1)} & set(range(len(self._poses)))
+        places = [place for node in sorted(compared) for place in self._matching_poses(node, view, closely=True)]
         if not places:
             return None
         best = max(places, key=lambda place: place.confidence)
-        others = [p for p in places if np.linalg.norm((p.T_target_source - best.T_target_source)[:3, 3]) > _APART]
+        others = [p for p in places if np.linalg.norm((p.T_target_source - best.T_target_source)[:3, 3]) > _SEPARATION]
         return replace(best, ok=not (why := _objection(best, others)), reason=why)
 
-    def _seen(self, node: int, view: _View, closely: bool = False) -> list[Registration]:
+    def _matching_poses(self, node: int, view: _View, closely: bool = False) -> list[Registration]:
         """Poses T_map_lidar where a keyframe shows the same as the image; their confidence is the correlation."""
-        s, result = self._settings, self._registered(node, view)
+        s, result = self._settings, self._register(node, view)
         if result is None or not result.ok:
             return []
         known = self._reference(node, result.T_target_source, result.open_direction)
@@ -137,7 +137,7 @@ class PicturedPlaces:
             for T_kf_lidar, peak in zip(moved, found, strict=True)
         ]
 
-    def _registered(self, node: int, view: _View) -> Registration | None:
+    def _register(self, node: int, view: _View) -> Registration | None:
         """Registration of the query's points to those of a keyframe; None if it has no image."""
         if node not in view.registered:
             result = None
@@ -153,12 +153,12 @@ class PicturedPlaces:
         The axis of the first call is kept: it is that of the road.
         """
         if node not in self._references:
-            if len(self._references) >= _KEPT:
+            if len(self._references) >= _MAX_REFERENCES:
                 self._references.clear()
-            self._references[node] = self._made(node, T_ref_lidar[:3, :3] @ axis)
+            self._references[node] = self._make_reference(node, T_ref_lidar[:3, :3] @ axis)
         return self._references[node]
 
-    def _made(self, node: int, axis: Array) -> Reference | None:
+    def _make_reference(self, node: int, axis: Array) -> Reference | None:
         image = usable_image(self._known.thumbnail(node))
         if image is None:
             return None
@@ -167,9 +167,9 @@ class PicturedPlaces:
 
 def _objection(best: Registration, others: Sequence[Registration]) -> str:
     """Why the place with the best correlation is rejected; empty if it is not."""
-    second = second_best(best, others, _ELSEWHERE, _CLEARLY)
+    second = second_best(best, others, _ASSUMED_CORRELATION, _MAX_RATIO)
     if second is None:
         return ""
-    if second == _ELSEWHERE:
+    if second == _ASSUMED_CORRELATION:
         return f"the image correlates by {best.confidence:.2f}: no more than with a place that looks alike"
     return f"the images of two places are alike: correlations of {best.confidence:.2f} and {second:.2f}"

@@ -67,12 +67,12 @@ class PlaceRecognition:
             agreeing: if a smaller fraction of the descriptors agrees on a motion, a place is rejected before the
                 network correlates the two, which takes seven times as long.
         """
-        agree = self._network.agreement(source, targets) if agreeing else [1.0] * len(targets)
+        agreement = self._network.agreement(source, targets) if agreeing else [1.0] * len(targets)
         return [
             self._network.register(source, target)
-            if part >= agreeing
-            else Registration.failed("neural", f"another place: {part:.0%} of the descriptors agree on a motion")
-            for part, target in zip(agree, targets, strict=True)
+            if ratio >= agreeing
+            else Registration.failed("neural", f"another place: {ratio:.0%} of the descriptors agree on a motion")
+            for ratio, target in zip(agreement, targets, strict=True)
         ]
 
 

@@ -13,9 +13,9 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.registration.icp import CORRELATED, DISTINCT, GeometricRegistration
 from dpm2_core.slam.registration.local_map import LocalMap
 
-_PROBE = 1.0  # m to either side along a direction that may be unconstrained
-_HELD = 1e7  # information, 1 / m2, that fixes a scan there: to less than a millimeter
-_CLOSED = 0.05  # m, standard deviation along a direction in which it fits clearly worse to either side
+_PROBE_DISTANCE = 1.0  # m to either side along a direction that may be unconstrained
+_HOLD_INFORMATION = 1e7  # information, 1 / m2, that fixes a scan there: to less than a millimeter
+_CONSTRAINED_SIGMA = 0.05  # m, standard deviation along a direction in which it fits clearly worse to either side
 
 
 def probed(registration: GeometricRegistration, source: Array, target: LocalMap, result: Registration) -> Registration:
@@ -26,24 +26,24 @@ def probed(registration: GeometricRegistration, source: Array, target: LocalMap,
     rest of its pose may change there. Starts to either side find a better pose if the first one was off.
     """
     b = np.concatenate([np.zeros(3), result.open_direction])
-    beside = [se3.exp(way * b) for way in (-_PROBE, _PROBE)]
-    found = [result, *(registration.register(source, target, result.T_target_source @ T) for T in beside)]
-    best = registration.likeliest(source, target, [_closed(r, b) for r in found])
-    held = _HELD * np.outer(b, b)
-    rivals = [registration.register(source, target, best.T_target_source @ T, prior=held) for T in beside]
+    offsets = [se3.exp(meters * b) for meters in (-_PROBE_DISTANCE, _PROBE_DISTANCE)]
+    found = [result, *(registration.register(source, target, result.T_target_source @ T) for T in offsets)]
+    best = registration.likeliest(source, target, [_limit_sigma(r, b) for r in found])
+    prior = _HOLD_INFORMATION * np.outer(b, b)
+    rivals = [registration.register(source, target, best.T_target_source @ T, prior=prior) for T in offsets]
     density = registration.log_density(source, target, best.T_target_source)
     gains = [density - registration.log_density(source, target, rival.T_target_source) for rival in rivals]
-    return best if all(_is_clear(gain) for gain in gains) else result
+    return best if all(_is_significant(gain) for gain in gains) else result
 
 
-def _closed(result: Registration, b: Array) -> Registration:
-    """The result with its standard deviation along a direction b (6,) limited to `_CLOSED`."""
+def _limit_sigma(result: Registration, b: Array) -> Registration:
+    """The result with its standard deviation along a direction b (6,) limited to `_CONSTRAINED_SIGMA`."""
     C_b = result.of_scene @ b
     variance = float(b @ C_b)
-    excess = max(variance - _CLOSED**2, 0.0) / variance**2
+    excess = max(variance - _CONSTRAINED_SIGMA**2, 0.0) / variance**2
     return replace(result, covariance=result.covariance - excess * np.outer(C_b, C_b))
 
 
-def _is_clear(gain: Array) -> bool:
+def _is_significant(gain: Array) -> bool:
     """Whether log likelihoods of the points (N,) differ by more than chance."""
     return bool(gain.mean() > max(DISTINCT, 3 * gain.std() * np.sqrt(CORRELATED / len(gain))))

@@ -36,9 +36,9 @@ HEIGHT = 4.0
 """Weight of height in the distance of two places: 3 m higher, on the next storey, the view is different."""
 CANDIDATES = 6
 """Keyframes similar to the scan that the network registers and the points verify."""
-_PICTURED = 150  # keyframes, no two adjacent, whose images are compared if the points do not determine the position
-_KEYFRAMES = 9  # maximum number of keyframes of the map around a place
-_REACH = 1.0  # m, along the road around a place that an image has found
+_MAX_IMAGES = 150  # keyframes, no two adjacent, whose images are compared if the points do not determine the position
+_MAX_KEYFRAMES = 9  # of the map around a place
+_IMAGE_REACH = 1.0  # m, along the road around a place that an image has found
 
 
 class RelocalizationSettings(Settings):
@@ -98,26 +98,28 @@ class Relocalizer:
         allowed = np.ones(len(self), bool)
         if hint is not None:  # in x and y only: a click on a map on a screen has no height
             allowed = np.linalg.norm(self._poses[:, :2, 3] - hint[:2, 3], axis=1) <= self._settings.hint_radius
-        places = self._by_points(cloud, descriptors, allowed)
-        found = _unique(places) if places else nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
+        places = self._verified_proposals(cloud, descriptors, allowed)
+        found = (
+            _clear_best(places) if places else nowhere(f"no keyframe of {int(allowed.sum())} matches the descriptors")
+        )
         texture = self._pictures.texture(keyframe)
         if found.ok or texture is None:
             return found
-        nodes = self._places.similar(descriptors, allowed, _PICTURED)
-        verifier, T_across = self._verifiers.suited_to(cloud), self._across(places)
+        nodes = self._places.similar(descriptors, allowed, _MAX_IMAGES)
+        verifier, T_across = self._verifiers.suited_to(cloud), self._pose_across_road(places)
         place = self._pictures.find(cloud, texture, nodes, verifier, T_across)
         if place is None:
             return found
         if not place.ok:
             return nowhere(f"{found.reason}; {place.reason}", found.confidence)
-        return self._verified(cloud, place.T_target_source, texture, _REACH)
+        return self._verify_pose(cloud, place.T_target_source, texture, _IMAGE_REACH)
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """Verify a pose in the map by the points, and by the thumbnail if they leave a direction unconstrained; returns
         T_map_lidar, `ok` or not."""
-        return self._verified(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), BETWEEN)
+        return self._verify_pose(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), BETWEEN)
 
-    def _verified(
+    def _verify_pose(
         self, cloud: Points, T_map_lidar: Array, picture: Texture | None = None, reach: float = 0.0
     ) -> Registration:
         """As `verify`; an image is compared up to `reach` m to either side along an unconstrained direction."""
@@ -125,7 +127,7 @@ class Relocalizer:
         near = np.flatnonzero(distance <= self._settings.surroundings)
         if not len(near):
             return nowhere("outside the map")
-        nodes = near[np.argsort(distance[near])[:_KEYFRAMES]].tolist()
+        nodes = near[np.argsort(distance[near])[:_MAX_KEYFRAMES]].tolist()
         T_at_map = se3.inverse(self._poses[nodes[0]])
         verifier = self._verifiers.suited_to(cloud)
         around = verifier.surroundings([self._cloud(n) for n in nodes], T_at_map @ self._poses[nodes])
@@ -134,23 +136,25 @@ class Relocalizer:
         T = se3.orthonormalized(self._poses[nodes[0]] @ result.T_target_source)
         return replace(result, T_target_source=T, method="relocalisation")
 
-    def _by_points(self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]) -> list[Registration]:
+    def _verified_proposals(
+        self, cloud: Points, descriptors: Descriptors, allowed: NDArray[np.bool_]
+    ) -> list[Registration]:
         """The poses that the descriptors propose among `allowed` (N,) keyframes, `ok` if the points confirm them."""
         nodes = self._places.similar(descriptors, allowed, CANDIDATES)
-        return [self._verified(cloud, proposal.T_target_source) for proposal in self._proposals(descriptors, nodes)]
+        return [self._verify_pose(cloud, proposal.T_target_source) for proposal in self._propose(descriptors, nodes)]
 
-    def _across(self, places: Sequence[Registration]) -> Array:
+    def _pose_across_road(self, places: Sequence[Registration]) -> Array:
         """Position across the road and heading, relative to a keyframe nearby with a similar heading."""
         nearest = [self._poses[_distance(self._poses, place.T_target_source).argmin()] for place in places]
-        seen = [(place, se3.inverse(T) @ place.T_target_source) for place, T in zip(places, nearest, strict=True)]
-        ahead = [(place, T) for place, T in seen if place.confidence > 0 and T[0, 0] > 0]
+        relative = [(place, se3.inverse(T) @ place.T_target_source) for place, T in zip(places, nearest, strict=True)]
+        ahead = [(place, T) for place, T in relative if place.confidence > 0 and T[0, 0] > 0]
         if not ahead:
             return np.eye(4)
         place, T = max(ahead, key=lambda one: one[0].confidence)
-        way = T[:3, :3] @ place.open_direction
-        return se3.make(T[:3, :3], T[:3, 3] - way * (way @ T[:3, 3]))
+        axis = T[:3, :3] @ place.open_direction
+        return se3.make(T[:3, :3], T[:3, 3] - axis * (axis @ T[:3, 3]))
 
-    def _proposals(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
+    def _propose(self, descriptors: Descriptors, nodes: Sequence[int]) -> list[Registration]:
         """T_map_lidar by each keyframe, the most confident first, one per place."""
         known = [(node, d) for node in nodes if (d := self._keyframes[node].descriptors) is not None]
         results = self._places.register(descriptors, [d for _, d in known])
@@ -166,7 +170,7 @@ class Relocalizer:
         return proposals
 
 
-def _unique(places: Sequence[Registration]) -> Registration:
+def _clear_best(places: Sequence[Registration]) -> Registration:
     """The best of several verified poses, if no other place fits nearly as well; else why there is none."""
     best = max(places, key=lambda place: (place.ok, place.confidence))
     if not best.ok:
@@ -176,8 +180,8 @@ def _unique(places: Sequence[Registration]) -> Registration:
     if objection:
         return nowhere(objection, best.confidence)
     for other in others:  # which of two equal storeys fits better depends on the positions of the keyframes
-        beside = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
-        storey = beside <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
+        horizontal = np.linalg.norm((other.T_target_source - best.T_target_source)[:2, 3])
+        storey = horizontal <= SAME_PLACE < _distance(other.T_target_source, best.T_target_source)
         if storey and other.ok and not objection_of_others(other, []):
             return nowhere(f"{other.confidence:.0%} of the points fit on another storey, too", best.confidence)
     return best

@@ -21,15 +21,15 @@ CHANNELS = 32
 """Directions of the feature space whose covariance is used."""
 WIDTH = CHANNELS * (CHANNELS + 1) // 2
 """Length of a vector: 528."""
-_FEW = 2 * CHANNELS  # descriptors; the covariance of fewer is not reliable
+_MIN_DESCRIPTORS = 2 * CHANNELS  # descriptors; the covariance of fewer is not reliable
 
 
 def pooled(descriptors: Descriptors) -> Vector:
     """The (528,) float32 vector of a place; zeros, similar to no place, if there are too few descriptors."""
     rows, columns = np.triu_indices(CHANNELS)
-    if len(descriptors) < _FEW:
+    if len(descriptors) < _MIN_DESCRIPTORS:
         return np.zeros(len(rows), np.float32)
-    features = descriptors.values @ _directions(descriptors.features.shape[1])
+    features = descriptors.values @ _random_directions(descriptors.features.shape[1])
     features -= features.mean(0)
     covariance = features.T @ features / len(features)
     eigenvalues, axes = np.linalg.eigh(covariance + 1e-3 * np.trace(covariance) / CHANNELS * np.eye(CHANNELS))
@@ -42,12 +42,12 @@ def centered(vectors: Vector, mean: Vector) -> Vector:
 
     The mean is subtracted since the part that all places share does not distinguish them.
     """
-    less = np.where(np.any(vectors, axis=1, keepdims=True), vectors - mean, 0)
-    return np.asarray(less / np.maximum(np.linalg.norm(less, axis=1, keepdims=True), 1e-6), np.float32)
+    differences = np.where(np.any(vectors, axis=1, keepdims=True), vectors - mean, 0)
+    return np.asarray(differences / np.maximum(np.linalg.norm(differences, axis=1, keepdims=True), 1e-6), np.float32)
 
 
 @cache
-def _directions(channels: int) -> NDArray[np.float32]:
+def _random_directions(channels: int) -> NDArray[np.float32]:
     """(channels, 32) orthonormal columns, always the same ones."""
     random = np.random.default_rng(0).normal(size=(channels, max(channels, CHANNELS)))
     return np.linalg.qr(random)[0][:, :CHANNELS].astype(np.float32)
@@ -60,7 +60,7 @@ class PlaceIndex:
         self._vectors = np.zeros((256, WIDTH), np.float32)
         self._squared = np.zeros(256, np.float32)  # lengths
         self._sum = np.zeros(self._vectors.shape[1])
-        self._used = 0  # vectors that are not zero
+        self._nonzero = 0  # vectors that are not zero
         self._count = 0
 
     def __len__(self) -> int:
@@ -76,12 +76,12 @@ class PlaceIndex:
             self._vectors[self._count] = vector
             self._squared[self._count] = vector @ vector
             self._sum += vector
-            self._used += bool(vector.any())
+            self._nonzero += bool(vector.any())
         self._count += 1
 
     def similarities(self, query: Vector) -> NDArray[np.float32]:
         """Cosine (N,) of each keyframe's vector and the (528,) query, both minus the mean of all; -1 if no vector."""
-        mean = (self._sum / max(self._used, 1)).astype(np.float32)
+        mean = (self._sum / max(self._nonzero, 1)).astype(np.float32)
         requested = query - mean
         vectors, squared = self._vectors[: self._count], self._squared[: self._count]
         dots = vectors @ np.stack([requested, mean], 1)

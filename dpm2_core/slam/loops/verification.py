@@ -21,13 +21,13 @@ from dpm2_core.slam.preprocess import PreprocessSettings
 from dpm2_core.slam.registration.icp import GeometricRegistration, GeometricSettings
 from dpm2_core.slam.registration.local_map import LocalMap, LocalMapSettings
 
-_CELL = 2.0  # m, of the grid whose lowest points are the ground
-_ABOVE = 0.5  # m above it: points on objects
-_WELL = 0.75  # fraction of these that fits at a right pose; with less, a pose next to it may fit better
-_CLEARLY = 0.5  # maximum ratio of the unmatched fraction at the best place to that at the second best
-_LEAST = 0.02  # minimum for the unmatched fraction: small rooms of one plan all fit to 100 %
-_ELSEWHERE = 0.8  # fit that an untried place is assumed to have: in car parks they have 0.5 to 0.89
-_MOST_TURNED = 5.0  # degrees, from the proposed pose
+_GROUND_CELL = 2.0  # m, of the grid whose lowest points are the ground
+_MIN_HEIGHT = 0.5  # m above it: points on objects
+_GOOD_FIT = 0.75  # fraction of these that fits at a right pose; with less, a pose next to it may fit better
+_MAX_RATIO = 0.5  # of the unmatched fraction at the best place to that at the second best
+_MIN_UNMATCHED = 0.02  # fraction: small rooms of one plan all fit to 100 %
+_ASSUMED_FIT = 0.8  # fit that an untried place is assumed to have: in car parks they have 0.5 to 0.89
+_MAX_ROTATION = 5.0  # degrees, from the proposed pose
 SAME_PLACE = 5.0  # m, poses closer to each other than this are of one place...
 _SAME_HEADING = 30.0
 """...and so are headings, degrees: in the middle of a room with two similar ends, both headings fit."""
@@ -68,7 +68,7 @@ def second_best(best: Registration, others: Sequence[Registration], assumed: flo
         clearly: maximum ratio of the unmatched fraction at a clear best place to that at the second best.
     """
     second = max([assumed, *(other.confidence for other in others)])
-    return None if max(1 - best.confidence, _LEAST) <= clearly * (1 - second) else second
+    return None if max(1 - best.confidence, _MIN_UNMATCHED) <= clearly * (1 - second) else second
 
 
 def objection_of_others(best: Registration, others: Sequence[Registration]) -> str:
@@ -77,10 +77,10 @@ def objection_of_others(best: Registration, others: Sequence[Registration]) -> s
     Args:
         others: verifications at other places, also those that were not accepted.
     """
-    second = second_best(best, others, _ELSEWHERE, _CLEARLY)
+    second = second_best(best, others, _ASSUMED_FIT, _MAX_RATIO)
     if second is None:
         return ""
-    if second == _ELSEWHERE:
+    if second == _ASSUMED_FIT:
         return f"{best.confidence:.0%} of the points fit: no more than at a place that looks alike"
     return f"two places of the map fit alike: {best.confidence:.0%} and {second:.0%} of the points"
 
@@ -130,28 +130,30 @@ class Verifier:
         result = self._registration.register(source, around, T_proposed, widen)
         if not result.ok:
             return result
-        standing = height_above_ground(source, _CELL, reach=0) > _ABOVE
-        points = int(standing.sum())
-        share, structure = self._shares(source, around, result.T_target_source, standing)
-        if result.worst_sigma > self._settings.max_sigma or structure < _WELL:
+        on_objects = height_above_ground(source, _GROUND_CELL, reach=0) > _MIN_HEIGHT
+        points = int(on_objects.sum())
+        ratio, structure = self._fit_ratios(source, around, result.T_target_source, on_objects)
+        if result.worst_sigma > self._settings.max_sigma or structure < _GOOD_FIT:
             result = probed(self._registration, source, around, result)
             if along is not None and result.worst_sigma > self._settings.max_sigma:
                 result = along(result)
-            share, structure = self._shares(source, around, result.T_target_source, standing)
+            ratio, structure = self._fit_ratios(source, around, result.T_target_source, on_objects)
         T_proposed_found = se3.inverse(T_proposed) @ result.T_target_source
-        reason = self._misfit(result, share, structure, points) or self._departure(T_proposed_found, widen)
+        reason = self._fit_objection(result, ratio, structure, points) or self._shift_objection(T_proposed_found, widen)
         return replace(result, confidence=min(result.confidence, structure), ok=not reason, reason=reason)
 
-    def _shares(self, source: Array, around: LocalMap, T: Array, standing: NDArray[np.bool_]) -> tuple[float, float]:
+    def _fit_ratios(
+        self, source: Array, around: LocalMap, T: Array, on_objects: NDArray[np.bool_]
+    ) -> tuple[float, float]:
         """Fractions on a surface of the map: of the points (N, 3), and of those on objects."""
         fits = self._registration.fits(source, around, T)
-        return float(fits.mean()), float(fits[standing].mean()) if standing.any() else 0.0
+        return float(fits.mean()), float(fits[on_objects].mean()) if on_objects.any() else 0.0
 
-    def _misfit(self, result: Registration, share: float, structure: float, points: int) -> str:
+    def _fit_objection(self, result: Registration, ratio: float, structure: float, points: int) -> str:
         """Why the points, this number of them above the ground, do not confirm a pose; empty if they do."""
         s = self._settings
-        if share < s.min_inliers:
-            return f"only {share:.0%} of the points fit"
+        if ratio < s.min_inliers:
+            return f"only {ratio:.0%} of the points fit"
         if points < s.min_points:
             return f"only {points} points above the ground"
         if structure < s.min_structure:
@@ -162,9 +164,9 @@ class Verifier:
             return f"position uncertain by {sigma:.2f} m"
         return ""
 
-    def _departure(self, T_proposed_found: Array, widen: float) -> str:
+    def _shift_objection(self, T_proposed_found: Array, widen: float) -> str:
         """Why a pose is too far from the proposed one; empty if it is not."""
         meters, degrees = se3.magnitude(T_proposed_found)
-        if meters > widen * self._settings.max_moved or degrees > widen * _MOST_TURNED:
+        if meters > widen * self._settings.max_moved or degrees > widen * _MAX_ROTATION:
             return f"the points and the proposed pose are {meters:.1f} m, {degrees:.1f} deg apart"
         return ""
