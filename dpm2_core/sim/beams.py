@@ -15,7 +15,7 @@ _CAR_BODY = (1.5, 1.67, 0.85, 0.56)
 """Roof edges ahead, behind and to the side, and the sensor's height above it, m: occludes the same as KITTI's car."""
 _PRISMS = ((7294 / 60, np.radians(17.6)), (-4664 / 60, np.radians(17.6)))
 """Revolutions per second and deflection, rad, of the two prisms of the rosette, as in Livox' Mid-40 and Avia."""
-_LASERS = np.radians(0.28)
+_LASER_SPACING = np.radians(0.28)
 """Angle between two lasers of the rosette, rad."""
 
 
@@ -40,32 +40,32 @@ class Beams:
 
     def __init__(self, config: LidarConfig, T_level_lidar: Array) -> None:
         self.config = config
-        self._spinning = config.pattern == "spinning"
+        self._is_spinning = config.pattern == "spinning"
         n = config.columns
         ring, column = np.divmod(np.arange(config.beams * n), n)
         self._kept: NDArray[np.bool_] | slice = slice(None)
-        self._always: Float | None = None  # constant directions of a spinning sensor
-        if self._spinning:
-            turn = self._turn()
+        self._fixed_directions: Float | None = None  # constant directions of a spinning sensor
+        if self._is_spinning:
+            directions = self._spinning_directions()
             if config.car_body:
-                self._kept = ~_hidden_by_car(turn @ T_level_lidar[:3, :3].T)
-            self._always = np.ascontiguousarray(turn[self._kept], np.float32)
+                self._kept = ~_hidden_by_car(directions @ T_level_lidar[:3, :3].T)
+            self._fixed_directions = np.ascontiguousarray(directions[self._kept], np.float32)
         self.ring, self.column = ring.astype(np.uint8)[self._kept], column[self._kept]
         azimuth = np.arange(n) * (2 * np.pi / n)
         # A spinning sensor rotates clockwise and faces straight ahead at the stamp.
-        phase = -np.remainder(azimuth + np.pi, 2 * np.pi) + np.pi if self._spinning else azimuth - np.pi
+        phase = -np.remainder(azimuth + np.pi, 2 * np.pi) + np.pi if self._is_spinning else azimuth - np.pi
         self.column_time = (phase / (2 * np.pi) * FRAME_PERIOD).astype(np.float32)
 
     def directions(self, time: float) -> Float:
         """(R, 3) unit directions in the LiDAR frame of the revolution at a time, s."""
-        return self._rosette(time) if self._always is None else self._always
+        return self._rosette_directions(time) if self._fixed_directions is None else self._fixed_directions
 
-    def _turn(self) -> Array:
+    def _spinning_directions(self) -> Array:
         config = self.config
         angle = elevations(config.beams)
         if config.real.uneven:
-            own = np.random.default_rng([config.real.serial, config.beams, 1])
-            angle = angle + np.radians(config.real.uneven) * own.standard_normal(config.beams)
+            rng = np.random.default_rng([config.real.serial, config.beams, 1])
+            angle = angle + np.radians(config.real.uneven) * rng.standard_normal(config.beams)
         elevation, azimuth = angle[:, None], np.arange(config.columns)[None] * (2 * np.pi / config.columns)
         parts = (
             np.cos(elevation) * np.cos(azimuth),
@@ -74,14 +74,14 @@ class Beams:
         )
         return np.stack(parts, -1).reshape(-1, 3)
 
-    def _rosette(self, time: float) -> Float:
+    def _rosette_directions(self, time: float) -> Float:
         """A row of lasers behind two counter-rotating prisms: the sum of two deflections, which does not repeat."""
-        when = time + self.column_time.astype(float)
-        aside, up = (
-            sum(bend * wave(2 * np.pi * rate * when) for rate, bend in _PRISMS) for wave in (np.cos, np.sin)
+        times = time + self.column_time.astype(float)
+        left, up = (
+            sum(bend * wave(2 * np.pi * rate * times) for rate, bend in _PRISMS) for wave in (np.cos, np.sin)
         )  # rad
-        laser = (0.5 * (self.config.beams - 1) - np.arange(self.config.beams)) * _LASERS
-        y = np.tan(np.broadcast_to(aside, (self.config.beams, len(when))))
+        laser = (0.5 * (self.config.beams - 1) - np.arange(self.config.beams)) * _LASER_SPACING
+        y = np.tan(np.broadcast_to(left, (self.config.beams, len(times))))
         z = np.tan(np.add.outer(laser, up))
         rays = np.stack([np.ones_like(y), y, z], -1).reshape(-1, 3)
         return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)

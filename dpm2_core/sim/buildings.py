@@ -116,11 +116,11 @@ def _features(
 
 def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> list[Mesh]:
     color = ROOF_COLORS[rng.integers(len(ROOF_COLORS))] + rng.normal(0, 8, 3)
-    w, over = width / 2 + 0.3, 0.4
+    w, eaves = width / 2 + 0.3, 0.4
     if rng.random() < 0.3 or depth > 18:
         flat = Surface(Label.BUILDING, Material.ROOF, color * 0.8)
         metal = Surface(Label.BUILDING, Material.METAL, (130,) * 3)
-        parts = [box((-w, -over / 2, top), (w, depth + over / 2, top + 0.3), flat)]
+        parts = [box((-w, -eaves / 2, top), (w, depth + eaves / 2, top + 0.3), flat)]
         for _ in range(rng.integers(0, 4)):
             at = rng.uniform((-w + 1, 1), (w - 2, depth - 2))
             parts.append(box((*at, top), (*(at + rng.uniform(0.6, 2, 2)), top + rng.uniform(0.6, 2)), metal))
@@ -128,7 +128,7 @@ def _roof(width: float, depth: float, top: float, rng: np.random.Generator) -> l
     ridge = top + depth / 2 * rng.uniform(0.5, 1.0)
     hip = rng.choice([0.0, 0.0, width / 4])
     corners = np.array([
-        (-w, -over, top - 0.2), (w, -over, top - 0.2), (w, depth + over, top - 0.2), (-w, depth + over, top - 0.2),
+        (-w, -eaves, top - 0.2), (w, -eaves, top - 0.2), (w, depth + eaves, top - 0.2), (-w, depth + eaves, top - 0.2),
         (-w + hip, depth / 2, ridge), (w - hip, depth / 2, ridge),
     ])  # fmt: skip
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]

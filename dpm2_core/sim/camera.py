@@ -20,10 +20,10 @@ from dpm2_core.sim.shading import VisiblePoints
 from dpm2_core.sim.traffic import DynamicObjects
 from dpm2_core.sim.world import World
 
-_LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
+_TO_LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
 _RESPONSE = 255 * np.minimum(np.arange(4096, dtype=np.float32) / 4096 * 1.25, 1) ** np.float32(1 / 2.2)
-_HAZE = np.array([0.72, 0.78, 0.86], np.float32)
-_BAND = 32
+_HAZE_COLOR = np.array([0.72, 0.78, 0.86], np.float32)
+_BAND_ROWS = 32
 """Number of pixel rows that are processed at a time."""
 REACH = 600.0
 """Visible range, m."""
@@ -55,50 +55,50 @@ def render(
     eye = T_world_cam[:3, 3].astype(np.float32)
     dynamic_objects = world.traffic.dynamic_objects(time, eye)
     radiance = np.empty((config.height, config.width, 3), np.float32)
-    for top in range(0, config.height, _BAND):  # bands fit the processor's cache: a sixth less work
-        rows = slice(top, min(top + _BAND, config.height))
+    for top in range(0, config.height, _BAND_ROWS):  # bands fit the processor's cache: a sixth less work
+        rows = slice(top, min(top + _BAND_ROWS, config.height))
         view = rotated(_rays(config)[rows].reshape(-1, 3), T_world_cam[:3, :3])
-        radiance[rows] = _band(world, light, dynamic_objects, eye, view, config).reshape(-1, config.width, 3)
+        radiance[rows] = _render_band(world, light, dynamic_objects, eye, view, config).reshape(-1, config.width, 3)
     return through_lens(_develop(radiance, light.exposure, config.noise, rng), config)
 
 
-def _band(
+def _render_band(
     world: World, light: Light, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
 ) -> Float:
     """(R, 3) light from the directions (R, 3) of some rows of pixels."""
-    surface, seen, distance = _visible(world, dynamic_objects, eye, view, config)
+    surface, seen, distance = _visible_points(world, dynamic_objects, eye, view, config)
     lit = np.ones(len(distance), np.float32)
     if not light.tunnel and light.overcast < 0.85:
         lit = _sunlit(world, light.sun, dynamic_objects, surface, seen, config.width)
     color = light.textures.albedo(surface, world.terrain)
     color *= light.shine(surface, lit)
     color[surface.material == Material.LAMP] = 1.3
-    color -= _HAZE
+    color -= _HAZE_COLOR
     color *= np.exp(distance / np.float32(-300 if light.tunnel else -900))[:, None]
-    color += _HAZE
+    color += _HAZE_COLOR
     radiance = np.empty_like(view)
     radiance[seen] = color
     radiance[~seen] = light.sky(view[~seen])
     return radiance
 
 
-def _visible(
+def _visible_points(
     world: World, dynamic_objects: DynamicObjects | None, eye: Float, view: Float, config: CameraConfig
 ) -> tuple[VisiblePoints, NDArray[np.bool_], Float]:
     """The nearest surface points on the rays that hit one, static or moving; which rays hit; and their distances."""
     hits = world.scene.cast(np.broadcast_to(eye, view.shape).copy(), view, REACH)
     if dynamic_objects is not None:
         moving, toward = dynamic_objects.cast(eye, view, REACH)
-        near = moving.distance < hits.distance[toward]
-        chosen, moving = toward[near], moving.part(near)
-        hits.distance[chosen], hits.normal[chosen] = moving.distance, moving.normal
+        is_nearer = moving.distance < hits.distance[toward]
+        moving_rays, moving = toward[is_nearer], moving.part(is_nearer)
+        hits.distance[moving_rays], hits.normal[moving_rays] = moving.distance, moving.normal
     seen = np.isfinite(hits.distance)
     hits = hits.part(seen)
     columns = _attributes(world.static, hits)
     if dynamic_objects is not None:
-        place = np.cumsum(seen)[chosen] - 1
-        for column, own in zip(columns, _attributes(dynamic_objects.scene.mesh, moving), strict=True):
-            column[place] = own
+        rows = np.cumsum(seen)[moving_rays] - 1
+        for column, moving_values in zip(columns, _attributes(dynamic_objects.scene.mesh, moving), strict=True):
+            column[rows] = moving_values
     uv, texture, material, color = columns
     direction, normal, distance = view[seen], hits.normal, hits.distance
     slope = np.einsum("ij,ij->i", normal, direction)
@@ -106,7 +106,11 @@ def _visible(
     normal *= scale[:, None]
     footprint = distance / np.float32(config.focal) / np.sqrt(np.maximum(-slope * scale, np.float32(0.02)))
     position = direction * distance[:, None] + eye
-    return VisiblePoints(position, normal, direction, uv, texture, material, _LINEAR[color], footprint), seen, distance
+    return (
+        VisiblePoints(position, normal, direction, uv, texture, material, _TO_LINEAR[color], footprint),
+        seen,
+        distance,
+    )
 
 
 def _attributes(mesh: Mesh, hits: Hits) -> tuple[NDArray, NDArray, NDArray, NDArray]:
@@ -134,11 +138,11 @@ def _sunlit(
     point = sparse[sparse >= 0]
     origins = surface.position[point] + surface.normal[point] * np.float32(0.03)
     towards = np.broadcast_to(sun, origins.shape).copy()
-    free = world.scene.cast(origins, towards, 150.0).face < 0
+    is_lit = world.scene.cast(origins, towards, 150.0).face < 0
     if dynamic_objects is not None:
-        free &= dynamic_objects.scene.cast(origins, towards, 150.0).face < 0
+        is_lit &= dynamic_objects.scene.cast(origins, towards, 150.0).face < 0
     half = np.ones(sparse.shape, np.float32)
-    half[sparse >= 0] = free
+    half[sparse >= 0] = is_lit
     full = cv2.resize(half, (width, len(seen) // width), interpolation=cv2.INTER_LINEAR)
     return full.reshape(-1)[seen]
 
@@ -148,8 +152,8 @@ def _develop(radiance: Float, exposure: float, noise: float, rng: np.random.Gene
     height, width = radiance.shape[:2]
     v, u = (np.linspace(-1, 1, n, dtype=np.float32) for n in (height, width))
     vignette = 1 - 0.22 * (u[None] ** 2 * 0.8 + v[:, None] ** 2 * 0.2)
-    level = np.float32(exposure * 0.24 / (radiance[::4, ::4].mean() + 0.02))
-    x = radiance * (vignette * level)[..., None]
+    gain = np.float32(exposure * 0.24 / (radiance[::4, ::4].mean() + 0.02))
+    x = radiance * (vignette * gain)[..., None]
     x *= np.float32(4095) / (1 + x)  # compresses highlights
     image = _RESPONSE[x.astype(np.uint16)]
     image += rng.standard_normal(image.shape, np.float32) * np.float32(noise)

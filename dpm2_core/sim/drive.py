@@ -31,9 +31,9 @@ OVERLAP = 16.0
 """Distance that a closed drive continues beyond its start, m."""
 LONGEST_LAP = 800.0
 """A longer drive goes around again, m."""
-_SMOOTH = 31
+_SMOOTHING_WINDOW = 31
 """IMU samples over which the trajectory is smoothed: 0.3 s, a few samples of a road; it moves by 1 mm (RMS)."""
-_UNSAID = {"pattern", "roll", "pitch", "real", "wet", "lens", "traffic", "imu", "gnss"}
+_OMITTED_IF_DEFAULT = {"pattern", "roll", "pitch", "real", "wet", "lens", "traffic", "imu", "gnss"}
 _LIDAR_STREAM, _CAMERA_STREAM, _IMU_STREAM, _GNSS_STREAM = 10, 11, 14, 15
 
 
@@ -56,9 +56,9 @@ def simulate(
     Raises:
         UsageError: a setting is invalid, or `out` contains something else. Dpm2Error: it could not be written.
     """
-    drive = drive.model_copy(update={"frames": _frames(drive)})
+    drive = drive.model_copy(update={"frames": _frame_count(drive)})
     recipe = _recipe(drive)
-    if _is_there(out, recipe):
+    if _already_exists(out, recipe):
         return False
     length = fitting_length(drive) if drive.road in ROAD_KINDS else 400.0
     world = build_world(drive.road, drive.preset, drive.seed, length, drive.traffic)
@@ -70,21 +70,21 @@ def simulate(
     return True
 
 
-def _frames(drive: DriveConfig) -> int:
+def _frame_count(drive: DriveConfig) -> int:
     if drive.frames is not None and drive.frames < 1:
         raise UsageError(f"--frames {drive.frames}: want at least 1")
     if drive.road in ROAD_KINDS:
         return 150 if drive.frames is None else drive.frames
-    known = len(read_drive(Path(drive.road)))
-    if drive.frames is not None and drive.frames > known:
-        raise UsageError(f"--frames {drive.frames}: {drive.road} has {known}")
-    return known if drive.frames is None else drive.frames
+    available = len(read_drive(Path(drive.road)))
+    if drive.frames is not None and drive.frames > available:
+        raise UsageError(f"--frames {drive.frames}: {drive.road} has {available}")
+    return available if drive.frames is None else drive.frames
 
 
 def fitting_length(drive: DriveConfig) -> float:
     """Length of the road, m, that the frames of a drive just fill."""
     kind = own_preset(drive.preset, drive.seed, drive.traffic)
-    end = (_frames(drive) - 1) * FRAME_PERIOD
+    end = (_frame_count(drive) - 1) * FRAME_PERIOD
     length = float(np.clip(end * kind.speed, 60, 20000))
     for _ in range(12):  # the driven distance depends on the curves, and these on the length
         streets = make_road(drive.road, kind, random_stream(drive.seed, drive.preset, 0), length)
@@ -104,15 +104,19 @@ def _recipe(drive: DriveConfig) -> dict[str, Any]:
     if drive.road not in ROAD_KINDS:
         path = Path(drive.road)
         recipe["road"] = f"{path.name} sha256:{file_digest(path)}"
-    usual = DriveConfig().model_dump(mode="json")
-    for part, default in ((recipe, usual), (recipe["lidar"], usual["lidar"]), (recipe["camera"], usual["camera"])):
-        for name in _UNSAID & part.keys():
+    defaults = DriveConfig().model_dump(mode="json")
+    for part, default in (
+        (recipe, defaults),
+        (recipe["lidar"], defaults["lidar"]),
+        (recipe["camera"], defaults["camera"]),
+    ):
+        for name in _OMITTED_IF_DEFAULT & part.keys():
             if part[name] == default[name]:
                 del part[name]
     return recipe
 
 
-def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
+def _already_exists(out: Path, recipe: dict[str, Any]) -> bool:
     """Whether `out` contains exactly this drive; UsageError if it contains anything else."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return False
@@ -121,9 +125,9 @@ def _is_there(out: Path, recipe: dict[str, Any]) -> bool:
     except (OSError, ValueError):
         raise UsageError(f"{out}: is there already and is no simulated drive; choose another folder") from None
     if found != recipe:
-        differ = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
-        differ += [key for key in found if key not in recipe] if isinstance(found, dict) else []
-        what = f"a drive with other {', '.join(differ) or 'settings'}, or of another version of dpm2"
+        different = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
+        different += [key for key in found if key not in recipe] if isinstance(found, dict) else []
+        what = f"a drive with other {', '.join(different) or 'settings'}, or of another version of dpm2"
         raise UsageError(f"{out}: holds {what}; remove it or choose another")
     return True
 
@@ -136,7 +140,7 @@ class _Drive:
         self.imu = None if drive.imu is None else Imu(drive.imu, np.random.default_rng([world.seed, _IMU_STREAM]))
         rng = np.random.default_rng([world.seed, _GNSS_STREAM])
         self.gnss = None if drive.gnss is None else Receiver(drive.gnss, rng)
-        self.times = np.arange(_frames(drive), dtype=np.float64) * FRAME_PERIOD
+        self.times = np.arange(_frame_count(drive), dtype=np.float64) * FRAME_PERIOD
         self.T_world_lidar = self._poses(self.times)
         color = calibration(drive.camera)
         # The poses and Tr of the layout are of the left gray camera 0; the color camera 2 is next to it.
@@ -185,16 +189,16 @@ class _Drive:
             np.savetxt(path, rows, "%.9e")
         np.savetxt(sequence / "times.txt", self.times, "%.6e")
         calib = io.StringIO()
-        for k, left in enumerate((0.0, -0.54, self.baseline, -0.48)):
-            P = np.concatenate([self.K, self.K @ [[left], [0], [0]]], 1)
+        for k, x_offset in enumerate((0.0, -0.54, self.baseline, -0.48)):
+            P = np.concatenate([self.K, self.K @ [[x_offset], [0], [0]]], 1)
             calib.write(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()) + "\n")
         calib.write("Tr: " + " ".join(f"{v:.12e}" for v in se3.inverse(self.T_lidar_cam0)[:3].ravel()) + "\n")
-        beside = {}
+        mounts = {}
         if self.imu is not None:
-            beside["imu"] = se3.make(self.imu.R_lidar_imu, np.zeros(3))
+            mounts["imu"] = se3.make(self.imu.R_lidar_imu, np.zeros(3))
         if self.gnss is not None:
-            beside["gnss"] = se3.make(np.eye(3), self.gnss.antenna)
-        for name, T_lidar_sensor in beside.items():
+            mounts["gnss"] = se3.make(np.eye(3), self.gnss.antenna)
+        for name, T_lidar_sensor in mounts.items():
             calib.write(f"Tr_{name}_to_velo: " + " ".join(f"{v:.12e}" for v in T_lidar_sensor[:3].ravel()) + "\n")
         (sequence / "calib.txt").write_text(calib.getvalue(), encoding="utf-8")
 
@@ -219,9 +223,9 @@ class _Drive:
         from scipy.signal import savgol_filter  # takes longer to import than everything else here
 
         T, early = self._poses(np.maximum(times, 0.0)), times < 0
-        first, soon = self._poses(np.array([0.0, 0.02]))
-        T[early] = first @ np.array([se3.exp(se3.log(se3.inverse(first) @ soon) * t / 0.02) for t in times[early]])
-        window = min(_SMOOTH, len(times) - 1 | 1)
+        first, second = self._poses(np.array([0.0, 0.02]))
+        T[early] = first @ np.array([se3.exp(se3.log(se3.inverse(first) @ second) * t / 0.02) for t in times[early]])
+        window = min(_SMOOTHING_WINDOW, len(times) - 1 | 1)
         T[:, :3, 3] = savgol_filter(T[:, :3, 3], window, 3, axis=0)
         return T
 

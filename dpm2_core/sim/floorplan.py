@@ -12,14 +12,14 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 
 RoomKind = Literal["room", "corridor", "hall", "stairs", "deck"]
-_NARROW = 2.4
+_MIN_ROOM_WIDTH = 2.4
 """Smallest width of a room that is no corridor, m."""
 AISLE = 6.2
 """Width of the lanes of a car park, m; the rows of cars between them are `ROW` deep."""
 ROW = 10.0
 PIPE = 0.57
 """Distance of the lowest pipe of a deck below its ceiling, m."""
-_TRIES = 50  # attempts to plan a building with more than a single hall
+_MAX_ATTEMPTS = 50  # attempts to plan a building with more than a single hall
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def office(length: float, rng: np.random.Generator) -> FloorPlan:
     """
     area, aspect = 1.8 * length, rng.uniform(0.8, 1.8)
     size = np.sqrt([area * aspect, area / aspect])
-    for _ in range(_TRIES):
+    for _ in range(_MAX_ATTEMPTS):
         rooms = _split((0.0, 0.0), (float(size[0]), float(size[1])), rng)
         if len(rooms) > 1:  # a single hall has no door, and so no path
             break
@@ -100,7 +100,7 @@ def office(length: float, rng: np.random.Generator) -> FloorPlan:
     if kinds:
         k = kinds[int(rng.integers(len(kinds)))]
         rooms[k] = Room("stairs", rooms[k].low, rooms[k].high, rooms[k].height + 3)
-    tree, others = _connections(rooms, rng)
+    tree, others = _connect(rooms, rng)
     return FloorPlan(rooms, tree + others, _tour(rooms, tree))
 
 
@@ -118,25 +118,32 @@ def _split(low: tuple[float, float], high: tuple[float, float], rng: np.random.G
     """Rooms that fill a rectangle: split at random, sometimes along a corridor, until they have usual sizes."""
     size = np.array(high) - low
     axis = int(size[1] > size[0])
-    area, least = float(size.prod()), 2 * _NARROW
+    area, min_size = float(size.prod()), 2 * _MIN_ROOM_WIDTH
     hall = area < 220 and size.min() > 7 and rng.random() < 0.2
-    if hall or size[axis] < least + 0.5 or area < rng.uniform(12, 55):
-        kind: RoomKind = "hall" if hall else "corridor" if size.min() < _NARROW else "room"
+    if hall or size[axis] < min_size + 0.5 or area < rng.uniform(12, 55):
+        kind: RoomKind = "hall" if hall else "corridor" if size.min() < _MIN_ROOM_WIDTH else "room"
         height = rng.uniform(4, 7) if hall else rng.uniform(2.4, 3.3)
         return [Room(kind, low, high, float(height))]
     width = float(rng.uniform(1.6, 2.3)) if size[axis] > 9 and rng.random() < 0.6 else 0.0
-    cut = float(rng.uniform(low[axis] + _NARROW, high[axis] - _NARROW - width))
+    cut = float(rng.uniform(low[axis] + _MIN_ROOM_WIDTH, high[axis] - _MIN_ROOM_WIDTH - width))
     first_high, second_low = list(high), list(low)
     first_high[axis], second_low[axis] = cut, cut + width
     out = _split(low, (first_high[0], first_high[1]), rng) + _split((second_low[0], second_low[1]), high, rng)
     if width:
-        from_, to = list(low), list(high)
-        from_[axis], to[axis] = cut, cut + width
-        out.append(Room("corridor", (from_[0], from_[1]), (to[0], to[1]), float(rng.uniform(2.4, 3.0))))
+        corridor_low, corridor_high = list(low), list(high)
+        corridor_low[axis], corridor_high[axis] = cut, cut + width
+        out.append(
+            Room(
+                "corridor",
+                (corridor_low[0], corridor_low[1]),
+                (corridor_high[0], corridor_high[1]),
+                float(rng.uniform(2.4, 3.0)),
+            )
+        )
     return out
 
 
-def _connections(rooms: list[Room], rng: np.random.Generator) -> tuple[list[Door], list[Door]]:
+def _connect(rooms: list[Room], rng: np.random.Generator) -> tuple[list[Door], list[Door]]:
     """Doors that connect all rooms in a tree, through corridors if possible, and a few more."""
     found = [door for i in range(len(rooms)) for j in range(i + 1, len(rooms)) if (door := _door(rooms, i, j, rng))]
     corridors = [any(rooms[k].kind == "corridor" for k in door.rooms) for door in found]
@@ -175,29 +182,29 @@ def _tour(rooms: list[Room], tree: list[Door]) -> Array:
     for door in tree:
         for k in door.rooms:
             doors[k].append(door)
-    way: list[Array] = []
+    path: list[Array] = []
 
-    def visit(k: int, came: Door | None) -> None:
+    def visit(k: int, entry: Door | None) -> None:
         middle = rooms[k].center
-        onward = [door for door in doors[k] if door is not came]
-        if came is not None and not onward:
-            way.extend(_round(rooms[k], came))
-        for door in onward:
+        exits = [door for door in doors[k] if door is not entry]
+        if entry is not None and not exits:
+            path.extend(_around_room(rooms[k], entry))
+        for door in exits:
             other = door.rooms[1] if door.rooms[0] == k else door.rooms[0]
-            beyond = rooms[other].center
-            way.extend([middle, door.point(middle, 0.7), door.point(beyond, 0.7)])
+            other_center = rooms[other].center
+            path.extend([middle, door.point(middle, 0.7), door.point(other_center, 0.7)])
             visit(other, door)
-            way.extend([door.point(beyond, 0.7), door.point(middle, 0.7)])
-        if onward:
-            way.append(middle)
+            path.extend([door.point(other_center, 0.7), door.point(middle, 0.7)])
+        if exits:
+            path.append(middle)
 
     visit(int(np.argmax([room.size.prod() for room in rooms])), None)
-    return np.array(way)
+    return np.array(path)
 
 
-def _round(room: Room, door: Door) -> list[Array]:
+def _around_room(room: Room, door: Door) -> list[Array]:
     """Four corners around the middle of a room, starting with the one nearest to the door."""
     reach = np.maximum(room.size / 2 - 1.1, 0.35)
-    corners = [room.center + reach * turn for turn in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [room.center + reach * direction for direction in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     first = int(np.argmin([np.linalg.norm(corner - door.point(room.center, 0.7)) for corner in corners]))
     return [corners[(first + k) % 4] for k in range(4)]

@@ -11,7 +11,7 @@ from dpm2_core.sim.settings import GnssConfig
 
 ORIGIN = (49.0, 8.4, 110.0)
 """Position of every world: latitude and longitude, deg, altitude above the ellipsoid, m. Its x axis points east."""
-_OFFSET = 0.03  # s after the first scan: a fix is between two scans
+_FIRST_FIX = 0.03  # s after the first scan: a fix is between two scans
 
 
 class Receiver:
@@ -30,14 +30,14 @@ class Receiver:
 
     def times(self, end: float) -> Array:
         """(K,) s up to the end, at its rate."""
-        return np.arange(_OFFSET, end, 1 / self.config.rate)
+        return np.arange(_FIRST_FIX, end, 1 / self.config.rate)
 
     def measure(self, T_world_lidar: Array) -> Array:
         """(K, 3) latitude and longitude, deg, and altitude, m, for (K, 4, 4) poses at its times."""
         c, count = self.config, len(T_world_lidar)
         noise, wander = self._rng.standard_normal((2, count, 3)) * [1.0, 1.0, 2.0]
-        stays = np.exp(-1 / (c.rate * c.wander_time))
+        correlation = np.exp(-1 / (c.rate * c.wander_time))
         for k in range(1, count):  # Gauss-Markov: the same standard deviation at all times
-            wander[k] = stays * wander[k - 1] + np.sqrt(1 - stays**2) * wander[k]
+            wander[k] = correlation * wander[k - 1] + np.sqrt(1 - correlation**2) * wander[k]
         local = (T_world_lidar @ np.append(self.antenna, 1))[:, :3] + c.noise * noise + c.wander * wander
         return geodesy.geodetic(se3.transform(self.T_ecef_world, local))

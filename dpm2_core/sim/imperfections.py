@@ -14,11 +14,11 @@ from dpm2_core.sim.mesh import Float
 from dpm2_core.sim.settings import LidarConfig
 
 Bool = NDArray[np.bool_]
-_EDGE = (0.2, 1.5)
+_EDGE_GAP = (0.2, 1.5)
 """Two surfaces this far apart along the beam, m, can give a single return from between them."""
-_HALO = 2
+_GLARE_RADIUS = 2
 """Beams and columns next to a retro-reflector that its glare reaches."""
-_NEAR = 25.0
+_MAX_DROP_RANGE = 25.0
 """Drops farther away than this, m, return too little."""
 
 
@@ -67,19 +67,19 @@ class SensorErrors:
         self.config, self.settings = config, config.real
         self.ring, self.column = ring, column
         real, beams = config.real, config.beams
-        own = np.random.default_rng([real.serial, beams, 2])
-        self.range_bias = (real.range_bias * own.standard_normal(beams)).astype(np.float32)[ring]
-        self._angles = np.radians(real.angle_bias * own.standard_normal((2, beams))).astype(np.float32)
+        rng = np.random.default_rng([real.serial, beams, 2])
+        self.range_bias = (real.range_bias * rng.standard_normal(beams)).astype(np.float32)[ring]
+        self._angles = np.radians(real.angle_bias * rng.standard_normal((2, beams))).astype(np.float32)
         upper, lower = real.emitters
         self.origin_height = np.where(ring < beams // 2, upper, lower).astype(np.float32)
-        self.clear = self._window(own)[ring, column]
+        self.clear = self._window(rng)[ring, column]
 
-    def _window(self, own: np.random.Generator) -> Float:
+    def _window(self, rng: np.random.Generator) -> Float:
         """(beams, columns) fraction of the light that passes: spots of dirt, each some degrees wide."""
         shape = (self.config.beams, self.config.columns)
         if not self.settings.dirt:
             return np.ones(shape, np.float32)
-        spots = cv2.resize(own.standard_normal((6, 48)).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+        spots = cv2.resize(rng.standard_normal((6, 48)).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
         limit = np.quantile(spots, 1 - self.settings.dirt)
         return np.exp(-4 * np.maximum(spots - limit, 0) / max(float(spots.std()), 1e-6)).astype(np.float32)
 
@@ -123,29 +123,32 @@ class SensorErrors:
 
     def _mix_edges(self, distance: Float, back: Bool, chance: Float) -> None:
         """Move returns of pulses that hit two surfaces to between them."""
-        after = np.diff(distance, append=distance[-1:])
-        gap = np.abs(after)
+        difference = np.diff(distance, append=distance[-1:])
+        gap = np.abs(difference)
         step = 2 * np.pi / self.config.columns
-        both = back & np.append(back[1:], False) & np.append(self.ring[1:] == self.ring[:-1], False)
+        is_pair = back & np.append(back[1:], False) & np.append(self.ring[1:] == self.ring[:-1], False)
         share = min(0.5, self.settings.footprint / step)
-        mixed = both & (gap > _EDGE[0]) & (gap < _EDGE[1]) & (chance < share)
-        distance[mixed] += after[mixed] * (chance[mixed] / np.float32(share))
+        mixed = is_pair & (gap > _EDGE_GAP[0]) & (gap < _EDGE_GAP[1]) & (chance < share)
+        distance[mixed] += difference[mixed] * (chance[mixed] / np.float32(share))
 
     def _glare(self, distance: Float, intensity: Float, back: Bool, retro: Bool, chance: Float) -> Bool:
         """Make pulses next to a retro-reflector, with nothing nearer, return at its distance."""
-        seen = np.full((self.config.beams, self.config.columns), np.inf, np.float32)
-        shown = np.flatnonzero(retro & back)
-        seen[self.ring[shown], self.column[shown]] = distance[shown]
-        halo = cv2.erode(seen, np.ones((2 * _HALO + 1, 2 * _HALO + 1), np.uint8), borderValue=float("inf"))
-        at = halo[self.ring, self.column]
-        lit = np.isfinite(at) & ~retro & (chance < self.settings.glare) & (distance > at)
-        distance[lit], intensity[lit], back[lit] = at[lit], np.float32(0.3), True
-        return lit
+        retro_distance = np.full((self.config.beams, self.config.columns), np.inf, np.float32)
+        retro_returns = np.flatnonzero(retro & back)
+        retro_distance[self.ring[retro_returns], self.column[retro_returns]] = distance[retro_returns]
+        halo = cv2.erode(
+            retro_distance, np.ones((2 * _GLARE_RADIUS + 1, 2 * _GLARE_RADIUS + 1), np.uint8), borderValue=float("inf")
+        )
+        glare_distance = halo[self.ring, self.column]
+        is_glare = np.isfinite(glare_distance) & ~retro & (chance < self.settings.glare) & (distance > glare_distance)
+        distance[is_glare], intensity[is_glare], back[is_glare] = glare_distance[is_glare], np.float32(0.3), True
+        return is_glare
 
     def _drops(self, distance: Float, intensity: Float, back: Bool, chance: Float) -> Bool:
         """Rain, snow or dust: pulses that return from a drop before they reach a surface."""
         density = np.float32(self.settings.drops)
-        at = -np.log(np.maximum(chance, np.float32(1e-7))) / density  # m, for a constant density along the beam
-        hit = (at < np.minimum(distance, _NEAR)) & (at > self.config.min_range)
-        distance[hit], intensity[hit], back[hit] = at[hit], np.float32(0.02), True
+        # m, for a constant density along the beam
+        drop_distance = -np.log(np.maximum(chance, np.float32(1e-7))) / density
+        hit = (drop_distance < np.minimum(distance, _MAX_DROP_RANGE)) & (drop_distance > self.config.min_range)
+        distance[hit], intensity[hit], back[hit] = drop_distance[hit], np.float32(0.02), True
         return hit

@@ -15,7 +15,7 @@ from dpm2_core.sim.settings import ImuConfig
 GRAVITY = 9.81
 RATE = 100.0
 """Samples per second; each is the mean over two periods, which simulates the sensor's low-pass filter."""
-_YAW = 90.0  # deg to the left, of the mount: its axes differ from those of the LiDAR
+_MOUNT_YAW = 90.0  # deg to the left, of the mount: its axes differ from those of the LiDAR
 
 
 class Imu:
@@ -28,9 +28,9 @@ class Imu:
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
         """`rng` draws the sensor's errors, and then its noise."""
         self.config, self._rng = config, rng
-        self.R_lidar_imu: Array = Rotation.from_euler("z", _YAW, degrees=True).as_matrix()
-        off = Rotation.from_rotvec(np.radians(config.misaligned) * rng.standard_normal(3)).as_matrix()
-        self._R_imu_lidar = (self.R_lidar_imu @ off).T
+        self.R_lidar_imu: Array = Rotation.from_euler("z", _MOUNT_YAW, degrees=True).as_matrix()
+        R_misaligned = Rotation.from_rotvec(np.radians(config.misaligned) * rng.standard_normal(3)).as_matrix()
+        self._R_imu_lidar = (self.R_lidar_imu @ R_misaligned).T
         self._gyro_scale, self._force_scale = 1 + config.scale * rng.standard_normal((2, 3))
         self._gyro_bias = config.gyro_bias * rng.standard_normal(3)
         self._force_bias = config.acceleration_bias * rng.standard_normal(3)

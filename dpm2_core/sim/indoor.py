@@ -16,20 +16,20 @@ from dpm2_core.sim.mesh import Mesh, merge, placed, pose
 from dpm2_core.sim.shapes import box, rod
 from dpm2_core.sim.vehicles import car
 
-_WALL = 0.07
+_HALF_WALL = 0.07
 """Half of the thickness of a wall, m: the part on the side of each room."""
-_FREE = 0.55
+_PATH_CLEARANCE = 0.55
 """Smallest distance of everything but walls from the path, m."""
 _METAL = Surface(Label.OBJECT, Material.METAL, (120, 122, 126))
 
 
 class Interior:
-    """Draws the contents of the rooms of a plan; `meshes()` yields them. `way`: (K, 2) m, path that is kept free."""
+    """Draws the contents of the rooms of a plan; `meshes()` yields them. `path`: (K, 2) m, free of objects."""
 
-    def __init__(self, plan: FloorPlan, way: Array, rng: np.random.Generator) -> None:
-        self.plan, self.rng, self.way = plan, rng, cKDTree(way)
-        every = np.array([[*room.low, *room.high] for room in plan.rooms])
-        self.outside = (every[:, :2].min(0), every[:, 2:].max(0))
+    def __init__(self, plan: FloorPlan, path: Array, rng: np.random.Generator) -> None:
+        self.plan, self.rng, self.path = plan, rng, cKDTree(path)
+        bounds = np.array([[*room.low, *room.high] for room in plan.rooms])
+        self.outside = (bounds[:, :2].min(0), bounds[:, 2:].max(0))
 
     def meshes(self) -> Iterator[Mesh]:
         """All meshes."""
@@ -77,7 +77,7 @@ class Interior:
             glass = Surface(Label.BUILDING, Material.GLASS, (90, 110, 125))
             for start in np.arange(low, high - 1.2, self.rng.uniform(1.5, 3.0)):
                 openings.append((float(start), float(start) + 1.1, 0.9, min(room.height - 0.3, 2.2), glass))
-        inner = at + (_WALL if side == 0 else -_WALL)
+        inner = at + (_HALF_WALL if side == 0 else -_HALF_WALL)
         depth = (min(at, inner), max(at, inner))
 
         def piece(start: float, end: float, bottom: float, top: float, surface: Surface) -> Mesh:
@@ -109,7 +109,7 @@ class Interior:
         half, round_ = self.rng.uniform(0.15, 0.35), self.rng.random() < 0.4
         for x in np.arange(room.low[0] + spacing / 2, room.high[0] - 1, spacing):
             for y in np.arange(room.low[1] + spacing / 2, room.high[1] - 1, spacing):
-                if not self._is_free((x, y), half + _FREE):
+                if not self._is_free((x, y), half + _PATH_CLEARANCE):
                     continue
                 if round_:
                     yield rod((x, y, 0), (x, y, room.height), (half, half), 12, shaft)
@@ -122,7 +122,7 @@ class Interior:
         rise, run, width = self.rng.uniform(0.15, 0.19), self.rng.uniform(0.26, 0.3), 1.0
         axis = int(room.size[1] > room.size[0])
         for side in (0, 1):
-            at = room.low[1 - axis] + _WALL if side == 0 else room.high[1 - axis] - _WALL - width
+            at = room.low[1 - axis] + _HALF_WALL if side == 0 else room.high[1 - axis] - _HALF_WALL - width
             steps = []
             for k, start in enumerate(np.arange(room.low[axis] + 0.8, room.high[axis] - 0.8, run)):
                 low, high = np.zeros(3), np.zeros(3)
@@ -138,12 +138,12 @@ class Interior:
         for _ in range(rng.poisson(room.size.sum() / (6 if room.kind == "corridor" else 2.5))):
             axis, side = int(rng.integers(2)), int(rng.integers(2))
             along = 1 - axis
-            length, depth, bottom, top = _FLAT[int(rng.integers(len(_FLAT)))]
+            length, depth, bottom, top = _WALL_OBJECTS[int(rng.integers(len(_WALL_OBJECTS)))]
             length, depth = length * rng.uniform(0.7, 1.3), depth * rng.uniform(0.8, 1.2)
             if room.size[along] < length + 0.4 or top > room.height:
                 continue
             start = rng.uniform(room.low[along] + 0.1, room.high[along] - length - 0.1)
-            wall = room.low[axis] + _WALL if side == 0 else room.high[axis] - _WALL - depth
+            wall = room.low[axis] + _HALF_WALL if side == 0 else room.high[axis] - _HALF_WALL - depth
             low, high = np.zeros(3), np.zeros(3)
             low[[axis, along, 2]], high[[axis, along, 2]] = (wall, start, bottom), (wall + depth, start + length, top)
             blocks = any(d.axis == axis and d.start < start + length and d.end > start for d in self.plan.doors)
@@ -158,22 +158,22 @@ class Interior:
         rng = self.rng
         for _ in range(rng.poisson(room.size.prod() / 7)):
             at = rng.uniform(np.array(room.low) + 0.9, np.array(room.high) - 0.9)
-            if not self._is_free(at, 1.0 + _FREE):
+            if not self._is_free(at, 1.0 + _PATH_CLEARANCE):
                 continue
-            thing = _table(rng) if rng.random() < 0.6 else _box(rng)
-            yield placed(thing, pose(at, 0.0, rng.uniform(0, 6.3)), rng.integers(65536, size=1))
+            item = _table(rng) if rng.random() < 0.6 else _box(rng)
+            yield placed(item, pose(at, 0.0, rng.uniform(0, 6.3)), rng.integers(65536, size=1))
 
     def _deck(self, deck: Room) -> Iterator[Mesh]:
         """Rows of cars on both sides of the lanes, pillars between them, a pipe and beams below the ceiling."""
         rng = self.rng
         models = [car(rng) for _ in range(8)]
-        full, pitch = rng.uniform(0.4, 0.95), AISLE + ROW
+        occupancy, pitch = rng.uniform(0.4, 0.95), AISLE + ROW
         rows = np.concatenate([[-2.6], *([k * pitch + AISLE + 2.5, k * pitch + AISLE + ROW - 2.5] for k in range(8))])
         for y in rows[rows < deck.high[1] - 2]:
             for x in np.arange(deck.low[0] + AISLE + 6.5, deck.high[0] - AISLE - 6, 2.6):
-                if rng.random() < full and self._is_free((x, y), 3.2):
-                    turn = np.pi / 2 + np.pi * rng.integers(2) + rng.normal(0, 0.03)
-                    at = pose(np.array([x, y]) + rng.normal(0, 0.15, 2), 0.0, turn)
+                if rng.random() < occupancy and self._is_free((x, y), 3.2):
+                    yaw = np.pi / 2 + np.pi * rng.integers(2) + rng.normal(0, 0.03)
+                    at = pose(np.array([x, y]) + rng.normal(0, 0.15, 2), 0.0, yaw)
                     tint = rng.uniform(0.7, 1.2, (1, 3))
                     yield placed(models[int(rng.integers(8))], at, rng.integers(65536, size=1), tint)
         yield from self._pillars(deck, float(rng.uniform(5.5, 8.0)))
@@ -186,10 +186,10 @@ class Interior:
 
     def _is_free(self, xy: Array | tuple[float, float], radius: float) -> bool:
         """Whether the path is farther than `radius`, m, from a position (2,)."""
-        return float(self.way.query(np.asarray(xy, float))[0]) > radius
+        return float(self.path.query(np.asarray(xy, float))[0]) > radius
 
 
-_FLAT = (  # length, depth, bottom, top, m
+_WALL_OBJECTS = (  # length, depth, bottom, top, m
     (1.2, 0.45, 0.0, 1.9), (0.9, 0.35, 0.0, 1.1), (1.6, 0.3, 0.0, 2.1), (1.1, 0.1, 0.15, 0.75), (0.5, 0.03, 1.3, 1.9),
     (0.3, 0.14, 0.8, 1.3), (0.8, 0.04, 1.1, 1.8),
 )  # fmt: skip

@@ -48,28 +48,28 @@ class Layout:
         kerb = preset.sidewalk or 1.2
         kinds = self.rng.choice(len(FURNITURE), 14, p=[p for _, p in FURNITURE])
         furniture = [FURNITURE[k][0](self.rng) for k in kinds]
-        yield from self._scattered(furniture, preset.poles, (0.45, 0.9), 0.3, scale=None)
+        yield from self._scatter(furniture, preset.poles, (0.45, 0.9), 0.3, scale=None)
         trees = [plants.tree(self.rng) for _ in range(10)]
         distant = [plants.tree(self.rng, 0.4) for _ in range(10)]
         bushes = [plants.bush(self.rng) for _ in range(8)]
-        yield from self._scattered(trees, preset.trees, (0.7, kerb + 3), 0.7, scale=(0.7, 1.15))
-        yield from self._scattered(distant, preset.trees, (kerb + 4, kerb + 40), 0.7)
-        yield from self._scattered(distant, 12 * preset.forest, (5, 30), 0.7, patchy=True)
-        yield from self._scattered(bushes, 12 * preset.forest, (4, 16), 0.3, patchy=True)
-        yield from self._scattered(bushes, preset.bushes, (kerb + 0.8, kerb + 14), 0.5)
+        yield from self._scatter(trees, preset.trees, (0.7, kerb + 3), 0.7, scale=(0.7, 1.15))
+        yield from self._scatter(distant, preset.trees, (kerb + 4, kerb + 40), 0.7)
+        yield from self._scatter(distant, 12 * preset.forest, (5, 30), 0.7, patchy=True)
+        yield from self._scatter(bushes, 12 * preset.forest, (4, 16), 0.3, patchy=True)
+        yield from self._scatter(bushes, preset.bushes, (kerb + 0.8, kerb + 14), 0.5)
         clutter = [*furniture, *(street_box(self.rng) for _ in range(6)), *(car(self.rng) for _ in range(6))]
-        yield from self._scattered(clutter, preset.clutter, (kerb + 2.5, kerb + 22), 1.2)
+        yield from self._scatter(clutter, preset.clutter, (kerb + 2.5, kerb + 22), 1.2)
         tufts = [plants.tuft(self.rng) for _ in range(8)]
-        yield from self._scattered(tufts, 100 * preset.tufts, (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0)
+        yield from self._scatter(tufts, 100 * preset.tufts, (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0)
 
-    def _free(self, xy: Array) -> bool:
+    def _is_free(self, xy: Array) -> bool:
         return not self.taken[self.terrain.cell(xy)].any()
 
-    def _take(self, outline: ArrayLike) -> None:
+    def _occupy(self, outline: ArrayLike) -> None:
         corners = np.rint((np.asarray(outline) - self.terrain.origin) / RESOLUTION).astype(np.int32)
         cv2.fillConvexPoly(self.taken, corners, 1)
 
-    def _scattered(
+    def _scatter(
         self,
         templates: list[Mesh],
         per_100m: float,
@@ -85,35 +85,39 @@ class Layout:
         if per_100m <= 0:
             return
         terrain, rng = self.terrain, self.rng
-        reach = np.array([_reach(template) for template in templates])
+        extent = np.array([_lower_extent(template) for template in templates])
         for line in terrain.contour(0.5 * (band[0] + band[1])):
             n = rng.poisson(per_100m * len(line.xy) / 100)
-            at = rng.integers(0, len(line.xy), n)
+            picked = rng.integers(0, len(line.xy), n)
             if patchy:  # belts of about 40 m: half of the line, from a random wave
-                at = at[np.sin(at * rng.uniform(0.05, 0.12) + rng.uniform(0, 6.3)) > 0.2]
-            n = len(at)
+                picked = picked[np.sin(picked * rng.uniform(0.05, 0.12) + rng.uniform(0, 6.3)) > 0.2]
+            n = len(picked)
             if not n:
                 continue
-            xy = line.xy[at] + line.outward[at] * rng.uniform(-0.5, 0.5, (n, 1)) * (band[1] - band[0])
-            which = rng.integers(0, len(templates), n)
+            xy = line.xy[picked] + line.outward[picked] * rng.uniform(-0.5, 0.5, (n, 1)) * (band[1] - band[0])
+            kind = rng.integers(0, len(templates), n)
             size = np.ones(n) if scale is None else rng.uniform(*scale, n)
             keep = terrain.edge_at(xy) > band[0] - 0.25
-            keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + reach[which] * size
+            keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + extent[kind] * size
             row, column = terrain.cell(xy)
             keep &= self.taken[row, column] == 0
             if radius:
                 close = cKDTree(xy).query_pairs(2 * radius, output_type="ndarray")
                 keep[close[keep[close].all(1), 1]] = False
                 self.taken[row[keep], column[keep]] = 1
-            xy, at, which, size = xy[keep], at[keep], which[keep], size[keep]
+            xy, picked, kind, size = xy[keep], picked[keep], kind[keep], size[keep]
             yaw = rng.uniform(0, 2 * np.pi, len(xy))
             if scale is None:
-                yaw = np.arctan2(line.outward[at, 1], line.outward[at, 0]) - np.pi / 2 + rng.normal(0, 0.05, len(xy))
+                yaw = (
+                    np.arctan2(line.outward[picked, 1], line.outward[picked, 0])
+                    - np.pi / 2
+                    + rng.normal(0, 0.05, len(xy))
+                )
             tint = rng.uniform(0.8, 1.2, (len(xy), 1)) * rng.uniform(0.93, 1.07, (len(xy), 3))
             z = terrain.surface_at(xy)
             texture = rng.integers(0, 65536, len(xy))
             for k, template in enumerate(templates):
-                if (mine := which == k).any():
+                if (mine := kind == k).any():
                     yield placed(template, pose(xy[mine], z[mine], yaw[mine], size[mine]), texture[mine], tint[mine])
 
     def _parked(self, share: float) -> Iterator[Mesh]:
@@ -124,8 +128,8 @@ class Layout:
             while at < len(line.xy) - 6:
                 i, j = int(at + 2.5), int(at + 3.5)
                 at += rng.uniform(5.2, 6.5)
-                bend = np.abs(np.diff(line.outward[i - 2 : i + 4], axis=0)).sum()
-                if rng.random() > share or line.junction[max(i - 4, 0) : i + 8].any() or bend > 0.25:
+                curvature = np.abs(np.diff(line.outward[i - 2 : i + 4], axis=0)).sum()
+                if rng.random() > share or line.junction[max(i - 4, 0) : i + 8].any() or curvature > 0.25:
                     continue
                 if self.drive.query(line.xy[i])[0] < CLEAR_OF_DRIVE:
                     continue
@@ -165,11 +169,11 @@ class Layout:
         front = (line.xy[start] + line.xy[end]) / 2 + inward * self.rng.uniform(0, 2.0) * (level > 6)
         u, v = np.meshgrid(np.linspace(-0.5, 0.5, 9) * (width - 0.5), np.linspace(0.2, depth, 9))
         spots = front + u.reshape(-1, 1) * along + v.reshape(-1, 1) * inward
-        near = self.terrain.edge_at(spots).min() < min(level, self.preset.setback) * 0.7
-        if near or self.drive.query(spots)[0].min() < CLEAR_OF_DRIVE + 1 or not self._free(spots):
+        is_too_near = self.terrain.edge_at(spots).min() < min(level, self.preset.setback) * 0.7
+        if is_too_near or self.drive.query(spots)[0].min() < CLEAR_OF_DRIVE + 1 or not self._is_free(spots):
             return None
         outline = [front + a * width / 2 * along + b * inward for a, b in ((-1, 0), (1, 0), (1, depth), (-1, depth))]
-        self._take(outline)
+        self._occupy(outline)
         z = float(self.terrain.height_at(spots).mean())
         mesh = building(width, depth, floors, self.rng)
         return placed(mesh, pose(front, z, np.arctan2(along[1], along[0])), self.rng.integers(65536, size=1))
@@ -185,7 +189,7 @@ class Layout:
                 part = slice(at, min(at + run, len(line.xy)))
                 at += run + int(rng.integers(2, 6))
                 span = Kerbline(line.xy[part], line.outward[part], line.junction[part])
-                clear = self._free(span.xy) and (self.drive.query(span.xy)[0] > CLEAR_OF_DRIVE + 0.5).all()
+                clear = self._is_free(span.xy) and (self.drive.query(span.xy)[0] > CLEAR_OF_DRIVE + 0.5).all()
                 if rng.random() < share and clear:
                     self.taken[self.terrain.cell(span.xy)] = 1
                     yield from kinds[int(rng.choice(3, p=[0.45, 0.3, 0.25]))](span)
@@ -228,7 +232,7 @@ class Layout:
         yield placed(merge([*pickets, *rails]), poses, rng.integers(65536, size=len(poses)))
 
 
-def _reach(mesh: Mesh) -> float:
+def _lower_extent(mesh: Mesh) -> float:
     """Horizontal extent of the lower 3 m, m, which could touch a passing car or its sensor."""
     low = mesh.vertices[mesh.vertices[:, 2] < 3.0]
     return float(np.hypot(low[:, 0], low[:, 1]).max())

@@ -86,22 +86,22 @@ class Lidar:
         chance = rng.random((2, len(directions)), np.float32)
         jitter = rng.standard_normal((2, len(directions)), np.float32)
         draws = self.errors.draws(rng)
-        still = world.scene.cast(origins, directions, self.config.range)
-        returns = self._returns(world.static, still, directions, chance, jitter)
-        label = world.static.label[np.maximum(still.face, 0)].astype(np.uint32)
+        static_hits = world.scene.cast(origins, directions, self.config.range)
+        returns = self._returns(world.static, static_hits, directions, chance, jitter)
+        label = world.static.label[np.maximum(static_hits.face, 0)].astype(np.uint32)
         if not world.terrain.preset.degenerate:  # there the intensity would show the motion
-            self._paint(world, T_world_lidar, aim, returns, label)
-        twin = returns.copy()
-        self.errors.finish(twin, draws)
-        static = self._points(aim, twin, believed)
+            self._mark_lanes(world, T_world_lidar, aim, returns, label)
+        static_returns = returns.copy()
+        self.errors.finish(static_returns, draws)
+        static = self._points(aim, static_returns, believed)
         if dynamic_objects := world.traffic.dynamic_objects(time, T_world_lidar[:3, 3]):
-            one_eye = twist is None and not any(self.config.real.emitters)
-            hits, toward = dynamic_objects.cast(origins[0] if one_eye else origins, directions, self.config.range)
-            near = hits.distance < still.distance[toward]
-            hits, which = hits.part(near), toward[near]
+            single_origin = twist is None and not any(self.config.real.emitters)
+            hits, toward = dynamic_objects.cast(origins[0] if single_origin else origins, directions, self.config.range)
+            is_nearer = hits.distance < static_hits.distance[toward]
+            hits, which = hits.part(is_nearer), toward[is_nearer]
             mesh = dynamic_objects.scene.mesh
-            nearer = self._returns(mesh, hits, directions[which], chance[:, which], jitter[:, which], which)
-            returns.put(which, nearer)
+            moving_returns = self._returns(mesh, hits, directions[which], chance[:, which], jitter[:, which], which)
+            returns.put(which, moving_returns)
             number = dynamic_objects.number[hits.face].astype(np.uint32)
             label[which] = MOVING_LABEL[mesh.label[hits.face]] | number << 16
         stray = self.errors.finish(returns, draws)
@@ -121,16 +121,18 @@ class Lidar:
         if not self.config.real.skew:
             return self.scan(world, T_world_lidar, time, rng)
         twist = world.drive_twist(time, self.config.height, self.config.real.sway)
-        own = (twist.reshape(2, 3) @ self.T_level_lidar[:3, :3]).ravel()
-        return self.scan(world, T_world_lidar, time, rng, own, own * (1 + self.config.real.skew * rng.normal()))
+        sensor_twist = (twist.reshape(2, 3) @ self.T_level_lidar[:3, :3]).ravel()
+        return self.scan(
+            world, T_world_lidar, time, rng, sensor_twist, sensor_twist * (1 + self.config.real.skew * rng.normal())
+        )
 
-    def _paint(
+    def _mark_lanes(
         self, world: World, T_world_lidar: Array, aim: Float, returns: Returns, label: NDArray[np.uint32]
     ) -> None:
         """Brighten and label the returns from lane markings, in place."""
         road = np.flatnonzero(returns.back & (label == Label.ROAD))
-        at = aim[road] * returns.distance[road, None]
-        xy = at @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
+        points = aim[road] * returns.distance[road, None]
+        xy = points @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
         footprint = np.full(len(xy), 0.03, np.float32)
         painted = road[road_marking(*world.terrain.lane_coordinates(xy), footprint, world.terrain) > 0.5]
         label[painted] = Label.MARKING
@@ -184,9 +186,9 @@ class Lidar:
         strength *= self.errors.clear[which]
         # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once per quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
-        gone = panel < MISS[material] if real.panes else MISS[material] * 2 * panel
-        lost = config.dropout + gone + np.exp(-strength / np.float32(0.006 * (1 + real.weak)))
-        back = (hits.face >= 0) & (chance[0] > lost)
+        absorbed = panel < MISS[material] if real.panes else MISS[material] * 2 * panel
+        loss = config.dropout + absorbed + np.exp(-strength / np.float32(0.006 * (1 + real.weak)))
+        back = (hits.face >= 0) & (chance[0] > loss)
         sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
         if real.growth or real.footprint:
             sigma = np.hypot(sigma, self.errors.noise(distance, cosine))

@@ -23,7 +23,7 @@ class Light:
     def __init__(self, seed: int, tunnel: bool) -> None:
         rng = np.random.default_rng([seed, 78])
         elevation, azimuth = np.radians(rng.uniform(22, 60)), rng.uniform(0, 2 * np.pi)
-        self.sun = _towards(elevation, azimuth)
+        self.sun = _direction(elevation, azimuth)
         self.overcast = float(rng.beta(0.5, 1.2))
         warm = np.array([1.0, 0.95, 0.86], np.float32)
         self.direct = warm * np.float32(2.1 * (1 - 0.9 * self.overcast))
@@ -39,7 +39,7 @@ class Light:
         out = copy.copy(self)
         elevation = np.clip(np.arcsin(self.sun[2]) - np.radians(5 * hours), np.radians(8), np.radians(75))
         azimuth = np.arctan2(self.sun[1], self.sun[0]) - np.radians(15 * hours)
-        out.sun = _towards(elevation, azimuth)
+        out.sun = _direction(elevation, azimuth)
         return out
 
     def sky(self, view: Float) -> Float:
@@ -68,7 +68,7 @@ class Light:
         return facing[:, None] * self.direct + open_sky[:, None] * self.ambient
 
 
-def _towards(elevation: float, azimuth: float) -> Float:
+def _direction(elevation: float, azimuth: float) -> Float:
     """(3,) unit vector in a direction; both angles in rad."""
     level = np.cos(elevation)
     return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], np.float32)

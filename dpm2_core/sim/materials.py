@@ -37,8 +37,8 @@ class Label(IntEnum):
 
 MOVING_LABEL = np.arange(100, dtype=np.uint32)
 """(100,) SemanticKITTI id of a class when it moves: 10 becomes 252."""
-for _still, _moving in {10: 252, 18: 258, 30: 254, 31: 253}.items():
-    MOVING_LABEL[_still] = _moving
+for _static_id, _moving_id in {10: 252, 18: 258, 30: 254, 31: 253}.items():
+    MOVING_LABEL[_static_id] = _moving_id
 
 
 class Material(IntEnum):

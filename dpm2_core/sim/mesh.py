@@ -61,9 +61,9 @@ def make(
     return Mesh(
         vertices,
         faces,
-        _bytes(label, (n,)),
-        _bytes(material, (n,)),
-        _bytes(color, (n, 3)),
+        _filled_bytes(label, (n,)),
+        _filled_bytes(material, (n,)),
+        _filled_bytes(color, (n, 3)),
         _box_uv(vertices[faces]) if uv is None else np.asarray(uv, np.float32),
         np.zeros(n, np.uint16),
     )
@@ -73,21 +73,21 @@ def make(
 # for building it.
 
 
-def _bytes(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _filled_bytes(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     out = np.empty(shape, np.uint8)
     out[...] = np.asarray(values, np.uint8)
     return out
 
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-_ACROSS = np.array([[1, 2], [0, 2], [0, 1]])  # the two other axes of each axis
+_OTHER_AXES = np.array([[1, 2], [0, 2], [0, 1]])  # the two other axes of each axis
 _CORNER = np.arange(3)[:, None]
 
 
 def _box_uv(corners: Float) -> Float:
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.abs(a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT])
-    axes = _ACROSS[normal.argmax(-1)]
+    axes = _OTHER_AXES[normal.argmax(-1)]
     return corners[np.arange(len(corners))[:, None, None], _CORNER, axes[:, None, :]]
 
 
@@ -192,6 +192,6 @@ class Scene:
         """Rays from (R, 3) origins along (R, 3) directions (unit length), up to `reach` m; both float32."""
         out = self._scene.run(origins, directions, query="INTERSECT", output=True)
         face, distance = out["primID"], out["tfar"]
-        lost = (face < 0) | (distance > reach)
-        face[lost], distance[lost] = -1, np.inf
+        missed = (face < 0) | (distance > reach)
+        face[missed], distance[missed] = -1, np.inf
         return Hits(distance, face, out["Ng"], out["u"], out["v"])

@@ -107,7 +107,7 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
         return _indoors(kind, preset, rng, length)
     if kind not in ROAD_KINDS:
         return _road_of_poses(FilePath(kind), preset, rng)
-    center = _center(kind, preset, rng, length)
+    center = _center_line(kind, preset, rng, length)
     drive = center.shifted(-preset.lane)
     start = 0.0 if center.closed else min(MARGIN, drive.length / 4)
     times, travelled = _progress(drive, preset.speed, start)
@@ -129,13 +129,13 @@ MARGIN = 110.0
 """Length of road behind the start and beyond the end of an open drive, m: beyond the LiDAR's range."""
 
 
-def _center(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
+def _center_line(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Path:
     if kind == "random":
         if preset.degenerate:
             kind = "arc"
         else:
             kind = str(rng.choice(["loop", "blob", "wave", "figure8"], p=[0.35, 0.25, 0.3, 0.1]))
-    turn = rng.uniform(0, 2 * np.pi)
+    rotation = rng.uniform(0, 2 * np.pi)
     t = np.linspace(0, 1, 1024, endpoint=False)
     if kind == "straight":
         xy = np.stack([np.linspace(-MARGIN, length + MARGIN, 1024), np.zeros(1024)], -1)
@@ -167,7 +167,7 @@ def _center(kind: str, preset: Preset, rng: np.random.Generator, length: float) 
         shape = Path(shape.xy[:-1] * length / shape.length, True)
         path = Path(_smooth(shape.xy[:-1], float(np.clip(length / 11, 4.0, 12.0)), True), True)
         xy = path.xy[:-1] * length / path.length
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    R = np.array([[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]])
     return Path(xy @ R.T, closed)
 
 
@@ -186,18 +186,18 @@ def _progress(path: Path, speed: float, start: float) -> tuple[Array, Array]:
     laps = 3 if path.closed else 1  # the middle lap of three is periodic
     curvature = np.abs(np.gradient(path.yaw, path.s))
     curvature = np.maximum(gaussian_filter1d(curvature, 4, mode="wrap" if path.closed else "nearest"), 1e-4)
-    pace = speed * (1 + 0.08 * np.sin(2 * np.pi * path.s / path.length * max(1, round(path.length / 90))))
-    square = np.tile(np.minimum(pace**2, 4.0 / curvature)[: -1 if path.closed else None], laps)
-    s = np.arange(len(square)) * (path.s[1] - path.s[0])
-    slope = 2 * 1.5 * s
-    square = np.minimum(np.minimum.accumulate(square - slope) + slope, square)
-    square = np.minimum((np.minimum.accumulate((square + slope)[::-1])[::-1]) - slope, square)
+    speeds = speed * (1 + 0.08 * np.sin(2 * np.pi * path.s / path.length * max(1, round(path.length / 90))))
+    speed_squared = np.tile(np.minimum(speeds**2, 4.0 / curvature)[: -1 if path.closed else None], laps)
+    s = np.arange(len(speed_squared)) * (path.s[1] - path.s[0])
+    ramp = 2 * 1.5 * s
+    speed_squared = np.minimum(np.minimum.accumulate(speed_squared - ramp) + ramp, speed_squared)
+    speed_squared = np.minimum((np.minimum.accumulate((speed_squared + ramp)[::-1])[::-1]) - ramp, speed_squared)
     if path.closed:
-        n = len(square) // 3
-        square = np.concatenate([square[n : 2 * n], square[n : n + 1]])
-    pace = np.sqrt(square)
+        n = len(speed_squared) // 3
+        speed_squared = np.concatenate([speed_squared[n : 2 * n], speed_squared[n : n + 1]])
+    speeds = np.sqrt(speed_squared)
     first = int(np.searchsorted(path.s, start))
-    times = np.concatenate([[0.0], np.cumsum(np.diff(path.s[first:]) * 2 / (pace[first:-1] + pace[first + 1 :]))])
+    times = np.concatenate([[0.0], np.cumsum(np.diff(path.s[first:]) * 2 / (speeds[first:-1] + speeds[first + 1 :]))])
     return times, path.s[first:]
 
 
@@ -213,10 +213,10 @@ def _side_streets(streets: list[Path], preset: Preset, rng: np.random.Generator)
                 heading = yaw + side * np.pi / 2 + rng.normal(0, 0.12)
                 reach = np.arange(0, rng.uniform(45, 110), STEP)
                 xy = foot + reach[:, None] * np.array([np.cos(heading), np.sin(heading)])
-                met = np.flatnonzero((reach > 25) & (tree.query(xy)[0] < STEP))
-                xy = xy[: met[0] + 1] if len(met) else xy
+                meetings = np.flatnonzero((reach > 25) & (tree.query(xy)[0] < STEP))
+                xy = xy[: meetings[0] + 1] if len(meetings) else xy
                 clear = tree.query(xy[reach[: len(xy)] > 18])[0] > 14
-                if clear.all() or len(met):
+                if clear.all() or len(meetings):
                     found.append(Path(xy))
             s += rng.exponential(100 / preset.side_streets) + 22
     return found
@@ -237,24 +237,24 @@ def read_drive(path: FilePath) -> Array:
 
 def _road_of_poses(file: FilePath, preset: Preset, rng: np.random.Generator) -> Road:
     position = read_drive(file)
-    moved = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
-    if moved.sum() < 20:
-        raise UsageError(f"--road {file}: a drive of {moved.sum():.0f} m; want at least 20 m")
+    steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
+    if steps.sum() < 20:
+        raise UsageError(f"--road {file}: a drive of {steps.sum():.0f} m; want at least 20 m")
     # At standstill the heading is noise: the path leaves these frames out, the progress keeps them.
-    keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(moved) / STEP)) > 0, [True]])
+    keep = np.concatenate([[True], np.diff(np.floor(np.cumsum(steps) / STEP)) > 0, [True]])
     raw = Path(position[keep, :2])
     smooth = _smooth(raw.xy, 2.0, False)
     drive = Path(smooth)
-    at = arc_lengths(position[:, :2])
-    on_raw = np.interp(at, at[keep], arc_lengths(position[keep, :2]))
-    travelled: Array = np.interp(on_raw, raw.s, arc_lengths(smooth))
+    arc = arc_lengths(position[:, :2])
+    raw_arc = np.interp(arc, arc[keep], arc_lengths(position[keep, :2]))
+    travelled: Array = np.interp(raw_arc, raw.s, arc_lengths(smooth))
     center = drive.shifted(preset.lane)
     z = gaussian_filter1d(np.interp(drive.s, travelled, position[:, 2]), 4)
     z = np.interp(np.linspace(0, 1, len(center.xy)), np.linspace(0, 1, len(z)), z)
     n = int(MARGIN / STEP)
-    beyond = np.arange(1, n + 1)[:, None] * STEP
+    margin = np.arange(1, n + 1)[:, None] * STEP
     heading = np.stack([np.cos(center.yaw[[0, -1]]), np.sin(center.yaw[[0, -1]])], -1)
-    xy = np.concatenate([center.xy[0] - beyond[::-1] * heading[0], center.xy, center.xy[-1] + beyond * heading[1]])
+    xy = np.concatenate([center.xy[0] - margin[::-1] * heading[0], center.xy, center.xy[-1] + margin * heading[1]])
     z = np.pad(z, n, mode="edge")
     pieces = list(_first_visits(xy))
     streets = [Path(xy[a:b]) for a, b in pieces]
@@ -272,7 +272,7 @@ def _first_visits(xy: Array) -> Iterator[tuple[int, int]]:
     """Runs [a, b) of samples that do not return to within 5 m of a position passed more than 30 m earlier."""
     pairs = cKDTree(xy).query_pairs(5.0, output_type="ndarray")
     pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 30.0 / STEP]
-    new = np.ones(len(xy), bool)
-    new[pairs.max(1)] = False
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], new.astype(np.int8), [0]])))
+    is_first = np.ones(len(xy), bool)
+    is_first[pairs.max(1)] = False
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_first.astype(np.int8), [0]])))
     return ((int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a > 3)

@@ -34,8 +34,8 @@ def clear(meshes: Iterable[Mesh], road: Road, terrain: Terrain) -> Iterator[Mesh
     for mesh in meshes:
         xy = mesh.vertices[:, :2]
         low = mesh.vertices[:, 2] < terrain.height_at(xy) + 3
-        barring = low & (drive.query(xy, distance_upper_bound=1.5)[0] < 1.5)
-        yield mesh.part(~barring[mesh.faces].any(1))
+        blocks_drive = low & (drive.query(xy, distance_upper_bound=1.5)[0] < 1.5)
+        yield mesh.part(~blocks_drive[mesh.faces].any(1))
 
 
 def highway(road: Road, terrain: Terrain, rng: np.random.Generator) -> Iterator[Mesh]:
@@ -59,12 +59,12 @@ def highway(road: Road, terrain: Terrain, rng: np.random.Generator) -> Iterator[
         xy = line.xy[at] + line.outward[at] * rng.uniform(0, 25, (len(at), 1))
         xy = xy[terrain.edge_at(xy) > 10]  # not between two arms of a road
         for k, tree in enumerate(trees):
-            mine = xy[k :: len(trees)]
-            if len(mine):
-                n = len(mine)
+            positions = xy[k :: len(trees)]
+            if len(positions):
+                n = len(positions)
                 yield placed(
                     tree,
-                    pose(mine, terrain.height_at(mine), rng.uniform(0, 6.3, n), rng.uniform(0.9, 1.5, n)),
+                    pose(positions, terrain.height_at(positions), rng.uniform(0, 6.3, n), rng.uniform(0.9, 1.5, n)),
                     rng.integers(65536, size=n),
                 )
 

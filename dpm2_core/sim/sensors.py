@@ -7,7 +7,7 @@ import numpy as np
 
 from dpm2_core.sim.settings import HDL64E, Imperfections, LidarConfig
 
-_SPREAD = ("uneven", "angle_bias", "range_bias", "growth", "footprint", "skew")
+_SCALED_ERRORS = ("uneven", "angle_bias", "range_bias", "growth", "footprint", "skew")
 
 
 def real_sensor(clean: LidarConfig) -> LidarConfig:
@@ -19,14 +19,14 @@ def real_sensor(clean: LidarConfig) -> LidarConfig:
 
 def drawn_sensor(usual: LidarConfig, real: float, others: float, rng: np.random.Generator) -> LidarConfig:
     """A world's LiDAR: with probability `others` not the usual one, with probability `real` with real errors."""
-    config = _other(usual, rng) if rng.random() < others else usual
+    config = _random_sensor(usual, rng) if rng.random() < others else usual
     if rng.random() >= real:
         return config
-    noise, dropout = HDL64E.noise * _factor(rng), HDL64E.dropout * _factor(rng)
-    return config.model_copy(update={"noise": noise, "dropout": dropout, "real": _errors(config, rng)})
+    noise, dropout = HDL64E.noise * _random_factor(rng), HDL64E.dropout * _random_factor(rng)
+    return config.model_copy(update={"noise": noise, "dropout": dropout, "real": _random_errors(config, rng)})
 
 
-def _other(usual: LidarConfig, rng: np.random.Generator) -> LidarConfig:
+def _random_sensor(usual: LidarConfig, rng: np.random.Generator) -> LidarConfig:
     """16 to 128 beams or a rosette, 0.4 to 3 m high, one in three tilted by up to 20 deg."""
     beams, columns = [(16, 1810), (32, 1810), (64, 1448), (128, 1024), (16, 1500)][kind := int(rng.integers(5))]
     height = float(np.exp(rng.uniform(np.log(0.4), np.log(3.0))))
@@ -40,10 +40,10 @@ def _other(usual: LidarConfig, rng: np.random.Generator) -> LidarConfig:
     )  # fmt: skip
 
 
-def _errors(config: LidarConfig, rng: np.random.Generator) -> Imperfections:
+def _random_errors(config: LidarConfig, rng: np.random.Generator) -> Imperfections:
     """Errors of the HDL-64E, half to twice as large; one in six in rain or dust, one in six behind a dirty window."""
     usual = real_sensor(config).real
-    changes = {name: getattr(usual, name) * _factor(rng) for name in _SPREAD}
+    changes = {name: getattr(usual, name) * _random_factor(rng) for name in _SCALED_ERRORS}
     changes |= {
         "serial": int(rng.integers(2**31)),
         "weak": float(rng.uniform(0, 3)), "sway": float(rng.uniform(0.4, 3)), "glare": float(rng.uniform(0, 0.5)),
@@ -53,5 +53,5 @@ def _errors(config: LidarConfig, rng: np.random.Generator) -> Imperfections:
     return usual.model_copy(update=changes)
 
 
-def _factor(rng: np.random.Generator) -> float:
+def _random_factor(rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(-np.log(2), np.log(2))))

@@ -250,15 +250,15 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
         return preset
     if preset.degenerate:
         return preset.model_copy(update={"traffic": preset.traffic * rng.uniform(0.3, 1.7)})
-    own = {name: getattr(preset, name) * rng.uniform(0.3, 1.6) for name in _DENSITIES}
-    own |= {name: min(own[name], 0.95) for name in ("buildings", "boundaries", "parked")}
+    values = {name: getattr(preset, name) * rng.uniform(0.3, 1.6) for name in _DENSITIES}
+    values |= {name: min(values[name], 0.95) for name in ("buildings", "boundaries", "parked")}
     half_width = preset.half_width * rng.uniform(0.65, 1.25)
     sidewalk = preset.sidewalk * rng.uniform(0.6, 1.5)
-    own |= {"half_width": half_width, "sidewalk": sidewalk}
+    values |= {"half_width": half_width, "sidewalk": sidewalk}
     # past the parked cars; in the middle of a narrow street
-    own["lane"] = float(np.clip(half_width - (3.0 if preset.parked else 1.7), 0.3, 1.8))
-    own["setback"] = max(preset.setback * rng.uniform(0.5, 1.5), sidewalk + 0.5)
-    return preset.model_copy(update=own)
+    values["lane"] = float(np.clip(half_width - (3.0 if preset.parked else 1.7), 0.3, 1.8))
+    values["setback"] = max(preset.setback * rng.uniform(0.5, 1.5), sidewalk + 0.5)
+    return preset.model_copy(update=values)
 
 
 def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:

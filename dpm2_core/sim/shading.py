@@ -80,10 +80,10 @@ class Textures:
         out = surface.color * (1 + strength * shade)[:, None]
         out *= 1 + np.float32(0.05) * strength[:, None] * self.noise(uv + 101, 2.9, 3)
         for material, paint in _PAINTERS.items():
-            which = np.flatnonzero(surface.material == material)
-            if len(which):
-                part = surface.part(which)
-                out[which] = paint(self, part, out[which], uv[which], terrain)
+            indices = np.flatnonzero(surface.material == material)
+            if len(indices):
+                part = surface.part(indices)
+                out[indices] = paint(self, part, out[indices], uv[indices], terrain)
         return out.clip(0.01, 1, out=out)
 
 
@@ -103,31 +103,31 @@ def _hash(*keys: Int) -> NDArray[np.uint32]:
     return h ^ (h >> np.uint32(13))
 
 
-def _unit(h: NDArray[np.uint32], k: int = 0) -> Float:
+def _unit_interval(h: NDArray[np.uint32], k: int = 0) -> Float:
     """0..1 from bits of a hash; k = 0, 1, 2 give different numbers."""
     return ((h >> np.uint32(10 * k)) & np.uint32(1023)).astype(np.float32) / np.float32(1023)
 
 
-def _vivid(h: NDArray[np.uint32]) -> Float:
+def _vivid_color(h: NDArray[np.uint32]) -> Float:
     """(P, 3) saturated colors from a hash."""
-    hue = _unit(h, 0)[:, None] * 6
+    hue = _unit_interval(h, 0)[:, None] * 6
     rgb = np.clip(np.abs(np.remainder(hue + np.array([0, 4, 2], np.float32), 6) - 3) - 1, 0, 1)
-    return (0.15 + 0.8 * _unit(h, 1)[:, None]) * (0.25 + 0.75 * rgb)
+    return (0.15 + 0.8 * _unit_interval(h, 1)[:, None]) * (0.25 + 0.75 * rgb)
 
 
 def _lines(at: Float, spacing: float, width: float, footprint: Float) -> Float:
     """(P,) fraction of a pixel covered by lines that are `spacing` m apart and `width` m wide."""
-    soft = np.maximum(footprint, 0.25 * width)
+    blur = np.maximum(footprint, 0.25 * width)
     distance = np.abs(np.remainder(at + 0.5 * spacing, spacing) - 0.5 * spacing)
-    inside = np.clip((0.5 * width - distance) / soft + 0.5, 0, 1)
-    return inside * np.minimum(1, width / soft) if width < 0.2 else inside
+    inside = np.clip((0.5 * width - distance) / blur + 0.5, 0, 1)
+    return inside * np.minimum(1, width / blur) if width < 0.2 else inside
 
 
 def _asphalt(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrain) -> Float:
     lateral, along, crossing = terrain.lane_coordinates(s.position[:, :2])
     # repairs: rectangles of another mix; cracks: the zero crossings of a slowly varying noise
     h = _hash(np.floor(along / 3.1), np.floor(lateral / 1.7), s.texture)
-    out = out * (0.82 + 0.3 * _unit(h))[:, None] ** (_unit(h, 1) < 0.22)[:, None]
+    out = out * (0.82 + 0.3 * _unit_interval(h))[:, None] ** (_unit_interval(h, 1) < 0.22)[:, None]
     crack = np.abs(t.noise(uv + 5, 2.3) + 0.4 * t.noise(uv + 9, 0.4)) < 0.05
     out = out * np.where(crack & (t.noise(uv + 19, 15.0) > 0.2), 0.6, 1.0).astype(np.float32)[:, None]
     worn = np.clip(0.85 + 0.3 * t.noise(uv + 23, 0.35), 0, 1) * t.marking
@@ -141,11 +141,11 @@ def road_marking(
     """(P,) 0..1 how much paint is at lane coordinates (P,) each: edge lines, a dashed center line, some arrows."""
     preset = terrain.preset
     half = preset.half_width
-    soft = np.maximum(footprint, 0.02)
+    blur = np.maximum(footprint, 0.02)
 
     def line(offset: float, width: float) -> Float:
-        return np.clip((width / 2 - np.abs(lateral - offset)) / soft + 0.5, 0, 1).astype(np.float32) * np.minimum(
-            1, width / soft
+        return np.clip((width / 2 - np.abs(lateral - offset)) / blur + 0.5, 0, 1).astype(np.float32) * np.minimum(
+            1, width / blur
         )
 
     dash = (np.remainder(along, 9.0) < 4.0).astype(np.float32)
@@ -160,15 +160,15 @@ def road_marking(
     # an arrow, a bar or a patch of text in some of the 14 m long slots of each lane
     slot = _hash(np.floor(along / 14.3), (lateral > 0).astype(np.int64))
     u, v = np.remainder(along, 14.3), np.abs(lateral) - preset.lane
-    symbol = (_unit(slot) < 0.22) & (u < 3.2) & (np.abs(v) < np.where(u > 2.0, 0.5 * (3.2 - u) / 1.2, 0.09))
-    bar = (_unit(slot, 1) < 0.05) & (u > 8) & (u < 8.4) & (np.abs(lateral) < half - 0.5)
+    symbol = (_unit_interval(slot) < 0.22) & (u < 3.2) & (np.abs(v) < np.where(u > 2.0, 0.5 * (3.2 - u) / 1.2, 0.09))
+    bar = (_unit_interval(slot, 1) < 0.05) & (u > 8) & (u < 8.4) & (np.abs(lateral) < half - 0.5)
     return np.where(crossing, 0, np.minimum(paint + symbol + bar, 1)).astype(np.float32)
 
 
 def _paving(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
     grid = np.maximum(_lines(uv[:, 0], 0.5, 0.02, s.footprint), _lines(uv[:, 1], 0.5, 0.02, s.footprint))
     h = _hash(np.floor(uv[:, 0] * 2), np.floor(uv[:, 1] * 2), s.texture)
-    return out * ((1 - 0.4 * grid) * (0.9 + 0.2 * _unit(h)))[:, None]
+    return out * ((1 - 0.4 * grid) * (0.9 + 0.2 * _unit_interval(h)))[:, None]
 
 
 def _grass(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:
@@ -184,8 +184,8 @@ def _plaster(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -
     # posters and graffiti within reach of a hand
     h = _hash(np.floor(uv[:, 0] / 1.9), np.floor(uv[:, 1] / 1.3), s.texture)
     low = (np.abs(s.normal[:, 2]) < 0.5) & (s.uv[:, 1] < 2.6)
-    tag = low & (_unit(h, 2) < t.gaudy) & (t.noise(uv + 61, 0.8) > -0.1)
-    return np.where(tag[:, None], _vivid(h), out)
+    is_graffiti = low & (_unit_interval(h, 2) < t.gaudy) & (t.noise(uv + 61, 0.8) > -0.1)
+    return np.where(is_graffiti[:, None], _vivid_color(h), out)
 
 
 def _brick(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrain) -> Float:
@@ -194,7 +194,7 @@ def _brick(t: Textures, s: VisiblePoints, out: Float, uv: Float, terrain: Terrai
     mortar = np.maximum(_lines(uv[:, 1], 0.075, 0.012, s.footprint), _lines(uv[:, 0] + shift, 0.24, 0.012, s.footprint))
     fine = np.minimum(0.2 / s.footprint, 1)
     h = _hash(course, np.floor((uv[:, 0] + shift) / 0.24))
-    out = out * (1 + fine * 0.35 * (_unit(h) - 0.5))[:, None]
+    out = out * (1 + fine * 0.35 * (_unit_interval(h) - 0.5))[:, None]
     return _plaster(t, s, out * (1 - mortar[:, None]) + 0.33 * mortar[:, None], uv, terrain)
 
 
@@ -214,16 +214,16 @@ def _panels(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) ->
     along, up = s.uv[:, 0], s.uv[:, 1]
     along = along + 0.9 * np.sin(along / 3.7) + 1.3 * np.sin(along / 6.1 + 1) + 2.1 * np.sin(along / 17.3 + 2)
     h = _hash(np.floor(along / 2.5), np.floor(up / 1.35), s.texture)
-    hue = (_unit(h, 1) - 0.5)[:, None] * np.array([0.22, 0, -0.22], np.float32)
-    out = out * (0.6 + 0.65 * _unit(h))[:, None] * (1 + hue)
+    hue = (_unit_interval(h, 1) - 0.5)[:, None] * np.array([0.22, 0, -0.22], np.float32)
+    out = out * (0.6 + 0.65 * _unit_interval(h))[:, None] * (1 + hue)
     seam: Float = np.maximum(_lines(along, 2.5, 0.03, s.footprint), _lines(up, 1.35, 0.03, s.footprint))
     out = out * (1 - 0.5 * seam)[:, None]
     dirt: Float = np.clip(t.noise(uv * np.array([1, 0.2], np.float32) + 43, 0.9) + 0.8 * t.noise(uv + 47, 5.3), 0, 2.5)
     out = out * (1 - 0.22 * dirt)[:, None]
     patch = _hash(np.floor((along + 0.9 * t.noise(uv, 3.7)) / 3.3), np.floor(up / 1.1))
     letters = np.abs(t.noise(uv + 83, 1.1)) + 0.35 * t.noise(uv + 89, 0.35) < 0.55
-    tag = (_unit(patch, 2) < 0.10 + t.gaudy) & letters
-    return np.where(tag[:, None], _vivid(_hash(patch, np.floor(t.noise(uv + 53, 0.9) * 1.5))), out)
+    is_graffiti = (_unit_interval(patch, 2) < 0.10 + t.gaudy) & letters
+    return np.where(is_graffiti[:, None], _vivid_color(_hash(patch, np.floor(t.noise(uv + 53, 0.9) * 1.5))), out)
 
 
 def _glass(t: Textures, s: VisiblePoints, out: Float, uv: Float, _: Terrain) -> Float:

@@ -102,20 +102,20 @@ def relief(x: ArrayLike, z: ArrayLike, depth: ArrayLike, material: ArrayLike, co
     d = depth.ravel()
     front = _quads(x[i], d, z[j], x[i + 1], d, z[j], x[i + 1], d, z[j + 1], x[i], d, z[j + 1])
     quads, materials, colors = [front], [material.reshape(-1)], [color.reshape(-1, 3)]
-    ring = np.zeros((depth.shape[0] + 2, depth.shape[1]))  # jambs; at the ends down to the plane
-    ring[1:-1] = depth
-    i, j = np.nonzero(ring[1:] - ring[:-1])
-    near, far = ring[i, j], ring[i + 1, j]
+    padded = np.zeros((depth.shape[0] + 2, depth.shape[1]))  # jambs; at the ends down to the plane
+    padded[1:-1] = depth
+    i, j = np.nonzero(padded[1:] - padded[:-1])
+    near, far = padded[i, j], padded[i + 1, j]
     quads.append(_quads(x[i], near, z[j], x[i], far, z[j], x[i], far, z[j + 1], x[i], near, z[j + 1]))
-    shallow = np.where(ring[i, j] < ring[i + 1, j], np.maximum(i - 1, 0), np.minimum(i, len(depth) - 1))
+    shallow = np.where(padded[i, j] < padded[i + 1, j], np.maximum(i - 1, 0), np.minimum(i, len(depth) - 1))
     materials.append(np.full(len(i), Material.PLASTER))
     colors.append(color[shallow, j])
-    ring = np.zeros((depth.shape[0], depth.shape[1] + 2))  # sills and lintels
-    ring[:, 1:-1] = depth
-    i, j = np.nonzero(ring[:, 1:] - ring[:, :-1])
-    near, far = ring[i, j], ring[i, j + 1]
+    padded = np.zeros((depth.shape[0], depth.shape[1] + 2))  # sills and lintels
+    padded[:, 1:-1] = depth
+    i, j = np.nonzero(padded[:, 1:] - padded[:, :-1])
+    near, far = padded[i, j], padded[i, j + 1]
     quads.append(_quads(x[i], near, z[j], x[i + 1], near, z[j], x[i + 1], far, z[j], x[i], far, z[j]))
-    shallow = np.where(ring[i, j] < ring[i, j + 1], np.maximum(j - 1, 0), np.minimum(j, depth.shape[1] - 1))
+    shallow = np.where(padded[i, j] < padded[i, j + 1], np.maximum(j - 1, 0), np.minimum(j, depth.shape[1] - 1))
     materials.append(np.full(len(i), Material.CONCRETE))
     colors.append(color[i, shallow])
     points = np.concatenate(quads).reshape(-1, 3)

@@ -21,14 +21,14 @@ from dpm2_core.sim.road import Road
 from dpm2_core.sim.settings import ImuConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
 
-_STREAM, _IMU_STREAM = 12, 13  # of random numbers, different from those of the other parts of a world
-_STEP = 0.01  # s between two poses of a robot, with interpolation in between
-_FASTEST = np.radians(100.0)  # rad/s
-_RAMP = 0.25  # s, duration of a change of the angular rate
-_CYCLE = 12.0  # s, period of the speed
+_LIDAR_STREAM, _IMU_STREAM = 12, 13  # of random numbers, different from those of the other parts of a world
+_POSE_STEP = 0.01  # s between two poses of a robot, with interpolation in between
+_MAX_RATE = np.radians(100.0)  # rad/s
+_RAMP_TIME = 0.25  # s, duration of a change of the angular rate
+_SPEED_PERIOD = 12.0  # s, period of the speed
 
 
-class _Simulated(IndexedSource):
+class _SimulatedSource(IndexedSource):
     """A drive with a LiDAR and no other sensor.
 
     Attributes:
@@ -50,7 +50,7 @@ class _Simulated(IndexedSource):
         return prefetch(super().frames(start, stop))
 
 
-class SimulatedDrive(_Simulated):
+class SimulatedDrive(_SimulatedSource):
     """The drive along a road, with traffic, at 10 Hz."""
 
     def __init__(self, road: str, preset: PresetName, seed: int, name: str) -> None:
@@ -67,7 +67,7 @@ class SimulatedDrive(_Simulated):
     def frame(self, position: int) -> Frame:
         """See `IndexedSource`."""
         time = float(self.times[position])
-        rng = np.random.default_rng([self.world.seed, _STREAM, position])
+        rng = np.random.default_rng([self.world.seed, _LIDAR_STREAM, position])
         scan = self._lidar.scan(self.world, self.poses[position], time, rng)
         return Frame(round(time * 1e9), scan.points, index=position)
 
@@ -91,7 +91,7 @@ class Ride:
         """(N, 4, 4) deviations at times (N,), s, from the pose without shakes; they begin when the motion begins."""
         amplitudes, frequencies = (np.array(part) for part in self.shakes)
         swing = amplitudes * np.sin(2 * np.pi * frequencies * times[:, None] + np.arange(6))
-        return se3.exp(_moving(times)[:, None] * swing)
+        return se3.exp(_start_ramp(times)[:, None] * swing)
 
 
 RIDES = {
@@ -104,7 +104,7 @@ RIDES = {
 """On a car, carried by a walker, waved by hand, on a trotting four-legged robot, and below a drone."""
 
 
-class TurningRobot(_Simulated):
+class TurningRobot(_SimulatedSource):
     """A robot that drives along a road and rotates fast. Scans are raw, with the time of each point, from poses that
     change within a sweep, stamped in the middle of the sweep; there may be an IMU."""
 
@@ -123,28 +123,28 @@ class TurningRobot(_Simulated):
         times = 0.5 + np.arange(frames, dtype=np.float64) * FRAME_PERIOD
         super().__init__(f"{world.preset} {world.seed}", world, times)
         self._lidar = Lidar(lidar)
-        at = np.arange(0.0, end, _STEP)
-        level = np.stack([self.world.drive_pose(t, lidar.height, float(_moving(t))) for t in at])
-        self._T = level @ ride.shaken(at)
+        instants = np.arange(0.0, end, _POSE_STEP)
+        level = np.stack([self.world.drive_pose(t, lidar.height, float(_start_ramp(t))) for t in instants])
+        self._T = level @ ride.shaken(instants)
         self.poses = self.pose(self.times)
         self._imu = None if imu is None else Imu(imu, rng)
         if self._imu is not None:
-            at = self._imu.times(0.1, end - 0.1)
-            self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(at, self.pose))
-            self._stamps = np.round(at * 1e9).astype(np.int64)
+            instants = self._imu.times(0.1, end - 0.1)
+            self._rates, self._forces = (a @ self._imu.R_lidar_imu.T for a in self._imu.measure(instants, self.pose))
+            self._stamps = np.round(instants * 1e9).astype(np.int64)
 
     def pose(self, times: Array) -> Array:
         """T_world_lidar (M, 4, 4) at times (M,) s."""
-        k = np.floor(times / _STEP).astype(int)
-        return se3.interpolated(self._T[k], self._T[k + 1], times / _STEP - k)
+        k = np.floor(times / _POSE_STEP).astype(int)
+        return se3.interpolated(self._T[k], self._T[k + 1], times / _POSE_STEP - k)
 
     def frame(self, position: int) -> Frame:
         """See `IndexedSource`; its IMU samples are those since the sweep before."""
         time, T = float(self.times[position]), self.poses[position]
         offsets = self._lidar.beams.column_time.astype(float)
-        turning = se3.inverse(T) @ self.pose(time + offsets)
-        rng = np.random.default_rng([self.world.seed, _STREAM, position])
-        scan = self._lidar.scan(self.world, T, time, rng, turning)
+        T_stamp_column = se3.inverse(T) @ self.pose(time + offsets)
+        rng = np.random.default_rng([self.world.seed, _LIDAR_STREAM, position])
+        scan = self._lidar.scan(self.world, T, time, rng, T_stamp_column)
         stamp, imu = round(time * 1e9), None
         if self._imu is not None:
             end = time + float(offsets.max())
@@ -155,33 +155,33 @@ class TurningRobot(_Simulated):
         return Frame(stamp, scan.points, scan.time_offset, index=position, imu=imu)
 
 
-def _moving(time: ArrayLike) -> Array:
+def _start_ramp(time: ArrayLike) -> Array:
     """0 while the robot is at rest, 1 after its start, with a ramp in between; at times, s."""
     return np.clip((np.asarray(time) - 1.5) / 1.0, 0, 1)
 
 
 def _robot_progress(road: Road, end: float, ride: Ride, rng: np.random.Generator) -> Road:
     """The road with the progress and heading of a robot that drives for `end` s."""
-    times = np.arange(0.0, end + 1, _STEP)
+    times = np.arange(0.0, end + 1, _POSE_STEP)
     s, curvature = road.drive.s, np.abs(np.diff(road.drive.yaw) / np.diff(road.drive.s))
-    paces = np.minimum(ride.speed, _FASTEST / np.maximum(curvature, 1e-3))
-    parts = _moving(times) * (1 - ride.slows * (1 - np.cos(2 * np.pi * times / _CYCLE)) / 2)
+    max_speeds = np.minimum(ride.speed, _MAX_RATE / np.maximum(curvature, 1e-3))
+    speed_factors = _start_ramp(times) * (1 - ride.slows * (1 - np.cos(2 * np.pi * times / _SPEED_PERIOD)) / 2)
     travelled = np.zeros(len(times))
     for k in range(1, len(times)):
         segment = int(np.searchsorted(s, travelled[k - 1] % road.drive.length, "right")) - 1
-        pace = paces[min(segment, len(paces) - 1)]
-        travelled[k] = travelled[k - 1] + _STEP * pace * parts[k]
-    rate, k, side = np.zeros(len(times)), round(2.5 / _STEP), 1
+        max_speed = max_speeds[min(segment, len(max_speeds) - 1)]
+        travelled[k] = travelled[k - 1] + _POSE_STEP * max_speed * speed_factors[k]
+    rate, k, side = np.zeros(len(times)), round(2.5 / _POSE_STEP), 1
     while ride.turns and k < len(times):
         turn = np.radians(ride.turns) * rng.uniform(0.5, 1)
-        ramp, steady = round(_RAMP / _STEP), max(round((turn / _FASTEST - _RAMP) / _STEP), 1)
-        shape = np.concatenate([np.linspace(0, 1, ramp), np.ones(steady), np.linspace(1, 0, ramp)]) * _FASTEST
+        ramp, steady = round(_RAMP_TIME / _POSE_STEP), max(round((turn / _MAX_RATE - _RAMP_TIME) / _POSE_STEP), 1)
+        shape = np.concatenate([np.linspace(0, 1, ramp), np.ones(steady), np.linspace(1, 0, ramp)]) * _MAX_RATE
         for sign in (side, -side):  # to the side and back
             part = rate[k : k + len(shape)]
             part += sign * shape[: len(part)]
-            k += len(shape) + round(rng.uniform(0.2, 1.0) / _STEP)
+            k += len(shape) + round(rng.uniform(0.2, 1.0) / _POSE_STEP)
         side = -side
-    return replace(road, times=times, travelled=travelled, slip=np.cumsum(rate) * _STEP)
+    return replace(road, times=times, travelled=travelled, slip=np.cumsum(rate) * _POSE_STEP)
 
 
 def wheel_odometry(T_world_base: Array, slip: float = 0.0, jump: float = 0.0) -> Array:

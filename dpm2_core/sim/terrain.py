@@ -81,9 +81,9 @@ class Terrain:
     def _junctions(self, road: Road) -> NDArray[np.bool_]:
         reach = 2 * self.preset.half_width + 1
         pairs = cKDTree(self.center).query_pairs(reach, output_type="ndarray")
-        apart = np.abs(self.along[pairs[:, 0]] - self.along[pairs[:, 1]])
-        laps = road.streets[0].length if road.drive.closed else np.inf
-        pairs = pairs[(apart > 3 * reach) & (np.abs(apart - laps) > 3 * reach)]
+        arc_distance = np.abs(self.along[pairs[:, 0]] - self.along[pairs[:, 1]])
+        lap_length = road.streets[0].length if road.drive.closed else np.inf
+        pairs = pairs[(arc_distance > 3 * reach) & (np.abs(arc_distance - lap_length) > 3 * reach)]
         out = np.zeros(len(self.center), bool)
         out[pairs.ravel()] = True
         return out
@@ -92,8 +92,8 @@ class Terrain:
         mark = np.full((shape[1], shape[0]), -1, np.int32)
         column, row = np.rint((self.center - self.origin) / RESOLUTION).astype(int).T
         mark[row, column] = np.arange(len(self.center), dtype=np.int32)
-        at = distance_transform_edt(mark < 0, return_distances=False, return_indices=True)
-        return mark[at[0], at[1]]
+        index = distance_transform_edt(mark < 0, return_distances=False, return_indices=True)
+        return mark[index[0], index[1]]
 
     def _distance(self) -> Array:
         y = self.origin[1] + np.arange(self.nearest.shape[0])[:, None] * RESOLUTION - self.center[self.nearest, 1]
@@ -105,21 +105,21 @@ class Terrain:
         # long waves are high, short ones low: grades are as on real streets
         waves = zip(rng.normal(0, 0.001, 6), rng.uniform(60, 300, 6), rng.uniform(0, 6.3, (6, 2)), strict=True)
         z = preset.hills * sum(
-            steep * w * np.sin(2 * np.pi / w * (self.center @ (np.cos(turn), np.sin(turn))) + phase)
-            for steep, w, (turn, phase) in waves
+            grade * w * np.sin(2 * np.pi / w * (self.center @ (np.cos(direction), np.sin(direction))) + phase)
+            for grade, w, (direction, phase) in waves
         )
         if road.heights is not None:
-            known = np.concatenate(road.heights)
-            beside = cKDTree(self.center[: len(known)]).query(self.center[len(known) :])[1]
-            z = np.concatenate([known, known[beside]])
+            main_heights = np.concatenate(road.heights)
+            nearest = cKDTree(self.center[: len(main_heights)]).query(self.center[len(main_heights) :])[1]
+            z = np.concatenate([main_heights, main_heights[nearest]])
         height = gaussian_filter(np.asarray(z, np.float32)[self.nearest], 5 / RESOLUTION)
         if preset.roughness > 0:
             # a cambered and slightly uneven road surface
             height -= 0.02 * np.clip(self.edge + preset.half_width, 0, preset.half_width)
             height += 0.012 * (_value_noise(shape, 5.0, rng) + _value_noise(shape, 14.0, rng))
-            beside = np.clip(self.edge - max(preset.sidewalk, 0.3), 0, None)
+            off_road = np.clip(self.edge - max(preset.sidewalk, 0.3), 0, None)
             rough = sum(a * _value_noise(shape, w, rng) for a, w in ((1.0, 2.5), (1.6, 8.0), (4.0, 30.0)))
-            height += preset.roughness * np.minimum(beside / 3, 1) * rough
+            height += preset.roughness * np.minimum(off_road / 3, 1) * rough
             # slopes, banks and ditches that vary along the road
             bank = _value_noise(shape, 45.0, rng) * preset.hills * 0.05
             height += bank * np.clip(self.edge - 3, 0, 40)
@@ -167,14 +167,14 @@ class Terrain:
         """For points (N, 2): m to the left of the nearest street's center, m along it, and whether at a crossing."""
         sample = self.nearest[self.cell(xy)]
         yaw = self.yaw[sample].astype(xy.dtype)
-        away = xy - self.center[sample].astype(xy.dtype)
+        offset = xy - self.center[sample].astype(xy.dtype)
         c, s = np.cos(yaw), np.sin(yaw)
-        along = self.along[sample].astype(xy.dtype) + c * away[:, 0] + s * away[:, 1]
-        return c * away[:, 1] - s * away[:, 0], along, self.junction[sample]
+        along = self.along[sample].astype(xy.dtype) + c * offset[:, 0] + s * offset[:, 1]
+        return c * offset[:, 1] - s * offset[:, 0], along, self.junction[sample]
 
     def contour(self, level: float) -> Iterator[Kerbline]:
         """The lines `level` m outside the curb (negative: on the road), including the ends of streets."""
-        for line in self._lines(level):
+        for line in self._contour_lines(level):
             length = arc_lengths(line)
             if length[-1] < 6:
                 continue
@@ -189,7 +189,7 @@ class Terrain:
             yield Kerbline(xy, outward, self.junction[sample])
 
     @cached_property
-    def _lines(self) -> Callable[[float], list[Array]]:
+    def _contour_lines(self) -> Callable[[float], list[Array]]:
         """Function that returns the (N, 2) lines on which `edge` has a value, m."""
         with needs("sim", "the synthetic city"):
             import contourpy
@@ -200,20 +200,20 @@ class Terrain:
 
     def ground(self) -> Mesh:
         """The mesh of the ground, roads and sidewalks included."""
-        return merge([*self._grid(), *self._sidewalks()])
+        return merge([*self._ground_meshes(), *self._sidewalks()])
 
-    def _grid(self) -> Iterator[Mesh]:
+    def _ground_meshes(self) -> Iterator[Mesh]:
         edge = self.edge[::2, ::2]
         near = edge < FINE
         corners = near[:-1, :-1] | near[1:, :-1] | near[:-1, 1:] | near[1:, 1:]
         x, y = (self.origin[k] + np.arange(n) * 2 * RESOLUTION for k, n in ((0, edge.shape[1]), (1, edge.shape[0])))
         xy = np.stack(np.broadcast_arrays(x[None], y[:, None]), -1)
-        yield self._cells(*_snapped(xy, edge), corners)
+        yield self._cell_mesh(*_snap_to_curb(xy, edge), corners)
         blocks = corners.reshape(corners.shape[0] // 4, 4, corners.shape[1] // 4, 4).all((1, 3))
         coarse = edge[::4, ::4]
-        yield self._cells(xy[::4, ::4], coarse, ~blocks & (coarse[:-1, :-1] < MARGIN - 10))
+        yield self._cell_mesh(xy[::4, ::4], coarse, ~blocks & (coarse[:-1, :-1] < MARGIN - 10))
 
-    def _cells(self, xy: Array, edge: NDArray, keep: NDArray[np.bool_]) -> Mesh:
+    def _cell_mesh(self, xy: Array, edge: NDArray, keep: NDArray[np.bool_]) -> Mesh:
         """Two triangles for each kept cell between nodes (H, W, 2), classified by their mean distance to the curb."""
         i, j = np.nonzero(keep)
         used = np.zeros(edge.shape, bool)
@@ -259,15 +259,15 @@ def sheet(points: ArrayLike, surface: Surface) -> Mesh:
     return make(points.reshape(-1, 3), faces, *surface, uv[faces])
 
 
-def _snapped(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
+def _snap_to_curb(xy: Array, edge: NDArray[np.float32]) -> tuple[Array, NDArray[np.float32]]:
     """Nodes (H, W, 2) of a 1 m grid, with those next to a curb moved onto it, and their distances (H, W) to it, m.
 
     A road then has a straight border instead of a staircase.
     """
-    down, across = np.gradient(edge)
-    slope = np.hypot(down, across) + 1e-6
+    dy, dx = np.gradient(edge)
+    slope = np.hypot(dy, dx) + 1e-6
     shift = np.where((np.abs(edge) < 0.71) & (slope > 0.5), edge, 0)  # 0.71: half of a cell's diagonal
-    step = -(shift / slope)[..., None] * np.stack([across, down], -1) / slope[..., None]
+    step = -(shift / slope)[..., None] * np.stack([dx, dy], -1) / slope[..., None]
     return xy + step, edge - shift
 
 

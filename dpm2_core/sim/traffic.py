@@ -46,8 +46,8 @@ class Traffic:
     def poses(self, time: float) -> tuple[Array, Array]:
         """Positions (M, 2) and headings (M,) at a time, s."""
         drive = self.road.drive
-        own = float(self.road.distance(time))
-        s = self.start + self.speed * time + np.where(self.follows, own + 2.0 * np.sin(0.3 * time + self.phase), 0.0)
+        driven = float(self.road.distance(time))
+        s = self.start + self.speed * time + np.where(self.follows, driven + 2.0 * np.sin(0.3 * time + self.phase), 0.0)
         s = np.mod(s, drive.length)
         xy, yaw = drive.at(s, self.lateral)
         return xy, yaw + np.where((self.speed < 0) & ~self.follows, np.pi, 0.0)
@@ -57,13 +57,15 @@ class Traffic:
         if not self.models:
             return None
         xy, yaw = self.poses(time)
-        away = np.linalg.norm(xy - np.asarray(around)[:2], axis=1)
-        seen = np.flatnonzero((away < SIGHT) & (away > self.gap))
-        if not len(seen):
+        distance = np.linalg.norm(xy - np.asarray(around)[:2], axis=1)
+        in_sight = np.flatnonzero((distance < SIGHT) & (distance > self.gap))
+        if not len(in_sight):
             return None
-        poses = pose(xy[seen], self.terrain.surface_at(xy[seen]), yaw[seen])
-        meshes = [placed(self.models[k], poses[i : i + 1], k * 101 % 65536) for i, k in enumerate(seen)]
-        return DynamicObjects(Scene(merge(meshes)), np.repeat((seen + 1).astype(np.uint16), [len(m) for m in meshes]))
+        poses = pose(xy[in_sight], self.terrain.surface_at(xy[in_sight]), yaw[in_sight])
+        meshes = [placed(self.models[k], poses[i : i + 1], k * 101 % 65536) for i, k in enumerate(in_sight)]
+        return DynamicObjects(
+            Scene(merge(meshes)), np.repeat((in_sight + 1).astype(np.uint16), [len(m) for m in meshes])
+        )
 
 
 @dataclass(eq=False)
@@ -76,17 +78,17 @@ class DynamicObjects:
     def cast(self, origin: Float, directions: Float, reach: float) -> tuple[Hits, NDArray[np.intp]]:
         """Hits of the K of R rays from (3,) or (R, 3) that can meet a dynamic object, and their indices (K,)."""
         all_rays = origin.ndim == 2
-        toward = np.arange(len(directions)) if all_rays else _towards(self.scene.mesh, origin, directions)
+        toward = np.arange(len(directions)) if all_rays else _rays_towards(self.scene.mesh, origin, directions)
         origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape)[toward])
         return self.scene.cast(origins, directions[toward], reach), toward
 
 
-def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
+def _rays_towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
     """Indices of the rays (R, 3) within the azimuths and elevations that a mesh covers as seen from a point (3,)."""
     bins = 720
-    away = mesh.vertices - origin
-    flat = np.hypot(away[:, 0], away[:, 1]) + np.float32(1e-3)
-    corners = np.arctan2(away[:, 1], away[:, 0])[mesh.faces]
+    offsets = mesh.vertices - origin
+    flat = np.hypot(offsets[:, 0], offsets[:, 1]) + np.float32(1e-3)
+    corners = np.arctan2(offsets[:, 1], offsets[:, 0])[mesh.faces]
     spread = np.remainder(corners - corners[:, :1] + np.pi, 2 * np.pi) - np.pi
     first = np.floor((corners[:, 0] + spread.min(1) - 0.01) / (2 * np.pi) * bins).astype(int)
     last = np.floor((corners[:, 0] + spread.max(1) + 0.01) / (2 * np.pi) * bins).astype(int)
@@ -94,7 +96,7 @@ def _towards(mesh: Mesh, origin: Float, directions: Float) -> NDArray[np.intp]:
     steps = np.bincount(first + bins, minlength=3 * bins + 1) - np.bincount(last + bins + 1, minlength=3 * bins + 1)
     covered = np.cumsum(steps)[: 3 * bins].reshape(3, bins).max(0) > 0
     slope = directions[:, 2] / (np.hypot(directions[:, 0], directions[:, 1]) + np.float32(1e-6))
-    low, high = (away[:, 2] / flat).min() - 0.02, (away[:, 2] / flat).max() + 0.02
+    low, high = (offsets[:, 2] / flat).min() - 0.02, (offsets[:, 2] / flat).max() + 0.02
     azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) * bins).astype(int) % bins
     return np.flatnonzero(covered[azimuth] & (slope > low) & (slope < high))
 
@@ -150,8 +152,8 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
         if lane_at == 0:  # space for the car itself, and for cars ahead and behind to come 2 m nearer
             pace = 0.0
             at = np.remainder(at + length / 2, length) - length / 2
-            apart = np.abs(at) > 9 + lengths[kind] / 2
-            kind, at = kind[apart], at[apart]
+            is_apart = np.abs(at) > 9 + lengths[kind] / 2
+            kind, at = kind[is_apart], at[is_apart]
         parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lane_at, same_way))))
     kind, *queues = (np.concatenate(part) for part in zip(*parts, strict=True))
     queues += [rng.uniform(0, 6.3, len(kind)), np.full(len(kind), ALONGSIDE)]

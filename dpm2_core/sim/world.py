@@ -57,8 +57,8 @@ class World:
         (xy,), (yaw,) = self.road.drive.at(s, lateral)
         yaw = yaw + heading
         ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-        feet = xy + np.array([1.4 * ahead, -1.4 * ahead, 0.8 * left, -0.8 * left])
-        z = self.terrain.height_at(feet)
+        wheels = xy + np.array([1.4 * ahead, -1.4 * ahead, 0.8 * left, -0.8 * left])
+        z = self.terrain.height_at(wheels)
         x_axis = np.array([*(2.8 * ahead), z[0] - z[1]])
         y_axis = np.array([*(1.6 * left), z[2] - z[3]])
         z_axis = np.cross(x_axis, y_axis)
