@@ -48,15 +48,15 @@ GROUPS = {
     "Learning": {
         "finetune": (
             "finetune:finetune",
-            "Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.",
+            "Fine-tune the network on drives without ground truth. The trajectory of the SLAM serves as the reference.",
         ),
         "train": ("tasks:train", "Make training data and train the network."),
-        "eval-task": ("tasks:eval_task", "Measure a trained task on scans that it has not learned from."),
+        "eval-task": ("tasks:eval_task", "Evaluate a trained task on scans that it was not trained on."),
     },
     "Papers": {
         "experiment": (
             "experiment:experiment",
-            "Make a table or figure of the papers on your copy of the data, theirs beside it.",
+            "Make a table or figure of the papers on your copy of the data, next to the papers' own figures.",
         ),
         "report": (
             "report:report",
@@ -66,12 +66,14 @@ GROUPS = {
     "This machine": {
         "doctor": (
             "doctor:doctor",
-            "Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then ten seconds of SLAM.",
+            "Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then test the SLAM for ten "
+            "seconds.",
         ),
-        "config": ("config:app", "Look at the configuration."),
+        "config": ("config:app", "Show the settings."),
         "bench": (
             "bench:bench",
-            "Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.",
+            "Measure accuracy and speed compared with KISS-ICP on the same scans, memory over a long drive, or the "
+            "network.",
         ),
     },
 }
@@ -120,7 +122,7 @@ def _quiet(
     quiet: Annotated[
         bool,
         typer.Option(
-            "--quiet", "-q", help="No notes, no progress: results on stdout, errors on stderr.",
+            "--quiet", "-q", help="Print only results, on stdout, and errors, on stderr.",
             callback=lambda value: QUIET.set(value), expose_value=False,
         ),
     ] = False,
@@ -131,7 +133,7 @@ def _quiet(
 app = typer.Typer(
     cls=Commands,
     help="LiDAR-visual SLAM.",
-    epilog="dpm2 COMMAND --help has its options. First: dpm2 doctor; then dpm2 run DRIVE --out out/mine.",
+    epilog="dpm2 COMMAND --help shows its options. Start with dpm2 doctor; then dpm2 run DRIVE --out out/mine.",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
 )
@@ -173,7 +175,7 @@ def _status(arguments: Sequence[str] | None) -> int:
         if error.errno not in _UNWRITTEN:
             raise
         if error.errno != errno.EPIPE:  # on EPIPE the reader, such as `head`, has what it wanted
-            print(f"dpm2: not written: {error.strerror}", file=sys.stderr)
+            print(f"dpm2: output could not be written: {error.strerror}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the text still buffered for stdout fails again at exit
         return 1
 

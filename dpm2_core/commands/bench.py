@@ -17,33 +17,36 @@ def bench(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, imu, "
-            "indoor, loop-cost, map, memory, motion, neural, paper, pose-graph, relocalise, roads, sensor, tilt, "
+            help="Benchmarks to run: beside, covariance, diffslam, finetune, fleet, gaps, geometric (default), hard, "
+            "imu, indoor, loop-cost, map, memory, motion, neural, paper, pose-graph, relocalise, roads, sensor, tilt, "
             "traffic, views."
         ),
     ] = None,
     source: Annotated[
         list[Path] | None,
         typer.Option(
-            help="A KITTI sequence or bag with ground truth; else the KITTI excerpt, packed or in KITTI layout, "
-            "in $DPM2_KITTI or ../shared/kitti."
+            help="KITTI sequence or bag with ground truth; repeat for more. Default: the KITTI excerpt, packed or in "
+            "KITTI layout, in $DPM2_KITTI or ../shared/kitti."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for NAME.json.")] = Path("benchmarks"),
     repetitions: Annotated[
-        int | None, typer.Option(min=1, help="Runs of every method on every drive, or seeds [3].")
+        int | None, typer.Option(min=1, help="Runs of every method on every drive, or number of seeds [3].")
     ] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="Processors that every method may use [2].")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of the configuration; repeat for more.")
+        list[str] | None, typer.Option("--set", help="Set KEY=VALUE of the settings; repeat for more.")
     ] = None,
     unseen: Annotated[
-        Path | None, typer.Option(help="neural: packed drives (`dpm2 train data`) instead of new unseen worlds.")
+        Path | None,
+        typer.Option(help="neural: packed drives (`dpm2 train data`) to test on, instead of newly simulated worlds."),
     ] = None,
-    pairs: Annotated[int | None, typer.Option(min=1, help="Pairs of each kind; of relocalise: visits [60].")] = None,
+    pairs: Annotated[
+        int | None, typer.Option(min=1, help="Number of frame pairs of each kind; relocalise: number of visits [60].")
+    ] = None,
     only: Annotated[str | None, typer.Option(help="Run only this part of a benchmark that has several.")] = None,
 ) -> None:
-    """Measure accuracy and speed beside KISS-ICP on the same scans, memory over a long drive, or the network.
+    """Measure accuracy and speed compared with KISS-ICP on the same scans, memory over a long drive, or the network.
 
     An option that a benchmark does not use is an error. The message lists the options that it uses.
     """

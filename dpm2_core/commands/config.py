@@ -9,10 +9,10 @@ from dpm2_core.commands.options import ConfigFile, Overrides
 from dpm2_core.config import dump_settings, load_settings
 from dpm2_core.slam.settings import Config
 
-app = typer.Typer(help="Look at the configuration.")
+app = typer.Typer(help="Show the settings.")
 
 
 @app.command()
 def dump(config: ConfigFile = None, settings: Overrides = None) -> None:
-    """Print every key with its description and value, as YAML that --config takes."""
+    """Print every setting with its description and value, as a YAML file for --config."""
     typer.echo(dump_settings(load_settings(Config, config, settings or [])), nl=False)

@@ -15,11 +15,11 @@ from dpm2_core.console import counted
 
 def convert(
     src: Annotated[Path, typer.Argument(help="Any recording that `dpm2 run` reads.")],
-    out: Annotated[Path, typer.Argument(help="rosbag2 folder to make.")],
-    frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
+    out: Annotated[Path, typer.Argument(help="rosbag2 folder to write.")],
+    frames: Annotated[str, typer.Option(help="Frames a to b - 1, as a:b, counted from 0; `:` is all.")] = ":",
     config: ConfigFile = None,
     settings: InputOverrides = None,
-    zstd: Annotated[bool, typer.Option("--zstd", help="Compress: about a third smaller, and slower.")] = False,
+    zstd: Annotated[bool, typer.Option("--zstd", help="Compress the bag: a third smaller, but slower.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bag.")] = False,
 ) -> None:
     """Convert a recording to a rosbag2 (MCAP) folder.

@@ -16,11 +16,11 @@ from dpm2_core.tables import FigureTable
 
 
 def doctor(
-    folder: Annotated[Path, typer.Option(help="Folder for results, whose free space is checked.")] = Path(),
-    no_test: Annotated[bool, typer.Option("--no-test", help="Without the self-test, which takes ten seconds.")] = False,
+    folder: Annotated[Path, typer.Option(help="Folder for results, whose free disk space is checked.")] = Path(),
+    no_test: Annotated[bool, typer.Option("--no-test", help="Skip the self-test, which takes ten seconds.")] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then ten seconds of SLAM.
+    """Check this machine: versions, processor, GPU, memory, disk, ROS 2 and DDS; then test the SLAM for ten seconds.
 
     The exit code is 1 if something does not work. What is only missing or slow is reported, but is not an error.
     """
@@ -33,7 +33,7 @@ def doctor(
             findings.append(finding)
             status.update(f"{finding.what}: {finding.found}")
         if not no_test:
-            status.update("ten seconds of SLAM")
+            status.update("self-test of the SLAM, ten seconds")
             findings.append(self_test().finding())
     table = FigureTable("This machine", names=["what", "how"], text=["found"])
     for finding in findings:
@@ -41,4 +41,4 @@ def doctor(
         table.add_row(finding.what, finding.level, finding.found + advice)
     show(table, {"findings": [asdict(finding) for finding in findings]}, json_file)
     if broken := [finding.what for finding in findings if finding.level == "error"]:
-        raise Dpm2Error(f"doctor: does not work: {', '.join(broken)}")
+        raise Dpm2Error(f"doctor: these do not work: {', '.join(broken)}")

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 FRAME_AS_GIVEN = "as in the files; both must be poses of the same sensor"
 FRAME_CAMERA = "left camera; the estimate, poses of the LiDAR, was converted with Tr of the calibration"
 OTHER_AXES = (
-    "the trajectories match, but along other axes, like those of LiDAR and left camera (--calib converts the "
-    "estimate), or the poses have no rotations: then only APE is meaningful"
+    "the trajectories have the same shape, but the axes of their poses differ, as those of LiDAR and left camera do "
+    "(--calib converts the estimate), or one has no rotations: then only APE is meaningful"
 )
 UNESTIMATED = "without a pose in the estimate"
 FRAME_OF_DRIVE = "{}, as in the files of this kind that dpm2 run writes"
@@ -31,18 +31,22 @@ def eval_(
     gt: Annotated[
         Path,
         typer.Option(
-            help="Ground truth: a KITTI, KITTI-360 or TUM file, or a drive whose poses are known: for a TUM estimate "
-            "those of its LiDAR, else those of its left camera."
+            help="Ground truth: a KITTI, KITTI-360 or TUM trajectory file, or a drive with known poses. A drive's "
+            "poses are those of its LiDAR for a TUM estimate, else those of its left camera."
         ),
     ],
-    est: Annotated[Path, typer.Option(help="The estimate, in either format.")],
+    est: Annotated[Path, typer.Option(help="Estimated trajectory: a file in one of the same formats.")],
     json_file: JsonFile = None,
     lengths: Annotated[
-        str | None, typer.Option(help="Segment lengths of the KITTI metric, m, such as 10,20,30,40,50.")
+        str | None,
+        typer.Option(help="Segment lengths of the KITTI metric, m, such as 10,20,30,40,50. Default: 100 to 800."),
     ] = None,
     calib: Annotated[
         Path | None,
-        typer.Option(help="KITTI calib.txt: the estimate holds LiDAR poses, the ground truth camera poses."),
+        typer.Option(
+            help="KITTI calib.txt. Give it if the estimate has poses of the LiDAR and the ground truth poses of the "
+            "left camera: the estimate is then converted."
+        ),
     ] = None,
     settings: InputOverrides = None,
 ) -> None:
@@ -54,7 +58,7 @@ def eval_(
     from dpm2_core.evaluation.report import metrics_table
 
     if settings and not is_drive(gt):
-        raise UsageError(f"--set {settings[0]}: is only for reading a drive, and {gt} is not a drive")
+        raise UsageError(f"--set {settings[0]}: applies only if --gt is a drive, and {gt} is not one")
     chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
     estimate, frame = read_trajectory(est), FRAME_AS_GIVEN
     if is_drive(gt):

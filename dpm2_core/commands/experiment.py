@@ -17,35 +17,50 @@ from dpm2_core.tables import FigureTable
 
 
 def experiment(
-    name: Annotated[str | None, typer.Argument(help="Name of the experiment; --list shows all.")] = None,
-    data: Annotated[Path | None, typer.Argument(help="Root of the data set.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of the experiment; --list shows all names.")] = None,
+    data: Annotated[Path | None, typer.Argument(help="Root folder of the data set.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; finished parts in it are kept.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the experiments.")] = False,
     sequences: Annotated[
-        str | None, typer.Option(help="Sequences to test on, with commas; else those of the paper that exist.")
+        str | None,
+        typer.Option(help="Sequences to test on, separated by commas. Default: all of the paper's in the data set."),
     ] = None,
-    learn: Annotated[str | None, typer.Option(help="Sequences to train on, with commas.")] = None,
-    weights: Annotated[str | None, typer.Option(help="Weights of the network: a name or a .safetensors file.")] = None,
+    learn: Annotated[
+        str | None,
+        typer.Option(help="Sequences to train on, separated by commas. Default: all of the paper's in the data set."),
+    ] = None,
+    weights: Annotated[
+        str | None, typer.Option(help="Weights of the network: a shipped name or a .safetensors file.")
+    ] = None,
     registration: Annotated[
-        str | None, typer.Option(help="For the SLAM: geometric, neural, refined, adaptive; several with commas.")
+        str | None,
+        typer.Option(help="Registrations of the SLAM, separated by commas: geometric, neural, refined, adaptive."),
     ] = None,
     peer: Annotated[
         list[str] | None,
-        typer.Option(help="kiss-icp, kiss-slam, small_gicp, or NAME=FILE with {sequence} in it; repeat for more."),
+        typer.Option(
+            help="Program to compare with: kiss-icp, kiss-slam, small_gicp, or its trajectories as NAME=FILE with "
+            "{sequence} in the file name; repeat for more."
+        ),
     ] = None,
     lengths: Annotated[
-        str | None, typer.Option(help="Segments of the KITTI metric, m, with commas, instead of 100 to 800.")
+        str | None,
+        typer.Option(help="Segment lengths of the KITTI metric, m, separated by commas, instead of 100 to 800."),
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="Frames of each sequence, a:b by position from 0.")] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of trainings of each arm.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="Frames a to b - 1 of each sequence, as a:b, counted from 0. Default: all.")
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Number of trainings of each compared network, one per seed.")
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file with settings of the trainings.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of the SLAM, or of the trainings.")
+        list[str] | None, typer.Option("--set", help="Set KEY=VALUE of the SLAM, or of the trainings; repeat for more.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Parts that run at a time, each in its own process.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Parallel parts, each in a process of its own.")] = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """Make a table or figure of the papers on your copy of the data, theirs beside it.
+    """Make a table or figure of the papers on your copy of the data, next to the papers' own figures.
 
     A stopped experiment continues where it was: every part (a method on a sequence, a training) is done only once.
     """
@@ -62,7 +77,7 @@ def experiment(
         show(table, {key: {"of": entry.paper, "what": entry.summary} for key, entry in EXPERIMENTS.items()}, json_file)
         return
     if name is None or data is None or out is None:
-        raise UsageError("dpm2 experiment: want NAME DATA --out DIR, or --list")
+        raise UsageError("dpm2 experiment: give NAME DATA --out DIR, or --list")
     check_one_process("experiment")
     request = Request(
         data,

@@ -16,14 +16,14 @@ from dpm2_core.tables import FigureTable
 
 
 def finetune(
-    src: Annotated[list[Path], typer.Argument(help="Any recordings that `dpm2 run` reads.")],
+    src: Annotated[list[Path], typer.Argument(help="Recordings of any format that `dpm2 run` reads.")],
     out: OutOption = Path("out/finetune"),
     config: ConfigOption = None,
     settings: SetOption = None,
     resume: ResumeOption = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Fine-tune the network on drives without ground truth: the reference is the trajectory of the SLAM.
+    """Fine-tune the network on drives without ground truth. The trajectory of the SLAM serves as the reference.
 
     Run the result with --set slam.neural.weights=OUT/weights.safetensors.
     """

@@ -26,15 +26,18 @@ from dpm2_core.tables import FigureTable
 app = typer.Typer(help="Many drives, on this machine or on a cluster of Ray: run, merge, sweep.", no_args_is_help=True)
 
 Drives = Annotated[
-    list[Path], typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a list of them as YAML.")
+    list[Path],
+    typer.Argument(metavar="DRIVE... | MANIFEST.yaml", help="Recordings, or a YAML list of them (docs/fleet.md)."),
 ]
-Out = Annotated[Path, typer.Option(help="Folder for the results, writable by all workers; complete ones are kept.")]
+Out = Annotated[
+    Path, typer.Option(help="Folder for the results, which all workers can write to; complete results are kept.")
+]
 Address = Annotated[
-    str | None, typer.Option("--ray", metavar="ADDRESS", help="A cluster of Ray, HOST:PORT or auto; else this machine.")
+    str | None,
+    typer.Option("--ray", metavar="ADDRESS", help="Ray cluster, HOST:PORT or auto. Default: this machine."),
 ]
 Workers = Annotated[
-    int | None,
-    typer.Option(min=1, show_default="as many as there are processors for", help="Tasks that run at a time."),
+    int | None, typer.Option(min=1, show_default="as many as the processors allow", help="Parallel tasks, at most.")
 ]
 
 
@@ -59,7 +62,9 @@ def run(
 @app.command()
 def merge(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results of `dpm2 fleet run`.")],
-    out: Annotated[Path, typer.Option(help="Map file; an earlier merge is replaced once the new one is complete.")],
+    out: Annotated[
+        Path, typer.Option(help="Map file; one of an earlier merge is replaced when the new one is complete.")
+    ],
     address: Address = None,
     workers: Workers = None,
     config: ConfigFile = None,
@@ -90,7 +95,8 @@ def sweep(
     drives: Drives,
     out: Out,
     settings: Annotated[
-        list[str], typer.Option("--set", help="KEY=VALUE,VALUE,...; of several, every combination is run.")
+        list[str],
+        typer.Option("--set", help="Values to try, KEY=VALUE,VALUE,...; with several --set, every combination is run."),
     ],
     address: Address = None,
     workers: Workers = None,
@@ -123,4 +129,6 @@ def _carry_out(
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise typer.Abort
     if failed := [outcome.name for outcome in outcomes if outcome.state == "failed"]:
-        raise Dpm2Error(f"{len(failed)} of {len(outcomes)} failed: {', '.join(failed)}; why: {out / SUMMARY}")
+        raise Dpm2Error(
+            f"{len(failed)} of {len(outcomes)} failed: {', '.join(failed)}; {out / SUMMARY} has the reasons"
+        )

@@ -36,7 +36,7 @@ def parse_hint(text: str) -> Array:
     except ValueError:
         raise UsageError(f"--hint {text}: want x,y,yaw in meters and degrees, such as 12.5,-3,90") from None
     if not np.isfinite([x, y, yaw]).all():
-        raise UsageError(f"--hint {text}: not finite")
+        raise UsageError(f"--hint {text}: want finite numbers")
     return se3.make(se3.exp(np.array([0, 0, np.radians(yaw), 0, 0, 0]))[:3, :3], np.array([x, y, 0.0]))
 
 
@@ -127,7 +127,7 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
 
         interrupted = drive.run(progress).interrupted
     if interrupted:
-        note("interrupted; writing what there is", "yellow")
+        note("interrupted; writing the results so far", "yellow")
     save_config(config, out)
     write_tum(out / TRAJECTORY, report.stamps, np.array(report.poses).reshape(-1, 4, 4))
     summary = report.summary()
@@ -136,5 +136,5 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     until = summary["frames_until_found"]
     why = f" ({summary['not_found']})" if summary["not_found"] else ""
     found = f"not found{why}" if until is None else f"found after {until} frames"
-    located = f"place known in {len(report.stamps)} of {summary['frames']} frames"
+    located = f"pose known in {len(report.stamps)} of {summary['frames']} frames"
     return f"{name}: {found}, {located}; results in {out}", summary

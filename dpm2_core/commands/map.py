@@ -34,7 +34,7 @@ app.command()(optimize)
 @app.command()
 def export(
     path: MapFile,
-    out: Annotated[Path, typer.Argument(help="File to write; its suffix gives the format, unless --format does.")],
+    out: Annotated[Path, typer.Argument(help="File to write; its extension determines the format without --format.")],
     format: Annotated[
         str,
         typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."),
@@ -43,11 +43,14 @@ def export(
         float | None, typer.Option(min=0.01, max=1000, help="Spacing of the points of a cloud, m [0.3].")
     ] = None,
     resolution: Annotated[
-        float | None, typer.Option(min=0.01, max=1000, help="Cell of the occupancy grid, m [0.1].")
+        float | None, typer.Option(min=0.01, max=1000, help="Cell size of the occupancy grid, m [0.1].")
     ] = None,
     tiles: Annotated[
         float | None,
-        typer.Option(metavar="METERS", help="A folder of map files, one for each square, for `dpm2 run --localise`."),
+        typer.Option(
+            metavar="METERS",
+            help="Write a folder of map files instead, one for each square of this size, for `dpm2 run --localise`.",
+        ),
     ] = None,
 ) -> None:
     """Write a map as a point cloud, a page for the browser, an occupancy grid, a trajectory, a pose graph, or tiles."""
@@ -58,13 +61,13 @@ def export(
 
 @app.command()
 def merge(
-    paths: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Map files; the first one's frame stays.")],
+    paths: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Map files; the first one sets the frame.")],
     out: Annotated[Path, typer.Option(help="New map file.")],
     transform: Annotated[
         list[str] | None,
         typer.Option(
-            help='Pose of a further map in the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; one each. Else the '
-            "maps are aligned by their descriptors."
+            help='Pose of another map in the frame of the first: "x y z yaw" (m, deg) or "x y z qx qy qz qw"; repeat '
+            "it for each map but the first. Default: the maps are aligned by places that their descriptors recognize."
         ),
     ] = None,
     config: ConfigFile = None,
@@ -103,7 +106,7 @@ def prune(
 @app.command()
 def check(
     path: MapFile,
-    recover: Annotated[Path | None, typer.Option(help="Write the undamaged part to this new map file.")] = None,
+    recover: Annotated[Path | None, typer.Option(help="Write undamaged data to this new map file.")] = None,
 ) -> None:
     """Check a map for damage: database, checksum of every row, dangling edges, invalid poses."""
     from dpm2_core.slam.mapping.parts import georeferenced
@@ -122,4 +125,4 @@ def check(
             f"{path}: {len(result.problems)} problems, {result.keyframes} keyframes can be recovered with --recover OUT"
         )
     else:
-        console.print(f"{path}: {result.keyframes} keyframes, sound")
+        console.print(f"{path}: {result.keyframes} keyframes, no damage")

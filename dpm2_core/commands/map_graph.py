@@ -19,8 +19,8 @@ from dpm2_core.tables import FigureTable
 
 
 def optimize(
-    graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="SE2 or SE3:QUAT; VERTEX lines may be absent.")],
-    out: Annotated[Path, typer.Option(help="New g2o file: optimized vertices, odometry, the loops that were kept.")],
+    graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="SE2 or SE3:QUAT; VERTEX lines may be missing.")],
+    out: Annotated[Path, typer.Option(help="New g2o file: optimized vertices, odometry and the accepted loops.")],
     json_file: JsonFile = None,
 ) -> None:
     """Optimize a pose graph and reject the loops that cannot be true.
@@ -33,7 +33,7 @@ def optimize(
     from dpm2_core.slam.graph.robust import least_squares
 
     if out.exists() and graph.exists() and out.samefile(graph):
-        raise UsageError(f"{out}: is the graph itself, whose rejected loops would be lost; choose another file")
+        raise UsageError(f"{out}: is the input graph, and would lose its rejected loops; give another --out")
     file = read_g2o(graph)
     require_connected(graph, file)
     data, dof = file.graph, 3 if file.planar else 6

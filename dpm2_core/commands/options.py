@@ -16,16 +16,21 @@ from dpm2_core.errors import UsageError, exit_code
 from dpm2_core.evaluation.machine import processors
 from dpm2_core.files import atomic_write, json_text
 
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file; `dpm2 config dump` shows every key.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, such as slam.map.voxel=0.3.")]
-InputOverrides = Annotated[
-    list[str] | None, typer.Option("--set", help="KEY=VALUE of input, such as input.sequence=04.")
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="YAML file with settings; `dpm2 config dump` prints every key.")
 ]
-Workers = Annotated[int, typer.Option(min=1, help="Number of processes; it does not change the result.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Set KEY=VALUE, such as slam.map.voxel=0.3; repeat for more.")
+]
+InputOverrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Set KEY=VALUE of input, such as input.sequence=04; repeat for more.")
+]
+Workers = Annotated[int, typer.Option(min=1, help="Parallel workers; their number does not change the result.")]
 PROCESSORS = processors()
 """Default of `Workers`."""
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to a file; -: only them to stdout.")
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Also write the figures as JSON to a file; -: only JSON, to stdout."),
 ]
 
 

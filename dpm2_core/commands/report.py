@@ -12,7 +12,9 @@ from dpm2_core.commands.options import note
 
 
 def report(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of `dpm2 run` or `dpm2 experiment`, or above such.")],
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of `dpm2 run` or `dpm2 experiment`, or their parents.")
+    ],
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
 ) -> None:
     """Show runs on one page: trajectories, loops, errors by length and speed, times and states.

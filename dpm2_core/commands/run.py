@@ -30,36 +30,49 @@ if TYPE_CHECKING:
 
 def run(
     src: Annotated[
-        Path, typer.Argument(help="KITTI, a bag of ROS 2 or ROS 1, PCD or PLY files, ...: docs/recordings.md.")
+        Path,
+        typer.Argument(help="Recording: KITTI, a ROS 2 or ROS 1 bag, PCD or PLY files, ...; see docs/recordings.md."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
-    gt: Annotated[Path | None, typer.Option(help="Ground truth (KITTI: left camera; TUM: LiDAR).")] = None,
-    frames: Annotated[str, typer.Option(help="Which frames, a:b by position from 0.")] = ":",
+    gt: Annotated[
+        Path | None,
+        typer.Option(
+            help="Ground truth: a file of poses (KITTI: of the left camera; TUM: of the LiDAR). Default: that of the "
+            "recording, if it has one."
+        ),
+    ] = None,
+    frames: Annotated[str, typer.Option(help="Frames a to b - 1, as a:b, counted from 0; `:` is all.")] = ":",
     corrupt: Annotated[
         str | None,
         typer.Option(
-            help="Let sensors fail, NAME=VALUE,...: fractions of frames camera (black), no_image, overexposed, "
-            "underexposed (by stops), obstruction; fraction of beams, of pulses that meet dust; sight (m); "
-            "extrinsic_deg, extrinsic_m, time_offset (s); seed."
+            help="Simulate sensor failures, NAME=VALUE,...: camera (black images), no_image, overexposed, "
+            "underexposed, obstruction (a box before the LiDAR), as fractions of the frames; stops (of the exposure); "
+            "beams (dead ones) and dust (pulses that return from it), as fractions; sight (largest range, m); "
+            "extrinsic_deg, extrinsic_m (errors of the extrinsics); time_offset (delay of the images, s); seed."
         ),
     ] = None,
     map_file: Annotated[
-        Path | None, typer.Option("--map", help="Map file, such as drive.dpm2map, written during the drive.")
+        Path | None, typer.Option("--map", help="Map file to write during the run, such as drive.dpm2map.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue where --map ends, after an interrupted run.")
+        bool, typer.Option("--resume", help="Continue an interrupted run of the same drive from the end of --map.")
     ] = False,
-    extend: Annotated[bool, typer.Option("--extend", help="Add this drive as a new one to an existing --map.")] = False,
+    extend: Annotated[bool, typer.Option("--extend", help="Add this drive to the map of other drives, --map.")] = False,
     localise: Annotated[
         Path | None,
-        typer.Option("--localise", help="Localize in this map (a file, or tiles), which is not changed."),
+        typer.Option("--localise", help="Localize the drive in this map (a file or tiles) and do not change the map."),
     ] = None,
-    hint: Annotated[str | None, typer.Option(help="Approximate start in --localise: x,y,yaw in m and degrees.")] = None,
+    hint: Annotated[
+        str | None,
+        typer.Option(
+            help="Approximate first pose in the map of --localise: x,y,yaw in m and degrees, such as 12,-3,90."
+        ),
+    ] = None,
     config: ConfigFile = None,
     settings: Overrides = None,
     view: Annotated[bool, typer.Option("--view", help="Show the run live in rerun's viewer.")] = False,
     record: Annotated[
-        Path | None, typer.Option(help="Record the same in a file, such as run.rrd: `rerun run.rrd` shows it.")
+        Path | None, typer.Option(help="Write what --view shows to a file, such as run.rrd: `rerun run.rrd` shows it.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -74,15 +87,15 @@ def run(
     corruption = None if corrupt is None else parse_corruption(corrupt)
     span = parse_range(frames)
     if resume and extend:
-        raise UsageError("--resume continues the same drive, --extend adds another one: they cannot be combined")
+        raise UsageError("--resume continues the same drive, --extend adds another one: give only one of them")
     if (resume or extend) and map_file is None:
-        raise UsageError(f"--{'resume' if resume else 'extend'}: in which map? give --map FILE")
+        raise UsageError(f"--{'resume' if resume else 'extend'}: needs the map, --map FILE")
     if localise is not None and (gt is not None or map_file is not None):
-        raise UsageError("--localise: the map and its frame do not change: it cannot be combined with --map or --gt")
+        raise UsageError("--localise: writes no map, and its poses are in the frame of the map: omit --map and --gt")
     if localise is not None and (view or record is not None):
-        raise UsageError("--view, --record: they show a growing map, and cannot be combined with --localise")
+        raise UsageError("--view, --record: they show how a map is made; they do not work with --localise")
     if localise is None and hint is not None:
-        raise UsageError("--hint: only with --localise")
+        raise UsageError("--hint: works only with --localise")
     T_hint = None if hint is None else parse_hint(hint)
     if view or record is not None:
         from dpm2_core.evaluation.live_view import check_view
@@ -97,7 +110,7 @@ def run(
             found, figures = run_localized(drive, out, T_hint, chosen)
             show(found, figures, json_file)
         if problem := figures["map_unreadable"]:
-            raise Dpm2Error(f"the map cannot be read everywhere: {problem}")
+            raise Dpm2Error(f"parts of the map cannot be read: {problem}")
         return
     mode: MapMode = "resume" if resume else "extend" if extend else "create"
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
@@ -114,7 +127,7 @@ def _keep_what_is_there(drive: OfflineRun, out: Path) -> None:
     if (out / TRAJECTORY).exists():
         first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
         before = set_aside(out, f"before_{first}")
-        note(f"{before}: the results so far; those of this run begin at frame {first}")
+        note(f"{before}: the results of the interrupted run; this run begins at frame {first}")
 
 
 def _map(drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path | None], json_file: Path | None) -> None:
@@ -168,14 +181,14 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
 
     source = result.source
     if result.interrupted:
-        note(f"interrupted after {len(result)} frames; writing what there is", "yellow")
+        note(f"interrupted after {len(result)} frames; writing their results", "yellow")
     for text in source.notes:
         note(text, "yellow")
     of_imu = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
     for problem, count in (of_imu | result.problems).items():
         note(f"{problem} ({count} of {len(result)} frames)", "yellow")
     if not result.connected:
-        note("no place of this drive was found in the map: its poses are in a frame of their own", "yellow")
+        note("no place of this drive was found in the map: its poses are in a frame of its own", "yellow")
     for missing in result.save(out):
         note(missing)
     metrics, title = result.metrics, f"{source.name}, {len(result)} frames"

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 def show(
     src: Annotated[Path, typer.Argument(help="Any recording that `dpm2 run` reads.")],
-    first: Annotated[int, typer.Argument(metavar="A", min=0, help="Position of a frame, from 0.")],
-    second: Annotated[int, typer.Argument(metavar="B", min=0, help="Position of the frame that is registered to A.")],
-    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("matches.png"),
+    first: Annotated[int, typer.Argument(metavar="A", min=0, help="First frame: its position, from 0.")],
+    second: Annotated[int, typer.Argument(metavar="B", min=0, help="Frame that is registered to A.")],
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("matches.png"),
     weights: Annotated[
         list[str] | None,
         typer.Option(
             show_default="small",
-            help="Name of shipped weights, or a .safetensors file; several are drawn below each other.",
+            help="Name of shipped weights, or a .safetensors file; repeat to draw several below each other.",
         ),
     ] = None,
-    corrupt: Annotated[str | None, typer.Option(help="Let sensors fail, as `dpm2 run --corrupt` does.")] = None,
+    corrupt: Annotated[str | None, typer.Option(help="Simulate sensor failures, as in `dpm2 run`.")] = None,
     settings: InputOverrides = None,
 ) -> None:
     """Draw two scans from above with their matched descriptors, colored by confidence, and how they fit.

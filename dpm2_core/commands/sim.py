@@ -16,34 +16,51 @@ from dpm2_core.sim.settings import DriveConfig, PresetName
 
 
 def sim(
-    out: Annotated[Path, typer.Argument(help="Folder to make, in KITTI odometry layout; a complete one is reused.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder to write, in KITTI odometry layout. If it contains this drive already, it is kept."
+        ),
+    ],
     frames: Annotated[
-        int | None, typer.Option(help="Number, at 10 Hz; 150, or all of a file.", show_default=False)
+        int | None,
+        typer.Option(
+            help="Number of frames, at 10 Hz. Default: 150, or all poses of the file --road.", show_default=False
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the world and the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of the world and of the noise.")] = 0,
     road: Annotated[
-        str, typer.Option(help="straight, loop, figure8, random, or a file of KITTI poses to drive along.")
+        str,
+        typer.Option(help="Shape of the road: straight, loop, figure8, random, or a file of KITTI poses to follow."),
     ] = "loop",
     preset: Annotated[
-        PresetName, typer.Option(help="city, suburb, rural, highway, tunnel, indoor or car_park.")
+        PresetName, typer.Option(help="World: city, suburb, rural, highway, tunnel, indoor or car_park.")
     ] = "city",
-    images: Annotated[bool, typer.Option("--images/--no-images", help="Write image_2.")] = True,
+    images: Annotated[bool, typer.Option("--images/--no-images", help="Write images of the camera (image_2).")] = True,
     traffic: Annotated[
-        float, typer.Option(help="As a factor of the preset's; above 1 in columns on every lane, 20 is full.")
+        float,
+        typer.Option(
+            help="Amount of traffic, relative to the preset's. Above 1 cars drive in columns on every lane; 20 fills "
+            "all lanes."
+        ),
     ] = 1.0,
     sensor: Annotated[
-        Literal["clean", "real"], typer.Option(help="clean: exact except for noise; real: with errors as KITTI's.")
+        Literal["clean", "real"],
+        typer.Option(help="Errors of the LiDAR; clean: only noise; real: those of KITTI's LiDAR."),
     ] = "clean",
     pattern: Annotated[
-        Literal["spinning", "rosette"], typer.Option(help="rosette: 70 deg ahead, never the same twice (Livox).")
+        Literal["spinning", "rosette"],
+        typer.Option(help="Scan pattern; rosette: 70 deg wide, to the front, different in every scan (Livox)."),
     ] = "spinning",
     beams: Annotated[int, typer.Option(help="Beams of the LiDAR: 16, 32, 64 or 128.")] = 64,
     height: Annotated[float, typer.Option(help="Height of the LiDAR above the ground, m.")] = 1.73,
     reach: Annotated[float, typer.Option("--range", help="Range of the LiDAR, m.")] = 80.0,
     imu: Annotated[
-        bool, typer.Option("--imu", help="Write imu.txt, of an IMU at 100 Hz with realistic errors.")
+        bool, typer.Option("--imu", help="Also write imu.txt, of an IMU at 100 Hz with realistic errors.")
     ] = False,
-    gnss: Annotated[bool, typer.Option("--gnss", help="Write gnss.txt, fixes of a plain receiver at 5 Hz.")] = False,
+    gnss: Annotated[
+        bool, typer.Option("--gnss", help="Also write gnss.txt, fixes at 5 Hz of a receiver without corrections.")
+    ] = False,
     workers: Workers = PROCESSORS,
 ) -> None:
     """Simulate a drive: scans, images, poses, point labels, scans without moving objects, and a map of the ground."""
@@ -57,4 +74,4 @@ def sim(
         drive = drive.model_copy(update={"lidar": real_sensor(drive.lidar)})
     with counted(f"{preset} -> {out}") as progress:
         made = simulate(out, drive, workers, progress)
-    note(f"{out}: {'written' if made else 'is there already'}")
+    note(f"{out}: {'written' if made else 'contains this drive already, nothing was written'}")

@@ -22,14 +22,15 @@ if TYPE_CHECKING:  # torch is slow to import
 SourceArgument = Annotated[
     Path,
     typer.Argument(
-        help="SemanticKITTI (not dslr), a drive of `dpm2 sim`, a folder of such; dslr and ae_lidar: or pairs of DSLR."
+        help="Scans: SemanticKITTI (not for dslr), a drive of `dpm2 sim`, or a folder with several; for dslr and "
+        "ae_lidar also pairs of DSLR."
     ),
 ]
 
 
 @train.command("tasks-data")
 def tasks_data(
-    out: Annotated[Path, typer.Argument(help="Folder to fill with train/NN and val/NN; what is there stays.")],
+    out: Annotated[Path, typer.Argument(help="Folder to fill with train/NN and val/NN; existing drives are kept.")],
     config: ConfigOption = None,
     settings: SetOption = None,
     workers: Workers = PROCESSORS,
@@ -46,12 +47,12 @@ def tasks_data(
 
 SequencesOption = Annotated[
     str | None,
-    typer.Option(
-        help="Sequences of SRC, or numbers of its pairs, with commas, such as 00,01; all there are otherwise."
-    ),
+    typer.Option(help="Sequences of SRC, or numbers of its pairs, separated by commas, such as 00,01. Default: all."),
 ]
-ValSequencesOption = Annotated[str | None, typer.Option(help="Sequences of --val, as --sequences.")]
-ValOption = Annotated[Path | None, typer.Option("--val", help="Scans to measure on during training, as SRC.")]
+ValSequencesOption = Annotated[str | None, typer.Option(help="The same for --val. Default: all.")]
+ValOption = Annotated[
+    Path | None, typer.Option("--val", help="Scans to evaluate on during training, in a format of SRC. Default: none.")
+]
 
 
 def _add(name: str, help_: str) -> None:
@@ -72,7 +73,7 @@ def _add(name: str, help_: str) -> None:
         chosen = load_settings(task_type(name).training_type, config, settings or [])
         sets = (src, parse_names(sequences)), None if val is None else (val, parse_names(val_sequences))
         if val is None and val_sequences is not None:
-            raise UsageError("--val-sequences: of which folder? give --val")
+            raise UsageError("--val-sequences: needs the folder of these sequences, --val")
         _train(name, chosen, out, resume, sets)
 
     command: Callable[..., None] = run
@@ -81,9 +82,9 @@ def _add(name: str, help_: str) -> None:
 
 
 _add("gndnet", "GndNet: the height of the ground around the sensor, from one scan.")
-_add("dslr", "DSLR: a scan without what moves, from one with it.")
-_add("ae_lidar", "AE_lidar: a scan as a short code and back.")
-_add("movers", "Movers: which points are of things that move or could. It has no SLAM loss.")
+_add("dslr", "DSLR: a scan without moving objects, from a scan with them.")
+_add("ae_lidar", "AE_lidar: encode a scan as a short code and decode it.")
+_add("movers", "Movers: which points are on objects that move or could move. It has no SLAM loss.")
 
 
 Scans = tuple[Path, Sequence[str]]
@@ -110,22 +111,26 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
         measured = open_scans(val[0], kind.needs, val[1])
         places = sequence_places(*val)
         same = measured.digest() == data["content"]  # such as a copy
-        say_learned(f"--val {val[0]} is what the task", places, places if same else sequence_places(src, sequences))
+        say_learned(f"--val {val[0]}: the task", places, places if same else sequence_places(src, sequences))
     train_task(new_task(name, settings), scans, out, measured)
     note(f"{out / WEIGHTS}: written")
 
 
 def eval_task(
     name: Annotated[str, typer.Argument(metavar="TASK", help="gndnet, dslr, ae_lidar or movers.")],
-    weights: Annotated[Path, typer.Argument(help="What `dpm2 train TASK` wrote: weights.safetensors.")],
+    weights: Annotated[Path, typer.Argument(help="weights.safetensors from `dpm2 train TASK`.")],
     src: SourceArgument,
     json_file: JsonFile = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG of one scan to write.")] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Scan of the image, counted through all sequences.")] = 0,
+    picture: Annotated[Path | None, typer.Option(help="Draw one scan with its result to this PNG file.")] = None,
+    frame: Annotated[
+        int, typer.Option(min=0, help="Scan for --picture: its number from 0, counted over all sequences.")
+    ] = 0,
     sequences: SequencesOption = None,
-    slam: Annotated[bool, typer.Option("--slam", help="Odometry on what the task makes, too; needs poses.")] = False,
+    slam: Annotated[
+        bool, typer.Option("--slam", help="Also run the odometry on the output of the task; needs poses.")
+    ] = False,
 ) -> None:
-    """Measure a trained task on scans that it has not learned from."""
+    """Evaluate a trained task on scans that it was not trained on."""
     from dpm2_core.tasks.open import open_scans
     from dpm2_core.tasks.task import task_type
     from dpm2_core.tasks.training import draw, load_task, measure

@@ -22,15 +22,19 @@ if TYPE_CHECKING:  # torch is slow to import
 
 train = typer.Typer(help="Make training data and train the network.", no_args_is_help=True)
 
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML; its defaults otherwise.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, a key as in the YAML.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML file with settings. Default: the built-in values.")
+]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Set KEY=VALUE, a key as in the YAML file; repeat for more.")
+]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for checkpoint, log and weights.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")]
 
 
 @train.command()
 def data(
-    out: Annotated[Path, typer.Argument(help="Folder to fill; worlds that are there already stay.")],
+    out: Annotated[Path, typer.Argument(help="Folder to fill; existing worlds are kept.")],
     config: ConfigOption = None,
     settings: SetOption = None,
     workers: Workers = PROCESSORS,
@@ -46,11 +50,11 @@ def data(
 @train.command()
 def pack(
     src: Annotated[Path, typer.Argument(help="KITTI, KITTI-360 or KITTI-CARLA folder, or a bag; with ground truth.")],
-    out: Annotated[Path, typer.Argument(help="Folder of the packed drive; name it under data.packed to train on it.")],
-    frames: Annotated[str, typer.Option(help="Positions a:b to pack, from 0.")] = ":",
-    preset: Annotated[str, typer.Option(help="Network preset: its crop and image size are stored.")] = "small",
+    out: Annotated[Path, typer.Argument(help="Folder for the packed drive; list it in data.packed to train on it.")],
+    frames: Annotated[str, typer.Option(help="Frames a to b - 1, as a:b, counted from 0; `:` is all.")] = ":",
+    preset: Annotated[str, typer.Option(help="Network preset; sets the crop and the image size to store.")] = "small",
     every: Annotated[
-        bool, typer.Option("--all", help="Every drive below SRC, each to OUT/NAME; those that are there already stay.")
+        bool, typer.Option("--all", help="Pack every drive below SRC to OUT/NAME; drives that exist there are kept.")
     ] = False,
     settings: InputOverrides = None,
 ) -> None:
@@ -66,11 +70,11 @@ def pack(
     packing = {"frames": frames, "preset": preset, "input": given}
     if not every:
         if out.exists():
-            raise UsageError(f"{out}: is there already; remove it, or choose another folder")
+            raise UsageError(f"{out}: exists already; remove it, or choose another folder")
         _pack_one(src, out, packing, overrides)
         return
     if len(given) < len(overrides):
-        raise UsageError("--all: packs every drive; leave --set input.sequence= out")
+        raise UsageError("--all: packs every drive; omit --set input.sequence=")
     left_out = []
     names = sequences_below(src)
     for name in names:
@@ -106,8 +110,8 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
     finally:
         for text in source.notes:  # such as an image that cannot be read
             note(text)
-    of_all = f" of {len(chosen)} frames; the others have no pose, cannot be read or show hardly any point"
-    note(f"{out}: {packed}{of_all if packed < len(chosen) else ' frames'}")
+    of_all = f" of {len(chosen)} frames packed; the others have no pose, cannot be read or have too few points"
+    note(f"{out}: {packed}{of_all if packed < len(chosen) else ' frames packed'}")
 
 
 def _content(src: Path, overrides: list[str]) -> dict[str, str]:
@@ -187,7 +191,7 @@ def ablation(
     check_one_process("train ablation")
     chosen = load_settings(AblationSettings, config, settings or [])
     if not chosen.measure:
-        raise UsageError("measure: want the folders of packed drives to measure on, such as {unseen: out/train/val}")
+        raise UsageError("measure: set the folders of packed drives to measure on, such as {unseen: out/train/val}")
     packed = chosen.training.data.packed
     learned = scans_of(drive for folder, weight in packed.items() if weight for drive in open_packed(Path(folder)))
     for name, folder in chosen.measure.items():
@@ -226,7 +230,7 @@ def say_packed(what: str, folder: Path, learned: Collection[bytes]) -> None:
 
     measured = open_packed(folder)
     both = {drive.folder.resolve() for drive in measured if not scans_of([drive]).isdisjoint(learned)}
-    say_learned(f"{what} is what the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
+    say_learned(f"{what}: the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
 
 
 def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:
@@ -234,4 +238,4 @@ def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Pat
     both = [name for folder, name in measured.items() if folder in learned]
     if both:
         which = "" if len(both) == len(measured) else f": {', '.join(both)}"
-        note(f"note: {what} learns from{which}")
+        note(f"note: {what} trains on these scans{which}")

@@ -189,7 +189,7 @@ def test_a_full_disk_under_stdout_is_one_line(straight: Path, arguments: list[st
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "dpm2_core.cli", *map(str, [*arguments, *given])]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (1, "dpm2: not written: No space left on device\n")
+    assert (done.returncode, done.stderr) == (1, "dpm2: output could not be written: No space left on device\n")
 
 
 @pytest.mark.slow

@@ -408,7 +408,7 @@ def test_what_was_saved_by_default_can_be_used(tmp_path: Path, capsys: pytest.Ca
         with pytest.raises(SystemExit) as ended:
             main(["map", arguments[0], str(tmp_path / "drive.dpm2map"), *arguments[1:]])
         assert ended.value.code == 0
-    assert "3 keyframes, sound" in capsys.readouterr().out
+    assert "3 keyframes, no damage" in capsys.readouterr().out
     assert (tmp_path / "grid.pgm").is_file()
     with pytest.raises(UsageError, match=r"ros.map_file does not name one; the newest in .* is .*drive\.dpm2map"):
         ActiveMap(config(map_directory=str(tmp_path), localization_mode=True), "", LOG)

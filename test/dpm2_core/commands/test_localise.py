@@ -80,7 +80,7 @@ def test_a_tile_that_is_missing_costs_no_results(recording: Path, made: Path, tm
     missing.unlink()
     done = dpm2("run", recording, "--out", tmp_path / "o", "--frames", ":3", "--localise", tmp_path / "tiles", *QUICK)
     assert done.returncode == 1, done.stderr
-    assert f"dpm2: the map cannot be read everywhere: {missing}: no such map file" in done.stderr
+    assert f"dpm2: parts of the map cannot be read: {missing}: no such map file" in done.stderr
     report = json.loads((tmp_path / "o" / "localisation.json").read_text())
     assert (report["frames"], report["map_unreadable"]) == (3, f"{missing}: no such map file")
 

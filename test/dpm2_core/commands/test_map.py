@@ -360,7 +360,7 @@ def test_run_writes_a_map_and_goes_on_with_it(tmp_path: Path, recording: Path) -
     assert "--resume goes on with its drive, --extend adds another" in error
     done = succeeded("run", recording, "--out", tmp_path / "b", "--map", parts, "--resume", *RUN)
     first = loaded(parts).keyframes[before - 1].index
-    assert f"before_{first}: the results so far; those of this run begin at frame {first}" in done.stderr
+    assert f"before_{first}: the results of the interrupted run; this run begins at frame {first}" in done.stderr
     assert len(read_trajectory(tmp_path / "b" / f"before_{first}" / "trajectory.tum")) == 35
     assert (tmp_path / "b" / f"before_{first}" / "metrics.json").exists()
     one, two = loaded(whole), loaded(parts)
@@ -389,7 +389,7 @@ def test_a_drive_that_is_killed_leaves_a_sound_map(tmp_path: Path, recording: Pa
     with started(*run, until=lambda: _rejected(path)):
         pass  # and kill -9
     done = succeeded("map", "check", path)
-    assert "keyframes, sound" in done.stdout
+    assert "keyframes, no damage" in done.stdout
     assert _rejected(path)
 
 

@@ -33,9 +33,9 @@ def test_figures_on_stdout_are_json_where_one_is_not_known(capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(("command", "words"), [
-    (["run", ".", "--out", "o", "--resume"], "--resume: in which map?"),
-    (["run", ".", "--out", "o", "--extend"], "--extend: in which map?"),
-    (["run", ".", "--out", "o", "--localise", "m", "--extend"], "--extend: in which map?"),
+    (["run", ".", "--out", "o", "--resume"], "--resume: needs the map, --map FILE"),
+    (["run", ".", "--out", "o", "--extend"], "--extend: needs the map, --map FILE"),
+    (["run", ".", "--out", "o", "--localise", "m", "--extend"], "--extend: needs the map, --map FILE"),
     (["map", "export", "m", "a.g2o", "--voxel", "1"], "--voxel: does not apply to g2o"),
     (["map", "export", "m", "a.ply", "--resolution", "1"], "--resolution: does not apply to ply"),
     (["map", "merge", "a", "b", "--out", "c", "--transform", "1 2 3 4", "--set", "slam.threads=1"],

@@ -44,7 +44,7 @@ def test_train_resume_and_measure(recording: Path, tmp_path: Path) -> None:
     out, third = tmp_path / "out", ("--set", "slam.every=3")
     first = train(recording, out, *SLAM, *third, "--val", recording)
     assert first.returncode == 0
-    assert f"--val {recording} is what the task learns from" in first.stderr
+    assert f"--val {recording}: the task trains on these scans" in first.stderr
     log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log if "slam_loss" in row] == [2]
     assert "miou" in log[-1]

@@ -49,13 +49,13 @@ def test_sequences_that_a_task_is_measured_on_and_learns_from_are_named(tmp_path
         done = succeeded("train", "gndnet", data, "--out", out, *sets(*QUICK, *GROUND), *more)
         return notes(done.stderr)
 
-    assert said(0, "--val", data, "--val-sequences", "02") == [f"note: --val {data} is what the task learns from"]
+    assert said(0, "--val", data, "--val-sequences", "02") == [f"note: --val {data}: the task trains on these scans"]
     both = ("--sequences", "00,02", "--val-sequences", "01,02")
-    assert said(1, "--val", data, *both) == [f"note: --val {data} is what the task learns from: 02"]
-    assert said(2, "--val", one) == [f"note: --val {one} is what the task learns from"]  # by another name
+    assert said(1, "--val", data, *both) == [f"note: --val {data}: the task trains on these scans: 02"]
+    assert said(2, "--val", one) == [f"note: --val {one}: the task trains on these scans"]  # by another name
     assert said(3, "--val", data, "--sequences", "00,01", "--val-sequences", "02") == []
     copy = shutil.copytree(one, tmp_path / "copy")
-    assert said(4, "--sequences", "02", "--val", copy) == [f"note: --val {copy} is what the task learns from"]
+    assert said(4, "--sequences", "02", "--val", copy) == [f"note: --val {copy}: the task trains on these scans"]
 
 
 @pytest.mark.slow
@@ -63,7 +63,7 @@ def test_pairs_that_are_measured_on_and_learned_from_are_named(tmp_path: Path) -
     data = write_pairs(tmp_path / "pairs", scans=2)
     call = ("train", "ae_lidar", data, *sets(*QUICK, *RANGE), "--val", data)
     done = dpm2(*call, "--out", tmp_path / "a", "--sequences", "1")
-    assert notes(done.stderr) == [f"note: --val {data} is what the task learns from: pairs/d1"]
+    assert notes(done.stderr) == [f"note: --val {data}: the task trains on these scans: pairs/d1"]
     done = dpm2(*call, "--out", tmp_path / "b", "--sequences", "1", "--val-sequences", "0")
     assert (done.returncode, notes(done.stderr)) == (0, [])
 
@@ -89,7 +89,7 @@ def test_packed_drives_of_a_validation_that_are_learned_from_are_named(
         drives = json.dumps({str(packed): weight, **({} if weight else {str(elsewhere): 1})})
         call = ("train", "phase1", "--config", tmp_path / "asked.yaml", "--out", tmp_path / f"out{number}")
         done = succeeded(*call, *sets(f"data.packed={drives}", f"validation={validation}"))
-        assert notes(done.stderr) == [f"note: validation {validation} is what the network learns from"] * said
+        assert notes(done.stderr) == [f"note: validation {validation}: the network trains on these scans"] * said
 
 
 @pytest.mark.weights

@@ -142,7 +142,7 @@ def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
     ("arguments", "problem"),
     [
         (("kiti", "DATA", "--out", "OUT"), "kiti: no such experiment; choose from kitti, "),
-        (("kitti", "DATA"), "want NAME DATA --out DIR, or --list"),
+        (("kitti", "DATA"), "give NAME DATA --out DIR, or --list"),
         (("kitti", "DATA", "--out", "OUT", "--sequences", "42"), "42"),
         (("kitti", "DATA", "--out", "OUT", "--seeds", "3"), "kitti: has no use for --seeds"),
         (("robustness", "DATA", "--out", "OUT", "--peer", "kiss-icp"), "robustness: has no use for --peer"),
