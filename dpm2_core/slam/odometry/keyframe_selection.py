@@ -17,10 +17,10 @@ from dpm2_core.geometry.voxel import voxel_first
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.spacing import Spacing
 
-_SAME = np.eye(4)
-_TRACE = 30  # frames that a fix may be older than the frame with which it arrives
+_IDENTITY = np.eye(4)
+_TRACE_LENGTH = 30  # frames that a fix may be older than the frame with which it arrives
 _DRIFT, _DRIFT_RAD = 0.01, np.radians(0.03)  # m and rad per m of motion, standard deviations besides the registration's
-_FAR = 1e5  # m: no larger uncertainty is needed
+_MAX_UNCERTAINTY = 1e5  # m: no larger uncertainty is needed
 
 
 class KeyframeSettings(Settings):
@@ -57,10 +57,10 @@ class KeyframeSelector:
         self._last: Keyframe | None = None
         self._near: list[Array] = []  # T_odom_kf of the keyframes near which the robot has stayed since
         self._uncertainty = np.zeros((6, 6))
-        self._left_open = np.zeros((3, 3))  # root of the covariance, m, of the motion since in unconstrained directions
+        self._open_sigma = np.zeros((3, 3))  # root of the covariance, m, of the motion in unconstrained directions
         self._weakest: Registration | None = None  # the one with the largest sigma since the last keyframe
         self._requested = False
-        self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE)  # stamps and poses of past frames, without a break
+        self._trace: deque[tuple[int, Array]] = deque(maxlen=_TRACE_LENGTH)  # stamps and poses, without a break
         self._fix: tuple[Fix, Array] | None = None  # the last fix, and T_odom_lidar when it was measured
 
     @property
@@ -83,11 +83,11 @@ class KeyframeSelector:
         The unknown there is the velocity, which persists: errors of the steps add up, not their squares.
         """
         variances, axes = np.linalg.eigh(step)
-        if np.trace(self._left_open) < _FAR:
-            self._left_open = self._left_open + (axes * np.sqrt(np.maximum(variances, 0))) @ axes.T
+        if np.trace(self._open_sigma) < _MAX_UNCERTAINTY:
+            self._open_sigma = self._open_sigma + (axes * np.sqrt(np.maximum(variances, 0))) @ axes.T
 
     def select(
-        self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration, T_scan_lidar: Array = _SAME
+        self, frame: Frame, scan: Scan, T_odom_lidar: Array, registration: Registration, T_scan_lidar: Array = _IDENTITY
     ) -> Keyframe | None:
         """The keyframe of this scan, or None. A scan that was not registered never becomes one.
 
@@ -110,36 +110,36 @@ class KeyframeSelector:
             if self._is_known(T_odom_lidar) and not self._requested:
                 return None
             T_last_this = se3.inverse(last.T_odom_kf) @ T_odom_lidar
-            way = max(se3.magnitude(T_last_this)[0], 1.0)
-            drift = isotropic(_DRIFT_RAD * way, _DRIFT * way)
+            distance = max(se3.magnitude(T_last_this)[0], 1.0)
+            drift = isotropic(_DRIFT_RAD * distance, _DRIFT * distance)
             covariance = self._weakest.covariance + drift + self._uncertainty
-            covariance[3:, 3:] += self._left_open @ self._left_open
+            covariance[3:, 3:] += self._open_sigma @ self._open_sigma
             edge = replace(registration, T_target_source=T_last_this, covariance=covariance)
         cloud = scan.points[voxel_first(scan.points, s.voxel, far=s.range)]
-        known = scan.descriptors if scan.description is not None and scan.description.made else None
-        if (T_scan_lidar != _SAME).any():
+        descriptors = scan.descriptors if scan.description is not None and scan.description.made else None
+        if (T_scan_lidar != _IDENTITY).any():
             T_lidar_scan = se3.inverse(T_scan_lidar)
             cloud = se3.transform(T_lidar_scan, cloud)
-            known = None if known is None else known.moved(T_lidar_scan)
+            descriptors = None if descriptors is None else descriptors.moved(T_lidar_scan)
         keyframe = Keyframe(
-            self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, known, up=frame.up
+            self.next_id, frame.stamp, frame.index, T_odom_lidar, cloud, edge, self._robot, descriptors, up=frame.up
         )
         if self._fix is not None:
             fix, T_odom_then = self._fix
             keyframe = replace(keyframe, fix=fix.moved(se3.inverse(T_odom_lidar) @ T_odom_then))
         self._last, self._uncertainty, self._requested, self._fix = keyframe, np.zeros((6, 6)), False, None
-        self._weakest, self._left_open = None, np.zeros((3, 3))
+        self._weakest, self._open_sigma = None, np.zeros((3, 3))
         # Replace keyframes with a similar view: at a halt one may be requested per second, and each frame compares all.
-        self._near = [T for T, degrees in self._near_by(T_odom_lidar) if degrees >= s.angle] + [T_odom_lidar]
+        self._near = [T for T, degrees in self._still_near(T_odom_lidar) if degrees >= s.angle] + [T_odom_lidar]
         return keyframe
 
     def _is_known(self, T_odom_lidar: Array) -> bool:
         """Whether a keyframe shows this view already: a robot turning on the spot sees the same in each revolution."""
-        near = self._near_by(T_odom_lidar)
+        near = self._still_near(T_odom_lidar)
         self._near = [T for T, _ in near]
         return any(degrees < self._settings.angle for _, degrees in near)
 
-    def _near_by(self, T_odom_lidar: Array) -> list[tuple[Array, float]]:
+    def _still_near(self, T_odom_lidar: Array) -> list[tuple[Array, float]]:
         """Keyframes of `_near` that are still near this pose (4, 4), and the angle to each, degrees."""
         moved = [(T, *se3.apart(T, T_odom_lidar)) for T in self._near]
         return [(T, degrees) for T, meters, degrees in moved if meters < self._spacing.meters]
@@ -154,5 +154,5 @@ class KeyframeSelector:
             return
         after = next(i for i, (stamp, _) in enumerate(trace) if stamp >= fix.stamp)
         (t0, T0), (t1, T1) = trace[max(after - 1, 0)], trace[after]
-        part = (fix.stamp - t0) / (t1 - t0) if t1 > t0 else 0.0
-        self._fix = fix, se3.interpolated(T0, T1, part)
+        fraction = (fix.stamp - t0) / (t1 - t0) if t1 > t0 else 0.0
+        self._fix = fix, se3.interpolated(T0, T1, fraction)

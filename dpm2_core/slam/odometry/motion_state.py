@@ -18,16 +18,16 @@ from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.registration.swept import Beginning, Swept, begun_steadily
 
-_GYROSCOPE = np.radians(0.4)
+_GYROSCOPE_SIGMA = np.radians(0.4)
 """Standard deviation of a measured rotation next to the points, rad; points that determine the heading outweigh it. At
 0.1 deg, the accuracy of a good gyroscope, the map took over its bias, scale error or delay with each rotation: 7 deg in
 5 s by a bias of 3 deg/s."""
 ANY_VELOCITY = 15.0**2 * np.eye(3)
 """Covariance (3, 3) of the velocity, m/s, until two scans are registered."""
 
-_ACCELERATION = 40.0  # m/s2 off the predicted motion, in addition to 0.5 m: no vehicle accelerates more
-_RIDE = 3.0  # s: no lift reaches another storey sooner, and in less time a crowd or a narrow place is passed
-_UP, _ASIDE = 30.0, 2.0  # m, standard deviations of the distance that an enclosure may have moved the LiDAR
+_MAX_ACCELERATION = 40.0  # m/s2 off the predicted motion, in addition to 0.5 m: no vehicle accelerates more
+_MIN_RIDE = 3.0  # s: no lift reaches another storey sooner, and in less time a crowd or a narrow place is passed
+_RIDE_UP, _RIDE_ASIDE = 30.0, 2.0  # m, standard deviations of the distance that an enclosure may have moved the LiDAR
 
 
 class MotionState:
@@ -41,7 +41,7 @@ class MotionState:
             registered frame before to it; None until there are two.
         sweep: the motion during the sweep of the last registered frame, if its points have shown it.
         change: (6,) change of the twist from one registered frame to the next.
-        of_velocity: covariance (3, 3) of the twist's velocity, m/s.
+        velocity_covariance: (3, 3) of the twist's velocity, m/s.
         left_open: covariance (3, 3), m, of the last step in directions that the scene does not constrain; else zero.
         T_registered, seconds: the last registered pose (4, 4), and the time from it to the last frame.
         inertial: the IMU, once a frame had samples. reckoned: the motion to the current frame by the IMU, if it is
@@ -55,16 +55,16 @@ class MotionState:
         self.twist: Array | None = None
         self.sweep: Swept | None = None
         self.change = np.zeros(6)
-        self.of_velocity, self.left_open = ANY_VELOCITY, np.zeros((3, 3))
+        self.velocity_covariance, self.left_open = ANY_VELOCITY, np.zeros((3, 3))
         self.T_registered, self.seconds = np.eye(4), 0.0
         self.inertial: InertialMotion | None = None
         self.reckoned: Reckoned | None = None
         self._open_way: OpenWay | None = None
         self._speed_shown = True  # in unconstrained directions, when the IMU began to estimate the motion there
         self.other: OtherMotion | None = None
-        self._open = 0.0  # s, for which the scene has not constrained a direction
+        self._open_seconds = 0.0  # s, for which the scene has not constrained a direction
         self._started = False
-        self._enclosed: float | None = None  # s, time since which all returns are near
+        self._enclosed_since: float | None = None  # s, time since which all returns are near
 
     def start(self, up: Up | None) -> None:
         """Set the pose of the first frame: `up` (3,), of `Frame`, points up. Later calls have no effect."""
@@ -83,12 +83,12 @@ class MotionState:
         frame = self.inertial.look(frame)
         if self.twist is not None:
             R = self.T_registered[:3, :3]
-            self.reckoned = self.inertial.step(frame.stamp, R, self.twist[3:], self.of_velocity)
+            self.reckoned = self.inertial.step(frame.stamp, R, self.twist[3:], self.velocity_covariance)
         return frame
 
     def begin(self, T: Array) -> None:
         """A new map begins with a frame at T (4, 4), reached by an unknown motion and registered next."""
-        self.T, self.twist, self.of_velocity, self._speed_shown = T, None, ANY_VELOCITY, False
+        self.T, self.twist, self.velocity_covariance, self._speed_shown = T, None, ANY_VELOCITY, False
 
     @property
     def known_twist(self) -> Array:
@@ -116,7 +116,7 @@ class MotionState:
         """Rotations in the parts of that time: see `InertialMotion`."""
         return None if self.inertial is None else self.inertial.turning
 
-    def _of_turn(self, seconds: float) -> Array | None:
+    def _rotation_covariance(self, seconds: float) -> Array | None:
         """Covariance (3, 3) rad2 of `turn` over `seconds`."""
         return None if self.inertial is None else self.inertial.covariance(seconds)
 
@@ -144,16 +144,16 @@ class MotionState:
 
     def of_prediction(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one registered `seconds` before."""
-        result = spread(self.settings.steadiness * seconds * seconds, seconds, self.of_velocity)
-        if (of_turn := self._of_turn(seconds)) is not None:
-            result[:3, :3] = of_turn
+        result = spread(self.settings.steadiness * seconds * seconds, seconds, self.velocity_covariance)
+        if (rotation_covariance := self._rotation_covariance(seconds)) is not None:
+            result[:3, :3] = rotation_covariance
         return result
 
     def information(self, seconds: float) -> Array:
         """Information (6, 6) of a pose that is predicted from one registered `seconds` before."""
         covariance = self.of_prediction(seconds)
         if self.turn is not None:
-            covariance[:3, :3] += _GYROSCOPE**2 * np.eye(3)
+            covariance[:3, :3] += _GYROSCOPE_SIGMA**2 * np.eye(3)
         return np.linalg.inv(covariance).astype(np.float64)
 
     def beginning(self, T: Array, seconds: float, half: float) -> Beginning:
@@ -168,17 +168,24 @@ class MotionState:
 
     def unknown(self, dt: float) -> Array:
         """Covariance (6, 6) of a frame's pose, `dt` s after the previous one, that is only predicted."""
-        speed, swing = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
+        speed, rate_change = float(np.linalg.norm(self.known_twist[3:])), float(np.linalg.norm(self.change[:3]))
         seconds = self.seconds + dt
         # A rotation rate that has changed may change again.
-        return covariance(speed, seconds, self.settings.steadiness, self.of_velocity, swing, self._of_turn(seconds))
+        return covariance(
+            speed,
+            seconds,
+            self.settings.steadiness,
+            self.velocity_covariance,
+            rate_change,
+            self._rotation_covariance(seconds),
+        )
 
     def gated(self, result: Registration, T_predicted: Array, dt: float) -> Registration:
         """Reject a motion that no vehicle can make; the allowance grows while nothing is registered."""
         time = self.seconds + dt
         meters, degrees = se3.apart(T_predicted, result.T_target_source)
-        unknown = 3 * float(np.linalg.eigvalsh(self.of_velocity)[-1]) ** 0.5 * time
-        if result.ok and meters > 0.5 + unknown + _ACCELERATION * time * time:
+        uncertainty = 3 * float(np.linalg.eigvalsh(self.velocity_covariance)[-1]) ** 0.5 * time
+        if result.ok and meters > 0.5 + uncertainty + _MAX_ACCELERATION * time * time:
             return result.rejected(f"{meters:.1f} m from the prediction")
         if result.ok and degrees > 3 + self.settings.max_turn * time:
             return result.rejected(f"{degrees:.0f} deg from the prediction")
@@ -196,29 +203,31 @@ class MotionState:
         seconds, moved = self.seconds + dt, registration.method != "first"
         by_imu = False
         if moved:
-            registration, swept, by_imu = self._along_open(registration, swept, seconds, led)
-            self._move(registration, seconds, led, swept)
+            registration, swept, by_imu = self._correct_open_directions(registration, swept, seconds, led)
+            self._update_motion(registration, seconds, led, swept)
         self.register(registration, stamp, moved, by_imu)
         self.sweep = swept
-        self._open = self._open + seconds if registration.worst_sigma >= OPEN else 0.0
+        self._open_seconds = self._open_seconds + seconds if registration.worst_sigma >= OPEN else 0.0
         self.left_open = np.zeros((3, 3))
-        if moved and self._open:
-            whole, self.left_open = self._left_open(registration.of_scene[3:, 3:], seconds)
-            self.covariance[3:, 3:] += whole
+        if moved and self._open_seconds:
+            total, self.left_open = self._open_covariances(registration.of_scene[3:, 3:], seconds)
+            self.covariance[3:, 3:] += total
 
-    def _left_open(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
+    def _open_covariances(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
         """Covariances (3, 3), m, of the motion in unconstrained directions: in all that time, and in `seconds`.
 
         The covariance of a scan is limited to 1 m there; that of the motion is not, as each pose follows from the last.
         """
-        of_velocity, way = along_open(of_scene, self.of_velocity), self._open_way
-        whole, step = of_velocity * self._open**2, of_velocity * seconds**2
-        if way is None or not self._speed_shown:
-            return whole, step
-        along = along_open(of_scene, np.eye(3))
-        return min(whole, along * way.sigma**2, key=np.trace), min(step, along * way.gained**2, key=np.trace)
+        open_velocity, open_way = along_open(of_scene, self.velocity_covariance), self._open_way
+        total, step = open_velocity * self._open_seconds**2, open_velocity * seconds**2
+        if open_way is None or not self._speed_shown:
+            return total, step
+        projection = along_open(of_scene, np.eye(3))
+        return min(total, projection * open_way.sigma**2, key=np.trace), min(
+            step, projection * open_way.gained**2, key=np.trace
+        )
 
-    def _along_open(
+    def _correct_open_directions(
         self, registration: Registration, swept: Swept | None, seconds: float, led: bool
     ) -> tuple[Registration, Swept | None, bool]:
         """A registration and the motion during its sweep, and whether an IMU has corrected them. It does so in the
@@ -230,24 +239,24 @@ class MotionState:
             return registration, swept, False
         if self._open_way is None:
             self._open_way = OpenWay(self.T_registered, self.known_twist[3:])
-        T, along = registration.T_target_source.copy(), along_open(registration.of_scene[3:, 3:], np.eye(3))
-        off = self._open_way.follow(self.T_registered, T, along, self.reckoned, seconds)
+        T, projection = registration.T_target_source.copy(), along_open(registration.of_scene[3:, 3:], np.eye(3))
+        offset = self._open_way.follow(self.T_registered, T, projection, self.reckoned, seconds)
         if not self._open_way.leads:
             return registration, swept, False
-        T[:3, 3] += off
+        T[:3, 3] += offset
         if swept is not None:
             motion = swept.motion.copy()
-            motion[0, 3:] += along @ (T[:3, :3].T @ self._open_way.velocity - motion[0, 3:])
+            motion[0, 3:] += projection @ (T[:3, :3].T @ self._open_way.velocity - motion[0, 3:])
             swept = replace(swept, T=T, motion=motion)
         return replace(registration, T_target_source=T), swept, True
 
-    def _move(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
+    def _update_motion(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """Update the motion from the last registered frame to the one `seconds` later."""
         step = self.other.step if led and self.other is not None else None
         of_prediction = self.of_prediction(seconds) if step is None else step.covariance
         of_scene = turned_open(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
         of_motion = combined(of_scene, of_prediction[3:, 3:])
-        self.of_velocity = of_motion / seconds**2
+        self.velocity_covariance = of_motion / seconds**2
         # Not from the predicted pose of the previous frame: its error would count as motion in one period.
         T_step = se3.inverse(self.T_registered) @ registration.T_target_source
         twist = se3.log(T_step) / seconds if swept is None else swept.motion[0]
@@ -258,16 +267,16 @@ class MotionState:
 
     def opens(self, enclosed: bool, now: float) -> bool:
         """Whether a registered frame, at `now` s, is the first outside of an enclosure that may have moved (a lift)."""
-        since = self._enclosed
-        self._enclosed = None if not enclosed else now if since is None else since
-        return not enclosed and since is not None and now - since >= _RIDE
+        since = self._enclosed_since
+        self._enclosed_since = None if not enclosed else now if since is None else since
+        return not enclosed and since is not None and now - since >= _MIN_RIDE
 
     def carry(self) -> None:
         """Add the unknown motion with an enclosure, such as a lift, to the covariance."""
         R = self.T[:3, :3]
-        along = np.zeros((6, 6))
-        along[3:, 3:] = R.T @ np.diag([_ASIDE, _ASIDE, _UP]) ** 2 @ R
-        self.covariance = self.covariance + along
+        added = np.zeros((6, 6))
+        added[3:, 3:] = R.T @ np.diag([_RIDE_ASIDE, _RIDE_ASIDE, _RIDE_UP]) ** 2 @ R
+        self.covariance = self.covariance + added
 
     def register(self, registration: Registration, stamp: int | None, moved: bool, by_imu: bool = False) -> None:
         """Continue from a registered pose. `moved`: the twist led there, else the motion is unknown. `by_imu`: the

@@ -26,12 +26,12 @@ from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 
-_ENCLOSED = "all points are near: the LiDAR may be in something that moves with it, such as a lift"
-_CARRIED = "broken: the LiDAR was in something that may have moved with it, such as a lift"
-_KNOWN = 0.5  # m and rad, standard deviation of the second pose, still skewed; the points find the pose from within it
-_LOST = 5  # frames without a registration, after which the state is `lost`, `degraded` before
-_TRIES = 10  # frames after a pause that are registered to the map before it, before the odometry counts as broken
-_BURST = 0.6  # of the usual period: while no motion is known, a frame that arrives sooner was delayed
+_ENCLOSED_REASON = "all points are near: the LiDAR may be in something that moves with it, such as a lift"
+_CARRIED_REASON = "broken: the LiDAR was in something that may have moved with it, such as a lift"
+_SECOND_SIGMA = 0.5  # m and rad, of the second pose, still skewed; the points find the pose from within it
+_MAX_FAILURES = 5  # frames without a registration, after which the state is `lost`, `degraded` before
+_MAX_TRIES = 10  # frames after a pause that are registered to the map before it, before the odometry counts as broken
+_BURST_RATIO = 0.6  # of the usual period: while no motion is known, a frame that arrives sooner was delayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Odometry:
     def __init__(self, tools: Tools, robot: str = "") -> None:
         """`robot`: namespace of its keyframes."""
         self._keyframes = KeyframeSelector(tools.keyframes, robot)
-        self._use(tools)
+        self._use_tools(tools)
         self.reset()
 
     @property
@@ -87,14 +87,14 @@ class Odometry:
         self._registration = self._tools.registration.fresh()
         self._keyframes.reset()
 
-    def _use(self, tools: Tools) -> None:
-        """Use these tools from now on; registration and motion follow in `reset` or `_go_on_with`."""
+    def _use_tools(self, tools: Tools) -> None:
+        """Use these tools from now on; registration and motion follow in `reset` or `_switch_tools`."""
         self._tools, self._settings = tools, tools.settings
         self._keyframes.use(tools.keyframes)
 
-    def _go_on_with(self, tools: Tools, frame: Frame) -> None:
+    def _switch_tools(self, tools: Tools, frame: Frame) -> None:
         """Continue with other tools after a registered frame: same pose and motion, and a map of that scan only."""
-        self._use(tools)
+        self._use_tools(tools)
         self._motion.settings = self._settings
         self._failures, self._first, self._bridge = 0, None, None
         self._registration = tools.registration.fresh()
@@ -118,24 +118,24 @@ class Odometry:
 
     def process(self, frame: Frame) -> OdometryResult:
         """Pose of one frame; never raises for data that a sensor may deliver, and always returns a finite pose."""
-        clock, motion = [perf_counter()], self._motion
+        ticks, motion = [perf_counter()], self._motion
         motion.start(frame.up)
-        given = self._part.new(frame)
-        is_part, frame = given is not frame, self._sweep.centered(given)
+        received = self._part.new(frame)
+        is_part, frame = received is not frame, self._sweep.centered(received)
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
-            self._forget_first(dt)
-        frame, twist = self._look(frame, motion.seconds + dt)
+            self._discard_first(dt)
+        frame, twist = self._use_priors(frame, motion.seconds + dt)
         scan = self._registration.prepare(frame, twist)
-        clock.append(perf_counter())
-        frame, match, dt = self._matched(frame, scan, twist, dt)
-        clock.append(perf_counter())
+        ticks.append(perf_counter())
+        frame, match, dt = self._match(frame, scan, twist, dt)
+        ticks.append(perf_counter())
         scan, registration = match.scan, match.result
         enclosed = is_enclosed(scan.points)
         if is_part:
             registration = registration.because(PART_PROBLEM)
         if enclosed:
-            registration = registration.because(_ENCLOSED)
+            registration = registration.because(_ENCLOSED_REASON)
         self._update(match, dt)
         if registration.ok:
             self._sweep.judge(match.contradicted)
@@ -144,19 +144,19 @@ class Odometry:
             self._first, self._first_sweep = frame, copy(self._sweep)
         T = motion.T
         if self._bridge is not None and registration.ok:
-            registration = self._cross(self._bridge, scan, registration)
+            registration = self._cross_pause(self._bridge, scan, registration)
             T = registration.T_target_source
         elif registration.ok and motion.opens(enclosed, self._clock.now):
-            registration = self._step_out(scan, registration)
+            registration = self._leave_enclosure(scan, registration)
         if motion.inertial is not None:
             T = motion.inertial.T_level_odom @ T
         T_scan_lidar = self._sweep.to_stamp(frame, motion.during)
         T = T @ T_scan_lidar
-        keyframe = self._keyframes.select(given, scan, T, registration, T_scan_lidar)
-        looked_at, seen = ({image.camera.name for image in one.images} for one in (frame, given))
-        clock.append(perf_counter())
+        keyframe = self._keyframes.select(received, scan, T, registration, T_scan_lidar)
+        used, delivered = ({image.camera.name for image in one.images} for one in (frame, received))
+        ticks.append(perf_counter())
         return OdometryResult(
-            stamp=given.stamp,
+            stamp=received.stamp,
             index=frame.index,
             T_odom_lidar=T,
             covariance=motion.covariance + self._sweep.covariance(motion.change),
@@ -165,16 +165,16 @@ class Odometry:
             registration=registration,
             keyframe=keyframe,
             breaks=len(self._breaks),
-            seconds=dict(zip(("preprocess", "register", "update"), np.diff(clock).tolist(), strict=True)),
+            seconds=dict(zip(("preprocess", "register", "update"), np.diff(ticks).tolist(), strict=True)),
             comparison=None if motion.other is None else motion.other.comparison,
             imu=None if motion.inertial is None else motion.inertial.problem,
             times=self._sweep.problem,
-            repeated=frozenset(seen - looked_at),
+            repeated=frozenset(delivered - used),
         )
 
-    def _matched(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:
+    def _match(self, frame: Frame, scan: Scan, twist: Array, dt: float) -> tuple[Frame, Match, float]:
         """Register a frame, prepared by a twist (6,): the frame, without an unusable IMU, its match, the period, s."""
-        pauses = self._pauses(frame, dt) and not self._registration.rejection(scan)
+        pauses = self._is_after_pause(frame, dt) and not self._registration.rejection(scan)
         T_predicted = self._begin_stretch(dt, frame.stepped) if pauses else self._motion.predicted(twist, dt)
         match, dt = self._register(frame, scan, T_predicted, dt)
         self._clock.correct(dt)
@@ -185,15 +185,15 @@ class Odometry:
             T_first_this = se3.inverse(motion.T) @ match.result.T_target_source
             if imu.denied(T_first_this[:3, :3], motion.seconds + dt):
                 self._first, frame = replace(self._first, imu=None), replace(frame, imu=None)
-        match = self._unbent(frame, match, twist, dt)
+        match = self._straighten(frame, match, twist, dt)
         known = motion.twist is not None and match.result.method not in ("none", "first")
         if known and motion.turn is not None and not match.result.ok:
-            again = self._matcher.again_without_imu(frame, dt, self._sweep.span / 2)
-            if again.result.ok:
-                frame, match, motion.reckoned = replace(frame, imu=None), again, None
+            without_imu = self._matcher.again_without_imu(frame, dt, self._sweep.span / 2)
+            if without_imu.result.ok:
+                frame, match, motion.reckoned = replace(frame, imu=None), without_imu, None
         return frame, match, dt
 
-    def _look(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
+    def _use_priors(self, frame: Frame, seconds: float) -> tuple[Frame, Array]:
         """Process IMU and other odometry of a frame, `seconds` after the last registered one: returns the frame with
         its usable data, and the twist (6,) that predicts its pose."""
         motion = self._motion
@@ -207,7 +207,7 @@ class Odometry:
             motion.other.look(frame.guess, known, seconds, motion.of_prediction(seconds))
         return frame, twist
 
-    def _forget_first(self, dt: float) -> None:
+    def _discard_first(self, dt: float) -> None:
         """The first scan shows only a part of the scene, as drivers start in mid-sweep: the next one is the first."""
         self._first = None
         self._registration = self._registration.fresh()
@@ -225,14 +225,14 @@ class Odometry:
         images = self._images.new(frame)
         return frame if len(images) == len(frame.images) else replace(frame, images=images)
 
-    def _pauses(self, frame: Frame, dt: float) -> bool:
+    def _is_after_pause(self, frame: Frame, dt: float) -> bool:
         """Whether the last registered scan is so old that a single scan is not accepted.
 
         If scans were dropped for lack of time, the limit is higher: the work after a pause would drop even more.
         """
-        least = SLOWEST if frame.dropped else self._settings.pause
+        min_pause = SLOWEST if frame.dropped else self._settings.pause
         known = len(self._registration) > 0 and frame.problem is None
-        return known and (self._clock.went_back or self._motion.seconds + dt > self._clock.pause(least))
+        return known and (self._clock.went_back or self._motion.seconds + dt > self._clock.pause(min_pause))
 
     def _begin_stretch(self, dt: float, stepped: bool) -> Array:
         """After a pause: the scan starts its own map at the predicted pose (4, 4), which is returned; `stepped` if the
@@ -248,7 +248,7 @@ class Odometry:
         motion.begin(self._bridge.begin(self._clock.now, T_other, imu, reckoned, stepped))
         return motion.T
 
-    def _cross(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
+    def _cross_pause(self, bridge: Bridge, scan: Scan, own: Registration) -> Registration:
         """Register a scan after a pause to the map before it; accept if it is confirmed; after enough tries, break."""
         motion = self._motion
         result, certain = bridge.register(scan, motion.T, motion.twist, own)
@@ -258,24 +258,24 @@ class Odometry:
             self._registration.update(scan, motion.T)
             return result
         motion.covariance = bridge.covariance(motion.T) + own.covariance
-        if bridge.tries >= _TRIES and motion.twist is not None:
+        if bridge.tries >= _MAX_TRIES and motion.twist is not None:
             self._bridge, self._failures = None, 0
-            self._break(loops=True)
+            self._record_break(loops=True)
             return replace(own, reason=f"broken by a pause: {result.reason}")
         self._failures += not bridge.agreed
         T = result.T_target_source if result.ok else motion.T
         return replace(result, T_target_source=T, ok=False, reason=result.reason or "after a pause: not confirmed yet")
 
-    def _step_out(self, scan: Scan, registration: Registration) -> Registration:
+    def _leave_enclosure(self, scan: Scan, registration: Registration) -> Registration:
         """The LiDAR leaves what enclosed it: a break, and a new map of what is seen outside."""
         self._motion.carry()
-        self._break(loops=False)
+        self._record_break(loops=False)
         self._keyframes.request()
         self._registration = self._registration.fresh()
         self._registration.update(scan, self._motion.T)
-        return registration.because(_CARRIED)
+        return registration.because(_CARRIED_REASON)
 
-    def _break(self, loops: bool) -> None:
+    def _record_break(self, loops: bool) -> None:
         """Record a break: the motion from earlier to later keyframes is known no better than the current pose."""
         self._keyframes.add_uncertainty(self._motion.covariance)
         self._breaks.append((self.next_keyframe, loops))
@@ -286,7 +286,7 @@ class Odometry:
         motion = self._motion
         match = self._matcher.match(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
-        if (burst := dt < _BURST * usual) and self._bridge is not None:
+        if (burst := dt < _BURST_RATIO * usual) and self._bridge is not None:
             self._bridge.held = True
         if motion.twist is None:
             return match, usual if burst else dt
@@ -303,14 +303,14 @@ class Odometry:
             dt = period_by_motion(result.T_target_source, (dt, T_predicted), (usual, T_usual), steadiness)
         return match, dt
 
-    def _unbent(self, frame: Frame, match: Match, twist: Array, dt: float) -> Match:
+    def _straighten(self, frame: Frame, match: Match, twist: Array, dt: float) -> Match:
         """Prepare and register a scan anew if its points show another motion than the one (6,) that it was prepared by;
         `dt`: s since the previous frame. Also prepare the first scan of a map anew."""
         if self._first is None:
             return self._matcher.straightened(frame, match, twist, dt, self._sweep.span / 2)
-        return self._begin_again(self._first, frame, match, self._motion.seconds + dt) if match.result.ok else match
+        return self._redo_first(self._first, frame, match, self._motion.seconds + dt) if match.result.ok else match
 
-    def _begin_again(self, first: Frame, frame: Frame, match: Match, seconds: float) -> Match:
+    def _redo_first(self, first: Frame, frame: Frame, match: Match, seconds: float) -> Match:
         """The second scan shows the velocity, `seconds` later: undo the motion in the first scan too; register anew."""
         self._first, motion = None, self._motion
         T_first_this = se3.inverse(motion.T) @ match.result.T_target_source
@@ -320,7 +320,7 @@ class Odometry:
         self._registration = self._registration.fresh()
         self._registration.update(self._registration.prepare(first, twist), motion.T)
         scan = self._registration.prepare(frame, twist)
-        known = Prediction([motion.T @ T_first_this], information=np.eye(6) / _KNOWN**2)
+        known = Prediction([motion.T @ T_first_this], information=np.eye(6) / _SECOND_SIGMA**2)
         return match._replace(scan=scan, result=self._registration.register(scan, known))
 
     def _update(self, match: Match, dt: float) -> None:
@@ -340,7 +340,7 @@ class Odometry:
         self._registration.update(match.scan, motion.T)
 
     def _state(self, registration: Registration, enclosed: bool) -> State:
-        if self._failures >= _LOST:
+        if self._failures >= _MAX_FAILURES:
             return State.LOST
         if self._motion.twist is None and self._bridge is None:
             return State.INITIALIZING

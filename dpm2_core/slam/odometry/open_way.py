@@ -13,10 +13,10 @@ import numpy as np
 from dpm2_core.frame import Array
 from dpm2_core.slam.odometry.inertial import Reckoned
 
-_SCANS, _SPEED = 0.1, 0.1  # m and m/s, standard deviations of the distance by scans, and of the speed that they show
-_SPAN = 1.0  # s over which the two are compared
+_DISTANCE_SIGMA, _SPEED_SIGMA = 0.1, 0.1  # m and m/s, of the distance by scans, and of the speed that they show
+_MIN_SPAN = 1.0  # s over which the two are compared
 _GAIN = 0.5  # fraction of the difference by which the speed is then corrected
-_CONTRADICTS = 3.0  # standard deviations
+_MAX_SIGMAS = 3.0
 
 
 class OpenWay:
@@ -41,20 +41,20 @@ class OpenWay:
             T: (4, 4) of the frame; T_before: of the last one, `seconds` before it. step: the motion between by the IMU.
             along: (3, 3) projection onto the unconstrained directions, in the axes of T.
         """
-        R, left = T_before[:3, :3], T[:3, :3] @ along @ T[:3, :3].T
+        R, projection = T_before[:3, :3], T[:3, :3] @ along @ T[:3, :3].T
         self._position = self._position + self.velocity * seconds + R @ step.gained[0]
         by_scans = (T[:3, 3] - T_before[:3, 3]) / seconds
-        self.velocity = by_scans + left @ (self.velocity + R @ step.gained[1] - by_scans)
+        self.velocity = by_scans + projection @ (self.velocity + R @ step.gained[1] - by_scans)
         self._seconds += seconds
-        off = np.asarray(left @ (self._position - T[:3, 3]))
-        self._position = T[:3, 3] + off
+        offset = np.asarray(projection @ (self._position - T[:3, 3]))
+        self._position = T[:3, 3] + offset
         t = self._seconds
-        allowed = _CONTRADICTS * float(np.linalg.norm([_SCANS, _SPEED * t, 0.5 * step.sigma * t**2]))
-        self.leads |= float(np.linalg.norm(off)) > allowed
+        allowed = _MAX_SIGMAS * float(np.linalg.norm([_DISTANCE_SIGMA, _SPEED_SIGMA * t, 0.5 * step.sigma * t**2]))
+        self.leads |= float(np.linalg.norm(offset)) > allowed
         # Before the two contradict each other the error may be this large, each time in the same direction.
         self.gained = max(0.0, self._sigma_before + allowed - self.sigma)
         self.sigma += self.gained
-        if not self.leads and t >= _SPAN:
-            self.velocity = self.velocity - _GAIN * off / t
+        if not self.leads and t >= _MIN_SPAN:
+            self.velocity = self.velocity - _GAIN * offset / t
             self._position, self._seconds, self._sigma_before = T[:3, 3], 0.0, self.sigma
-        return off
+        return offset

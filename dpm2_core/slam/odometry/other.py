@@ -21,14 +21,14 @@ from dpm2_core.geometry.motion import predicted
 from dpm2_core.slam.registration.protocol import MAP_NOISE
 
 # Standard deviations of a step: at rest, and per m (or rad) of motion. They are so large that points outweigh them.
-_STANDING = np.array([0.5 * np.pi / 180, 0.05])
-_SHARE = 0.05
-_POSSIBLE = 9.0  # squared sigmas from the scan, or from the previous motion; hard braking already takes one
-_JUDGED = (0.5, 1.0)  # m or s: over less, any error of a slow robot is within the assumed error of a step
-_MEMORY = 0.1  # weight of the newest motion in the doubt
-_USUAL = 3.0  # squared sigmas of a usual measurement; more makes the sensor doubtful,
-_WORST = 25.0  # up to this multiple of it, so that a single jump is forgiven
-_CREDIBLE = 4.0  # largest doubt at which the sensor is used
+_REST_SIGMAS = np.array([0.5 * np.pi / 180, 0.05])
+_MOTION_SHARE = 0.05
+_MAX_CHI2 = 9.0  # squared sigmas from the scan, or from the previous motion; hard braking already takes one
+_MIN_JUDGED = (0.5, 1.0)  # m or s: over less, any error of a slow robot is within the assumed error of a step
+_NEWEST_WEIGHT = 0.1  # weight of the newest motion in the doubt
+_USUAL_CHI2 = 3.0  # squared sigmas of a usual measurement; more makes the sensor doubtful,
+_MAX_ERROR = 25.0  # up to this multiple of it, so that a single jump is forgiven
+_MAX_DOUBT = 4.0  # largest doubt at which the sensor is used
 
 
 class Doubt:
@@ -44,13 +44,13 @@ class Doubt:
 
     def add(self, squared: float) -> None:
         """Add a measurement with this error in squared sigmas."""
-        newest = min(squared / _USUAL, _WORST)
+        newest = min(squared / _USUAL_CHI2, _MAX_ERROR)
         self.value = max(self._least, (1 - self._memory) * self.value + self._memory * newest)
 
     @property
     def is_credible(self) -> bool:
         """Whether the sensor is used."""
-        return self.value <= _CREDIBLE
+        return self.value <= _MAX_DOUBT
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,26 +62,26 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _Motion:
     """Consecutive steps by both: each T (4, 4), the covariance (6, 6) of the scans' T, and the duration."""
 
     T_other: Array
     T_scans: Array
-    of_scans: Array
+    scans_covariance: Array
     seconds: float
 
-    def and_then(self, step: _Way) -> _Way:
-        return _Way(
+    def and_then(self, step: _Motion) -> _Motion:
+        return _Motion(
             self.T_other @ step.T_other,
             self.T_scans @ step.T_scans,
-            self.of_scans + step.of_scans,
+            self.scans_covariance + step.scans_covariance,
             self.seconds + step.seconds,
         )
 
     @property
     def is_judged(self) -> bool:
         meters = max(se3.magnitude(T)[0] for T in (self.T_other, self.T_scans))
-        return meters >= _JUDGED[0] or self.seconds >= _JUDGED[1]
+        return meters >= _MIN_JUDGED[0] or self.seconds >= _MIN_JUDGED[1]
 
 
 class OtherMotion:
@@ -97,15 +97,15 @@ class OtherMotion:
         self._steadiness = steadiness
         self.step: Step | None = None
         self.comparison: Comparison | None = None
-        self._raw: Array | None = None  # the step, possible or not
-        self._unsure = False  # only by its own covariance
+        self._raw_step: Array | None = None  # the step, possible or not
+        self._uncertain = False  # only by its own covariance
         self._jumped = False  # since the last registered frame; or it repeats a pose where it cannot have stopped
-        self._now: Guess | None = None
-        self._last: Guess | None = None  # that of the last registered frame
-        self._before: Guess | None = None  # the last one; below: its time after `_last`, s, and its motion (6,)
+        self._guess: Guess | None = None
+        self._registered_guess: Guess | None = None  # that of the last registered frame
+        self._previous_guess: Guess | None = None  # below: its time after `_registered_guess`, s, and motion (6,)
         self._seconds, self._twist = 0.0, np.zeros(6)
-        self._way: _Way | None = None  # motion since the last judgement
-        self._doubt = Doubt(_MEMORY, least=1.0)
+        self._compared: _Motion | None = None  # motion since the last judgement
+        self._doubt = Doubt(_NEWEST_WEIGHT, least=1.0)
 
     def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
         """Process the guess of a new frame, `seconds` after the last registered one.
@@ -114,71 +114,73 @@ class OtherMotion:
             twist: (6,) [rad/s, m/s] predicted for it; None if unknown.
             of_prediction: covariance (6, 6) of the pose predicted by it.
         """
-        self._now, self.step, self._raw, self.comparison, self._unsure = guess, None, None, None, False
-        if guess is None or self._last is None:
+        self._guess, self.step, self._raw_step, self.comparison, self._uncertain = guess, None, None, None, False
+        if guess is None or self._registered_guess is None:
             return
-        T = self._raw = se3.orthonormalized(se3.inverse(self._last.T_other_lidar) @ guess.T_other_lidar)
-        grown = _grown(self._last, guess)
-        covariance = _spread(T) + grown
-        lost, unsteady = self._before is not self._last, self._is_unsteady(guess, seconds)
+        T = self._raw_step = se3.orthonormalized(
+            se3.inverse(self._registered_guess.T_other_lidar) @ guess.T_other_lidar
+        )
+        increase = _reported_increase(self._registered_guess, guess)
+        covariance = _step_covariance(T) + increase
+        unregistered, unsteady = self._previous_guess is not self._registered_guess, self._is_unsteady(guess, seconds)
         if twist is not None:
             T_predicted = predicted(np.eye(4), twist, seconds)
-            impossible = se3.squared_sigmas(T_predicted, T, covariance + of_prediction) > _POSSIBLE
-            same = np.array_equal(self._last.T_other_lidar, guess.T_other_lidar)
-            self._jumped = impossible or (lost and unsteady) or (self._jumped and (lost or same))
+            impossible = se3.squared_sigmas(T_predicted, T, covariance + of_prediction) > _MAX_CHI2
+            repeated = np.array_equal(self._registered_guess.T_other_lidar, guess.T_other_lidar)
+            self._jumped = impossible or (unregistered and unsteady) or (self._jumped and (unregistered or repeated))
             if self._jumped or not self._doubt.is_credible:
                 return
-            self._unsure = bool(np.trace(grown[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
-            if self._unsure:
+            self._uncertain = bool(np.trace(increase[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
+            if self._uncertain:
                 return
         self.step = Step(T, covariance)
 
     def _is_unsteady(self, guess: Guess, seconds: float) -> bool:
         """Whether a guess, `seconds` after the last registered frame, cannot follow the previous guess by driving."""
-        assert self._before is not None
-        before, period = self._before, seconds - self._seconds
+        assert self._previous_guess is not None
+        before, period = self._previous_guess, seconds - self._seconds
         T, T_steady = se3.inverse(before.T_other_lidar) @ guess.T_other_lidar, predicted(np.eye(4), self._twist, period)
-        self._before, self._seconds, self._twist = guess, seconds, se3.log(T) / period
-        covariance = _spread(T) + _spread(T_steady) + _grown(before, guess)
+        self._previous_guess, self._seconds, self._twist = guess, seconds, se3.log(T) / period
+        covariance = _step_covariance(T) + _step_covariance(T_steady) + _reported_increase(before, guess)
         covariance += (self._steadiness * period**2) ** 2 * np.eye(6)
-        return se3.squared_sigmas(T_steady, T, covariance) > _POSSIBLE
+        return se3.squared_sigmas(T_steady, T, covariance) > _MAX_CHI2
 
     def agrees(self, T_before: Array, result: Registration) -> bool:
         """Whether a scan registered from the end of the step (the last one at T_before (4, 4)) confirms the step."""
         assert self.step is not None
         covariance = result.of_scene + self.step.covariance + MAP_NOISE
-        return se3.squared_sigmas(T_before @ self.step.T, result.T_target_source, covariance) <= _POSSIBLE
+        return se3.squared_sigmas(T_before @ self.step.T, result.T_target_source, covariance) <= _MAX_CHI2
 
     def compare(self, T_scans: Array, of_scene: Array, seconds: float, used: bool) -> None:
         """Compare with the step (4, 4) of the scans, covariance (6, 6), since the last registered frame."""
-        if self._raw is None:
-            self._way = None
+        if self._raw_step is None:
+            self._compared = None
             return
-        step = _Way(self._raw, T_scans, of_scene, seconds)
-        way = self._way = step if self._way is None else self._way.and_then(step)
-        if way.is_judged:
-            covariance = way.of_scans + _spread(way.T_other) + MAP_NOISE
-            self._doubt.add(se3.squared_sigmas(way.T_other, way.T_scans, covariance))
-            self._way = None
-        self.comparison = Comparison(self._raw, T_scans, used, self._doubt.value**0.5, self._unsure)
+        step = _Motion(self._raw_step, T_scans, of_scene, seconds)
+        motion = self._compared = step if self._compared is None else self._compared.and_then(step)
+        if motion.is_judged:
+            covariance = motion.scans_covariance + _step_covariance(motion.T_other) + MAP_NOISE
+            self._doubt.add(se3.squared_sigmas(motion.T_other, motion.T_scans, covariance))
+            self._compared = None
+        self.comparison = Comparison(self._raw_step, T_scans, used, self._doubt.value**0.5, self._uncertain)
 
     def keep(self) -> None:
         """This frame was registered: the next step starts here."""
-        self._last = self._before = self._now
+        self._registered_guess = self._previous_guess = self._guess
         self._seconds = 0.0
 
 
-def _spread(T: Array) -> Array:
+def _step_covariance(T: Array) -> Array:
     """Covariance (6, 6) of a step (4, 4)."""
     meters, degrees = se3.magnitude(T)
-    return isotropic(*(_STANDING + _SHARE * np.array([np.radians(degrees), meters])))
+    return isotropic(*(_REST_SIGMAS + _MOTION_SHARE * np.array([np.radians(degrees), meters])))
 
 
-def _grown(before: Guess, now: Guess) -> Array:
+def _reported_increase(before: Guess, now: Guess) -> Array:
     """Increase of the covariance (6, 6) that the odometry itself reports, in fixed axes; 0 if it reports none, or
     always the same."""
     if before.covariance is None or now.covariance is None:
         return np.zeros((6, 6))
-    turn = np.kron(np.eye(2), now.T_other_lidar[:3, :3].T @ before.T_other_lidar[:3, :3])
-    values, axes = np.linalg.eigh(now.covariance - turn @ before.covariance @ turn.T)
+    rotation = np.kron(np.eye(2), now.T_other_lidar[:3, :3].T @ before.T_other_lidar[:3, :3])
+    values, axes = np.linalg.eigh(now.covariance - rotation @ before.covariance @ rotation.T)
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

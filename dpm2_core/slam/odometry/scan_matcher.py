@@ -24,8 +24,8 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, fits_better
 from dpm2_core.slam.registration.swept import JOINT, Swept
 
-_BENT = 0.02  # m at the ends of the sweep and the usual range: smaller distortions are ignored
-_BENT_ON_AVERAGE = 0.1  # m, the same if only the motion between scans is known
+_MIN_DISTORTION = 0.02  # m at the ends of the sweep and the usual range: smaller distortions are ignored
+_MIN_DISTORTION_AVERAGE = 0.1  # m, the same if only the motion between scans is known
 
 
 class Match(NamedTuple):
@@ -67,10 +67,10 @@ class ScanMatcher:
             problem = self.registration.rejection(scan)
             fits = float(not problem)
             return Match(scan, Registration(T_predicted, np.zeros((6, 6)), fits, 0.0, "first", not problem, problem))
-        led, fits_there = self._led_by_other(scan, dt)
+        led, fits_there = self._register_by_other(scan, dt)
         if led is not None and fits_there:
             return Match(scan, led, led=True)
-        own = self._alone(frame, scan, T_predicted, dt)
+        own = self._match_by_motion(frame, scan, T_predicted, dt)
         # In a tunnel a map made at rest fits most of a scan at the same pose: that does not determine the step.
         if led is not None and own.result.worst_sigma >= OPEN:
             return Match(scan, led, led=True)
@@ -94,10 +94,10 @@ class ScanMatcher:
         if swept is None:
             if beginning is not without_imu:  # find out whether the points or the IMU contradict it
                 swept = self.registration.swept(match.scan, match.result, without_imu)
-            timed = match.result.ok and len(match.scan.times) > 0
-            match = match._replace(contradicted=timed and swept is None)
-            return match if turn is not None else self._steadied(frame, match, twist, seconds, half)
-        if _bent(match.scan, partial(way, motion=twist, turn=turn), swept.motion, half) > _BENT:
+            has_times = match.result.ok and len(match.scan.times) > 0
+            match = match._replace(contradicted=has_times and swept is None)
+            return match if turn is not None else self._straightened_by_average(frame, match, twist, seconds, half)
+        if _distortion(match.scan, partial(way, motion=twist, turn=turn), swept.motion, half) > _MIN_DISTORTION:
             scan = self.registration.prepare(frame, swept.motion)
             information = np.linalg.inv(swept.covariance[:6, :6] + JOINT[:6, :6]).astype(np.float64)
             result = self.registration.register(scan, Prediction([swept.T], information=information))
@@ -112,42 +112,44 @@ class ScanMatcher:
         motion.inertial, motion.reckoned = None, None
         motion.T = predicted(motion.T_registered, motion.ahead, motion.seconds)
         frame, twist, matcher = replace(frame, imu=None), motion.ahead, replace(self, motion=motion)
-        match = matcher._alone(frame, self.registration.prepare(frame, twist), motion.predicted(twist, dt), dt)
+        match = matcher._match_by_motion(
+            frame, self.registration.prepare(frame, twist), motion.predicted(twist, dt), dt
+        )
         return matcher.straightened(frame, match, twist, dt, half)
 
-    def _steadied(self, frame: Frame, match: Match, twist: Array, seconds: float, half: float) -> Match:
+    def _straightened_by_average(self, frame: Frame, match: Match, twist: Array, seconds: float, half: float) -> Match:
         """As `straightened`, by the average motion during the `seconds` since the last scan, if the points of the sweep
         do not show it."""
         motion, T = self.motion, match.result.T_target_source
         average = se3.way(motion.T_registered, T) / seconds
         prepared = partial(curve.poses, motion=twist)
-        if not match.result.ok or _bent(match.scan, prepared, average, half) < _BENT_ON_AVERAGE:
+        if not match.result.ok or _distortion(match.scan, prepared, average, half) < _MIN_DISTORTION_AVERAGE:
             return match
         scan = self.registration.prepare(frame, average)
         result = self.registration.register(scan, Prediction([T], information=motion.information(seconds)))
         return match._replace(scan=scan, result=result) if result.ok else match
 
-    def _alone(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
+    def _match_by_motion(self, frame: Frame, scan: Scan, T_predicted: Array, dt: float) -> Match:
         """Match from the prediction by the motion so far, or from rest."""
         motion = self.motion
         if motion.twist is None:
-            return Match(scan, self._from_rest(scan, T_predicted, dt))
+            return Match(scan, self._register_from_rest(scan, T_predicted, dt))
         seconds = motion.seconds + dt
         widen = min(seconds / dt, 5.0)
         result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
         result = motion.gated(result, T_predicted, dt)
         # A wrong rotation leads to a wrong pose where the scan gets stuck: only that few of its points fit shows it.
         if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
-            steady = self._without_imu(frame, motion.twist, dt)
-            if fits_better(steady.result, result):
-                scan, result = steady.scan, steady.result
+            without_imu = self._match_without_imu(frame, motion.twist, dt)
+            if fits_better(without_imu.result, result):
+                scan, result = without_imu.scan, without_imu.result
         if result.ok:
             return Match(scan, result)
         starts = turned_starts(T_predicted, motion.T_registered, self.settings.turns)
         turned = motion.gated(self.registration.register(scan, Prediction(starts, widen)), T_predicted, dt)
         return Match(scan, turned if turned.ok else result)
 
-    def _without_imu(self, frame: Frame, twist: Array, dt: float) -> Match:
+    def _match_without_imu(self, frame: Frame, twist: Array, dt: float) -> Match:
         """Match without the IMU in case it is wrong, in prediction and scan: a wrong rotation distorts a scan, too."""
         motion = self.motion
         seconds = motion.seconds + dt
@@ -156,7 +158,7 @@ class ScanMatcher:
         result = self.registration.register(scan, Prediction([T], min(seconds / dt, 5.0)))
         return Match(scan, motion.gated(result, T, dt))
 
-    def _led_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
+    def _register_by_other(self, scan: Scan, dt: float) -> tuple[Registration | None, bool]:
         """The result from the other odometry's prediction, if they agree, and whether the scan fits there."""
         motion = self.motion
         if motion.other is None or (step := motion.other.step) is None:
@@ -169,7 +171,7 @@ class ScanMatcher:
         agrees = result.ok and motion.other.agrees(motion.T_registered, result)
         return (result if agrees else None), agrees and prediction.convinced(result)
 
-    def _from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
+    def _register_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first with the motion before it."""
         if self.bridge is not None and self.bridge.twist is not None:
             expected = self.bridge.expected(T, dt)
@@ -184,10 +186,10 @@ class ScanMatcher:
         return result
 
 
-def _bent(scan: Scan, prepared: Callable[[Array], Array], motion: Array, half: float) -> float:
+def _distortion(scan: Scan, prepared: Callable[[Array], Array], motion: Array, half: float) -> float:
     """Largest displacement, m, of the ends of a scan, `half` s from its middle, between the motion it was prepared by
     and another one, (6,) or (K, 6)."""
     times = np.array([-half, 0.0, half])
-    off = se3.way(prepared(times), curve.poses(times, motion))[[0, 2]]
+    displacements = se3.way(prepared(times), curve.poses(times, motion))[[0, 2]]
     reach = float(np.median(np.linalg.norm(scan.points[:, :3], axis=1)))
-    return float((np.linalg.norm(off.reshape(2, 2, 3), axis=2) @ [reach, 1.0]).max())
+    return float((np.linalg.norm(displacements.reshape(2, 2, 3), axis=2) @ [reach, 1.0]).max())
