@@ -17,7 +17,7 @@ from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_core.slam.store.rows import MAX_ID, why_no_pose
 
 MAX_DESCRIPTORS = 4096
-_REACH = 32_000.0  # m: the range of a packed cloud
+_MAX_RANGE = 32_000.0  # m: the range of a packed cloud
 _LARGEST_VARIANCE = 1e12  # m^2: of an unknown pose
 _LARGEST_FEATURE = 1000.0  # trained networks give less than 10; more would outweigh all other places in the search
 
@@ -43,7 +43,7 @@ def check_keyframe(keyframe: Keyframe, channels: int | None) -> None:
         raise RejectedError("id", f"keyframe {keyframe.id}: want an id from 0 to {MAX_ID}")
     check_pose(keyframe.T_odom_kf)
     check_cloud(keyframe.cloud)
-    if not np.abs(keyframe.origin).max() <= _REACH:  # false for NaN
+    if not np.abs(keyframe.origin).max() <= _MAX_RANGE:  # false for NaN
         raise RejectedError("cloud", f"its cloud is seen from {keyframe.origin.tolist()} m")
     if keyframe.edge is not None:
         check_covariance(keyframe.edge.covariance)
@@ -69,8 +69,8 @@ def check_cloud(cloud: Points) -> None:
         raise RejectedError("cloud", f"its cloud has shape {cloud.shape}; want (M, 4), at most {MAX_POINTS} points")
     if not np.isfinite(cloud).all():
         raise RejectedError("cloud", "its cloud has coordinates that are not finite")
-    if np.abs(cloud[:, :3]).max(initial=0.0) > _REACH:
-        raise RejectedError("cloud", f"its cloud reaches farther than {_REACH / 1000:.0f} km")
+    if np.abs(cloud[:, :3]).max(initial=0.0) > _MAX_RANGE:
+        raise RejectedError("cloud", f"its cloud reaches farther than {_MAX_RANGE / 1000:.0f} km")
 
 
 def check_descriptors(d: Descriptors, channels: int | None) -> None:
@@ -82,6 +82,6 @@ def check_descriptors(d: Descriptors, channels: int | None) -> None:
         raise RejectedError("descriptors", f"{count} descriptors of {width} channels; want 1 to {MAX_DESCRIPTORS}")
     if d.axis is not None and d.axis.shape != (count, 2):
         raise RejectedError("descriptors", f"its descriptors have axes of shape {d.axis.shape}; want ({count}, 2)")
-    parts = ((d.xyz, _REACH), (d.step, _LARGEST_FEATURE / 127), (d.axes, 2.0))
+    parts = ((d.xyz, _MAX_RANGE), (d.step, _LARGEST_FEATURE / 127), (d.axes, 2.0))
     if not all(np.abs(part).max() <= limit for part, limit in parts):  # NaN compares false
         raise RejectedError("descriptors", "its descriptors are not finite, or too large")

@@ -30,7 +30,7 @@ from dpm2_core.slam.store.map_data import Thumbnail, borrowing, load_map
 from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.slam.store.writer import MapWriter
 
-_MOST_MISSED = 1000  # missing keyframes between two, for which the covariance of an edge is increased
+_MAX_MISSED = 1000  # missing keyframes between two, for which the covariance of an edge is increased
 
 
 class MapSettings(Settings):
@@ -63,7 +63,7 @@ class _Robot:
     offset: int = 0
 
 
-class _Start(NamedTuple):
+class _SessionStart(NamedTuple):
     """Start of a session in a loaded map; see `Mapper.start_session`."""
 
     T_map_odom: Array | None
@@ -98,7 +98,7 @@ class Mapper:
         self.clouds = CloudStore()
         self._writer: MapWriter | None = None
         self._robots: dict[str, _Robot] = {}
-        self._start: _Start | None = None
+        self._start: _SessionStart | None = None
         if store is not None:
             self._load(store)
         self.session_start = len(self.keyframes)
@@ -157,7 +157,7 @@ class Mapper:
                 it has the pose of the map's last keyframe, is of the same frame, and continues its odometry.
             covariance: (6, 6) of the first keyframe's pose relative to that one.
         """
-        self._start = _Start(T_map_odom, covariance)
+        self._start = _SessionStart(T_map_odom, covariance)
 
     def forget_start(self) -> None:
         """The odometry of `start_session` restarts before its first keyframe: only a loop can give its pose."""
@@ -175,46 +175,46 @@ class Mapper:
                 after a later error the keyframe is in the map, with the results so far.
         """
         check_keyframe(keyframe, self._closer.channels)
-        node, cloud, thumbnail, way = len(self.keyframes), keyframe.cloud, keyframe.thumbnail, keyframe.edge
+        node, cloud, thumbnail, odometry = len(self.keyframes), keyframe.cloud, keyframe.thumbnail, keyframe.edge
         origin = keyframe.origin
         robot = self._robot(keyframe.robot)
-        follows = robot.last is not None and way is not None
+        follows = robot.last is not None and odometry is not None
         offset = robot.offset if follows else robot.ids
         keyframe = self.described(keyframe if follows else replace(keyframe, edge=None))
         keyframe = replace(keyframe, id=keyframe.id + offset, session=0)
         keyframe = replace(keyframe, cloud=NO_POINTS, thumbnail=None, origin=np.zeros(3))
         packed = pack_cloud(cloud, origin)
-        to_before = self._add_node(keyframe, way, robot.last if follows else None)
+        new_edges = self._add_node(keyframe, odometry, robot.last if follows else None)
         self.clouds.append(packed)
         self.keyframes.append(keyframe)
         robot.last, robot.ids, robot.offset = node, keyframe.id + 1, offset
-        before = len(self.loops)
+        n_loops = len(self.loops)
         try:
             self._close_loops(keyframe.fix is not None and self.graph.add_fix(node, keyframe.fix))
-            self._lend(node, to_before, self.loops[before:])
+            self._borrow_clouds(node, new_edges, self.loops[n_loops:])
             if not follows:  # the motion since the previous keyframe is unknown: its clouds cannot show moving points
                 self._mark_moving(robot.window.finish(self.poses))
                 robot.window = MovingWindow(self._settings.moving_window)
             self._mark_moving(robot.window.add(node, cloud, self.poses, origin, keyframe.up))
         finally:
-            self._store(node, thumbnail, [*to_before, *self.loops[before:]])
-        return self.loops[before:]
+            self._store(node, thumbnail, [*new_edges, *self.loops[n_loops:]])
+        return self.loops[n_loops:]
 
-    def _lend(self, node: int, to_before: list[Edge], loops: list[Edge]) -> None:
+    def _borrow_clouds(self, node: int, new_edges: list[Edge], loops: list[Edge]) -> None:
         """Let keyframes that revisit older ones borrow their clouds: the new one, and any with a postponed loop."""
-        odometry = [edge for edge in to_before if edge.kind == "odometry"]
-        again = odometry if node == self.session_start else []  # the frame with which the previous session ended
-        ties = [*again, *self.kept(loops)]
-        for back in sorted({edge.to_node for edge in ties}):
-            loan = lender(back, ties, self.clouds.loan, self._settings.redundancy)
-            if loan is None or not self.clouds.may_borrow(back):
+        odometry = [edge for edge in new_edges if edge.kind == "odometry"]
+        repeated = odometry if node == self.session_start else []  # the frame with which the previous session ended
+        edges = [*repeated, *self.kept(loops)]
+        for revisit in sorted({edge.to_node for edge in edges}):
+            loan = lender(revisit, edges, self.clouds.loan, self._settings.redundancy)
+            if loan is None or not self.clouds.may_borrow(revisit):
                 continue
-            given_up = self.clouds.borrow(back, loan)
-            self.keyframes[back] = borrowing(self.keyframes[back], self.keyframes, loan)
+            given_up = self.clouds.borrow(revisit, loan)
+            self.keyframes[revisit] = borrowing(self.keyframes[revisit], self.keyframes, loan)
             if self._writer is not None and given_up is not None:
                 self._writer.give_up(given_up)
-            if self._writer is not None and back != node:
-                self._writer.add(back, self.keyframes[back], None, [])
+            if self._writer is not None and revisit != node:
+                self._writer.add(revisit, self.keyframes[revisit], None, [])
 
     def _store(self, node: int, thumbnail: bytes | None, edges: list[Edge]) -> None:
         """Update the map file, if there is one, with a new keyframe."""
@@ -278,16 +278,16 @@ class Mapper:
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot(MovingWindow(self._settings.moving_window)))
 
-    def _add_node(self, keyframe: Keyframe, way: Registration | None, last: int | None) -> list[Edge]:
-        """Add a node with an edge to its robot's `last` one, even if some between were lost; `way`: its edge."""
-        node, result = len(self.keyframes), way
+    def _add_node(self, keyframe: Keyframe, odometry: Registration | None, last: int | None) -> list[Edge]:
+        """Add a node with an edge to its robot's `last` one, even if some between were lost; `odometry`: its edge."""
+        node, result = len(self.keyframes), odometry
         if result is not None and last is not None:
             before = self.keyframes[last]
             T_before_this = se3.inverse(before.T_odom_kf) @ keyframe.T_odom_kf
-            covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MOST_MISSED)
+            covariance = result.covariance * np.clip(keyframe.id - before.id, 1, _MAX_MISSED)
             result = replace(result, T_target_source=T_before_this, covariance=covariance)
         elif node == self.session_start and self._start is not None:
-            return [self._begin_session(self._start, keyframe, way)]
+            return [self._begin_session(self._start, keyframe, odometry)]
         else:
             self.graph.add_node(keyframe.T_odom_kf)
             return []
@@ -295,13 +295,13 @@ class Mapper:
         self.graph.add_node(self.graph.pose(last) @ edge.T_from_to, edge)
         return [edge]
 
-    def _begin_session(self, start: _Start, keyframe: Keyframe, way: Registration | None) -> Edge:
+    def _begin_session(self, start: _SessionStart, keyframe: Keyframe, odometry: Registration | None) -> Edge:
         """Add the first node of a session and its edge: odometry from the last node, or a loop to the nearest.
 
-        `way`: edge to it from a keyframe before the session, if there is one: it may include a break of the odometry.
+        `odometry`: edge to it from a keyframe before the session, if there is one: it may include a break.
         """
         node, poses = len(self.keyframes), self.poses
-        covariance = start.covariance if way is None else start.covariance + way.covariance
+        covariance = start.covariance if odometry is None else start.covariance + odometry.covariance
         if start.T_map_odom is None:
             edge = Edge("odometry", node - 1, node, Registration(np.eye(4), covariance))
             self.graph.add_node(poses[-1], edge)
@@ -309,7 +309,7 @@ class Mapper:
         T, known = start.T_map_odom @ keyframe.T_odom_kf, np.flatnonzero(self.placed)
         other = int(known[np.linalg.norm(poses[known, :3, 3] - T[:3, 3], axis=1).argmin()])
         self.graph.add_node(T)
-        return self._tied(Edge("loop", other, node, Registration(se3.inverse(poses[other]) @ T, covariance)))
+        return self._add_to_graph(Edge("loop", other, node, Registration(se3.inverse(poses[other]) @ T, covariance)))
 
     def _close_loops(self, due: bool) -> None:
         """Search loops of the last keyframe and add them to the graph, unless they are rejected.
@@ -317,11 +317,11 @@ class Mapper:
         `due`: optimize in any case.
         """
         found = self._closer.close(self.keyframes, self.clouds, self.poses, self.graph.parts, self.clouds.own)
-        tried = [self._tied(loop) for loop in found]
+        tried = [self._add_to_graph(loop) for loop in found]
         self.loops += tried
         self._optimize(due or any(loop.ok for loop in tried))
 
-    def _tied(self, loop: Edge) -> Edge:
+    def _add_to_graph(self, loop: Edge) -> Edge:
         """A tried loop, added to the graph if it was accepted; rejected if the graph does not accept it."""
         if loop.ok:
             loop = to_lender(loop, self.clouds.loan)

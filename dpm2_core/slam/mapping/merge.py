@@ -49,7 +49,7 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         a.georeference,
     )
     if a.georeference is None and b.georeference is not None and placed(both)[n : n + 1].any():
-        return replace(both, georeference=_seen_from(T_a_b, b.georeference))
+        return replace(both, georeference=_transformed(T_a_b, b.georeference))
     return both
 
 
@@ -64,7 +64,7 @@ def tie_of(a: MapData, b: MapData, T_a_b: Array) -> list[Edge]:
     return [Edge("loop", 0, 0, Registration(T, _GIVEN_COVARIANCE, method="transform"))]
 
 
-def _seen_from(T_a_b: Array, known: Georeference) -> Georeference:
+def _transformed(T_a_b: Array, known: Georeference) -> Georeference:
     """The georeference of b expressed for a."""
     return replace(known, T_enu_map=known.T_enu_map @ se3.inverse(T_a_b))
 
@@ -74,8 +74,8 @@ def off_by_satellites(a: MapData, b: MapData, T_a_b: Array) -> float:
     if these are not known."""
     if a.georeference is None or b.georeference is None or not len(b):
         return 0.0
-    away = T_a_b @ b.poses - se3.inverse(frame_of(a.georeference)) @ frame_of(b.georeference) @ b.poses
-    return float(np.median(np.linalg.norm(away[:, :2, 3], axis=1)))
+    difference = T_a_b @ b.poses - se3.inverse(frame_of(a.georeference)) @ frame_of(b.georeference) @ b.poses
+    return float(np.median(np.linalg.norm(difference[:, :2, 3], axis=1)))
 
 
 def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Edge]] | None:
@@ -85,8 +85,8 @@ def align(a: MapData, b: MapData, find_loops: FindLoops) -> tuple[Array, list[Ed
         return None
     guesses = np.array([a.poses[e.from_node] @ e.T_from_to @ se3.inverse(b.poses[e.to_node]) for e in loops])
     # The transform nearest to the others: a start for the optimization, which weights them all.
-    apart = [np.median(np.linalg.norm(guesses[:, :3, 3] - T[:3, 3], axis=1)) for T in guesses]
-    return se3.orthonormalized(guesses[int(np.argmin(apart))]), loops  # else rounding errors double with each merge
+    distances = [np.median(np.linalg.norm(guesses[:, :3, 3] - T[:3, 3], axis=1)) for T in guesses]
+    return se3.orthonormalized(guesses[int(np.argmin(distances))]), loops  # else rounding errors double with each merge
 
 
 def loops_by(closer: LoopCloser) -> FindLoops:

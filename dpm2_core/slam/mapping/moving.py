@@ -26,14 +26,14 @@ Mask = NDArray[np.bool_]
 
 _PIXEL = np.radians(1.0)
 _COLUMNS = 360
-_LOWEST, _ROWS = np.radians(-45.0), 90
-_HALVES = (1, 2, 4)  # half sizes, pixels, of the windows in which a close return counts
+_MIN_ELEVATION, _ROWS = np.radians(-45.0), 90
+_HALF_WINDOWS = (1, 2, 4)  # half sizes, pixels, of the windows in which a close return counts
 _CLEARANCE = 0.25  # m above the local ground: lower points are kept, since the ground is seen at grazing angles
-_WITNESSES = 2  # neighbors that must see through the place of a point
-_BEHIND = (0.5, 0.03)  # m, and per meter of range: minimum distance of their return behind the point
+_MIN_WITNESSES = 2  # neighbors that must see through the place of a point
+_MIN_GAP = (0.5, 0.03)  # m, and per meter of range: minimum distance of their return behind the point
 _FOOTPRINT = 0.3  # m: a return within this of the line of sight counts as seeing the point
-_TOUCHES = 0.7  # m: points this close to a moving one move with it, unless neighbors saw them...
-_EXTENT = 2.0  # ...and so on, up to this distance, m, from those that were seen through: not along a whole wall
+_TOUCH_DISTANCE = 0.7  # m: points this close to a moving one move with it, unless neighbors saw them...
+_MAX_EXTENT = 2.0  # ...and so on, up to this distance, m, from those that were seen through: not along a whole wall
 
 
 class RangeImage:
@@ -42,24 +42,26 @@ class RangeImage:
     def __init__(self, points: Points) -> None:
         """(M, 4) in the sensor's frame."""
         r, row, column = _spherical(points[:, :3])
-        self._own = _nearest(r, row, column)
+        self._closest = _closest_returns(r, row, column)
         # The ground before an object is within any window around it, but occludes nothing.
         above = height_above_ground(points) > _CLEARANCE
-        standing = _nearest(r[above], row[above], column[above])
-        self._near = [minimum_filter(standing, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALVES]
+        closest_object = _closest_returns(r[above], row[above], column[above])
+        self._closest_around = [
+            minimum_filter(closest_object, 2 * half + 1, mode=("nearest", "wrap")) for half in _HALF_WINDOWS
+        ]
 
     def compare(self, points: Points) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Masks of (M, 3+) points in the sensor's frame: which are seen through, and which are seen."""
         r, row, column = _spherical(points[:, :3])
-        margin = _BEHIND[0] + _BEHIND[1] * r
-        window = np.searchsorted(_HALVES[:-1], _FOOTPRINT / np.maximum(r, 0.1) / _PIXEL)
-        near = np.choose(window, [image[row, column] for image in self._near])
-        own = self._own[row, column]
-        through = np.isfinite(own) & (np.minimum(own, near) > r + margin) & (r > 2.0)
-        return through, np.abs(near - r) <= margin
+        margin = _MIN_GAP[0] + _MIN_GAP[1] * r
+        window = np.searchsorted(_HALF_WINDOWS[:-1], _FOOTPRINT / np.maximum(r, 0.1) / _PIXEL)
+        closest_around = np.choose(window, [image[row, column] for image in self._closest_around])
+        closest = self._closest[row, column]
+        through = np.isfinite(closest) & (np.minimum(closest, closest_around) > r + margin) & (r > 2.0)
+        return through, np.abs(closest_around - r) <= margin
 
 
-def _nearest(r: Points, row: NDArray[np.intp], column: NDArray[np.intp]) -> Points:
+def _closest_returns(r: Points, row: NDArray[np.intp], column: NDArray[np.intp]) -> Points:
     image = np.full((_ROWS, _COLUMNS), np.inf, np.float32)
     np.minimum.at(image, (row, column), r)
     return image
@@ -77,22 +79,22 @@ def find_moving(cloud: Points, T_map_kf: Array, others: Sequence[tuple[RangeImag
     """
     through, seen = np.zeros(len(cloud), np.int16), np.zeros(len(cloud), np.int16)
     candidates = np.flatnonzero(height_above_ground(cloud) > _CLEARANCE)
-    part = cloud[candidates]
+    points = cloud[candidates]
     for image, T_map_other in others:
-        looked, present = image.compare(se3.transform(se3.inverse(T_map_other) @ T_map_kf, part))
-        through[candidates] += looked
-        seen[candidates] += present
-    moving = (through >= _WITNESSES) & (through > seen)
-    return _grown(moving, cloud, candidates[through[candidates] >= seen[candidates]])
+        is_through, is_seen = image.compare(se3.transform(se3.inverse(T_map_other) @ T_map_kf, points))
+        through[candidates] += is_through
+        seen[candidates] += is_seen
+    moving = (through >= _MIN_WITNESSES) & (through > seen)
+    return _grow(moving, cloud, candidates[through[candidates] >= seen[candidates]])
 
 
-def _grown(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
+def _grow(moving: Mask, cloud: Points, candidates: NDArray[np.intp]) -> Mask:
     """Add the candidates that touch a moving point: the rest of a car, against the sky or outside of their view."""
     grown = moving.copy()
     edge = np.flatnonzero(moving)
-    candidates = _within(_EXTENT, candidates, edge, cloud)
+    candidates = _within(_MAX_EXTENT, candidates, edge, cloud)
     while len(edge):
-        edge = _within(_TOUCHES, candidates, edge, cloud)
+        edge = _within(_TOUCH_DISTANCE, candidates, edge, cloud)
         edge = edge[~grown[edge]]
         grown[edge] = True
     return grown
@@ -112,7 +114,7 @@ class MovingWindow:
     def __init__(self, window: int) -> None:
         """`window`: see `MapSettings.moving_window`."""
         self._window = window
-        self._seen: deque[tuple[int, Points, RangeImage, Array]] = deque(maxlen=2 * window + 1)
+        self._recent: deque[tuple[int, Points, RangeImage, Array]] = deque(maxlen=2 * window + 1)
         self._next = 0  # the first node that has not been checked
 
     def add(
@@ -126,19 +128,19 @@ class MovingWindow:
         if self._window:
             T_kf_level = se3.make(levelling(tilt_of(cloud, up)).T, origin)
             cloud = se3.transform(se3.inverse(T_kf_level), cloud)
-            self._seen.append((node, cloud, RangeImage(cloud), T_kf_level))
-            if len(self._seen) > self._window:
-                yield from self._compare(self._seen[-1 - self._window][0], poses)
+            self._recent.append((node, cloud, RangeImage(cloud), T_kf_level))
+            if len(self._recent) > self._window:
+                yield from self._compare(self._recent[-1 - self._window][0], poses)
 
     def finish(self, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
         """Check the keyframes at the end of the drive against those that are available."""
-        if self._seen:
-            yield from self._compare(self._seen[-1][0], poses)
+        if self._recent:
+            yield from self._compare(self._recent[-1][0], poses)
 
     def _compare(self, last: int, poses: Array) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        for node, cloud, _, T_kf_level in self._seen:
+        for node, cloud, _, T_kf_level in self._recent:
             if self._next <= node <= last:
-                others = [(image, poses[n] @ T) for n, _, image, T in self._seen if n != node]
+                others = [(image, poses[n] @ T) for n, _, image, T in self._recent if n != node]
                 yield node, find_moving(cloud, poses[node] @ T_kf_level, others)
                 self._next = node + 1
 
@@ -147,6 +149,6 @@ def _spherical(xyz: Points) -> tuple[Points, NDArray[np.intp], NDArray[np.intp]]
     """Range (M,) m, row and column (M,) of the range image for (M, 3) points."""
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     elevation = np.arcsin(np.clip(xyz[:, 2] / np.maximum(r, 1e-6), -1, 1))
-    row = np.clip((elevation - _LOWEST) / _PIXEL, 0, _ROWS - 1).astype(np.intp)
+    row = np.clip((elevation - _MIN_ELEVATION) / _PIXEL, 0, _ROWS - 1).astype(np.intp)
     column = (np.arctan2(xyz[:, 1], xyz[:, 0]) / _PIXEL).astype(np.float64) % _COLUMNS
     return r, row, np.minimum(column.astype(np.intp), _COLUMNS - 1)

@@ -22,13 +22,11 @@ from dpm2_core.geometry.tilt import up_of
 from dpm2_core.slam.mapping.occupancy_map import Grid, OccupancyMap, OccupancySettings
 from dpm2_core.slam.store.cloud_store import CloudStore
 
-_MOST = 400_000_000  # cells
-_LOOKED_AT, _SHOW_GROUND = 30, 0.3  # keyframes that are checked, and the fraction of them that must show ground
+_MAX_CELLS = 400_000_000  # cells
+_MAX_CHECKED, _MIN_GROUND_RATIO = 30, 0.3  # keyframes that are checked, and the fraction of them that must show ground
 _SQUARE = 5.0  # m: the steepest ramp rises by less than a storey within one
-_STOREY = (
-    2.4  # m, allowed height difference of keyframes: less than a floor's height, more than a LiDAR's above its base
-)
-_OVER = np.diag(np.array([1, -1, -1], np.float32))  # rotated upside down
+_MAX_HEIGHT_DIFFERENCE = 2.4  # m, of keyframes: less than a floor's height, more than a LiDAR's above its base
+_UPSIDE_DOWN = np.diag(np.array([1, -1, -1], np.float32))
 
 
 def occupancy_grid(clouds: CloudStore, poses: Array, settings: OccupancySettings) -> Grid:
@@ -38,11 +36,11 @@ def occupancy_grid(clouds: CloudStore, poses: Array, settings: OccupancySettings
         Dpm2Error: the grid would be too large.
     """
     shape = np.ceil((np.ptp(poses[:, :2, 3], axis=0) + 2 * settings.reach) / settings.resolution) + 1
-    if shape.prod() > _MOST:
+    if shape.prod() > _MAX_CELLS:
         raise Dpm2Error(f"an occupancy grid of {shape[0]:.0f} by {shape[1]:.0f} cells: choose a larger --resolution")
-    whole = OccupancyMap(settings, 2 * _MOST)
-    whole.update(clouds, poses)
-    return whole.grid()
+    occupancy = OccupancyMap(settings, 2 * _MAX_CELLS)
+    occupancy.update(clouds, poses)
+    return occupancy.grid()
 
 
 def ground_tilt(clouds: CloudStore, poses: Array) -> float:
@@ -51,10 +49,10 @@ def ground_tilt(clouds: CloudStore, poses: Array) -> float:
     Some of the keyframe clouds at (N, 4, 4) T_map_kf are checked, as seen from the LiDAR. Upside down is recognized
     outdoors only: rooms have ceilings.
     """
-    some = evenly(len(poses), _LOOKED_AT).tolist()
-    seen = ((node, clouds[node][:, :3] - clouds.origin(node).astype(np.float32)) for node in some)
-    found = [(node, up) for node, cloud in seen if (up := _up(cloud)) is not None]
-    if len(found) < _SHOW_GROUND * len(some):
+    checked = evenly(len(poses), _MAX_CHECKED).tolist()
+    views = ((node, clouds[node][:, :3] - clouds.origin(node).astype(np.float32)) for node in checked)
+    found = [(node, up) for node, cloud in views if (up := _up_direction(cloud)) is not None]
+    if len(found) < _MIN_GROUND_RATIO * len(checked):
         return 0.0
     x, y, z = np.median([poses[node, :3, :3] @ up for node, up in found], axis=0)
     return float(np.degrees(np.arctan2(np.hypot(x, y), z)))
@@ -62,13 +60,13 @@ def ground_tilt(clouds: CloudStore, poses: Array) -> float:
 
 def why_of_no_use(poses: Array) -> str:
     """Why a grid of keyframes at (N, 4, 4) T_map_kf is unusable, as it shows several levels; empty if it is usable."""
-    if not len(poses) or (height := _height_over_each_other(poses)) <= _STOREY:
+    if not len(poses) or (height := _height_difference(poses)) <= _MAX_HEIGHT_DIFFERENCE:
         return ""
     why = "because of storeys (make one map of each) or of drift without a loop"
     return f"do not use it: parts of the map lie up to {height:.1f} m above each other, {why}"
 
 
-def _height_over_each_other(poses: Array) -> float:
+def _height_difference(poses: Array) -> float:
     """Largest difference in height, m, of keyframes at (N, 4, 4) T_map_kf, N > 0, within one square of 5 m."""
     _, square = np.unique(np.floor(poses[:, :2, 3] / _SQUARE), axis=0, return_inverse=True)
     lowest, highest = np.full((2, len(poses)), [[np.inf], [-np.inf]])
@@ -77,11 +75,11 @@ def _height_over_each_other(poses: Array) -> float:
     return float((highest - lowest).max())
 
 
-def _up(cloud: Points) -> NDArray[np.float32] | None:
+def _up_direction(cloud: Points) -> NDArray[np.float32] | None:
     """Up direction (3,) in a cloud (M, 4), also if z points roughly down; None if it shows no ground."""
     up = up_of(cloud)
-    if up is None and is_room(cloud) is False and (turned := up_of(cloud[:, :3] @ _OVER)) is not None:
-        return _OVER @ turned
+    if up is None and is_room(cloud) is False and (flipped := up_of(cloud[:, :3] @ _UPSIDE_DOWN)) is not None:
+        return _UPSIDE_DOWN @ flipped
     return up
 
 
@@ -91,7 +89,7 @@ def write_grid(path: Path, grid: Grid) -> Path:
     Raises:
         Dpm2Error: a file could not be written.
     """
-    image, about = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+    image, metadata = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     rows, columns = grid.cells.shape
     with atomic_write(image, "wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode("ascii"))
@@ -105,6 +103,6 @@ def write_grid(path: Path, grid: Grid) -> Path:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,  # below (255 - 205) / 255, which is unknown: map_server has no rule for 205 itself
     }
-    with atomic_write(about) as file:
+    with atomic_write(metadata) as file:
         yaml.safe_dump(content, file, sort_keys=False)
-    return about
+    return metadata

@@ -30,9 +30,9 @@ from dpm2_core.slam.store.cloud_store import CloudStore
 _DIRECTIONS = 720
 _MARGIN = 20.0  # m around the cells that are needed, for the next keyframes
 _BORDER = 2.0  # m, for rounding
-_PLACE = np.array([6.0, 6.0, 3.0])  # m: keyframes in a box of this size see about the same
+_PLACE_SIZE = np.array([6.0, 6.0, 3.0])  # m: keyframes in a box of this size see about the same
 _BOX_NUMBER = 1 << np.array([42, 21, 0])  # encodes a box as one number, for sorting
-_NEWER, _VISITS = 3, 3  # a fan counts as much as three of the previous visit; all with 3 or more later visits equal
+_VISIT_FACTOR, _MAX_VISITS = 3, 3  # a fan counts as three of the previous visit; all with 3 or more later visits equal
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray values of map_server
 
 
@@ -91,15 +91,17 @@ def fan_of(cloud: Points, T_map_kf: Array, settings: OccupancySettings, lidar: A
         return Fan(yaw, np.zeros(2), np.zeros(_DIRECTIONS, np.float32), np.zeros((0, 2), np.float32))
     height = points[:, 2] - ground_below(points[:, :3])
     stands, ground = (height > settings.lowest) & (height < settings.highest), height < settings.lowest
-    away = points[:, :2] - T_map_kf[:2, 3] - origin
-    distance = np.linalg.norm(away, axis=1)
-    direction = ((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) % 1.0) * _DIRECTIONS).astype(np.intp) % _DIRECTIONS
+    offsets = points[:, :2] - T_map_kf[:2, 3] - origin
+    distance = np.linalg.norm(offsets, axis=1)
+    direction = ((np.arctan2(offsets[:, 1], offsets[:, 0]) / (2 * np.pi) % 1.0) * _DIRECTIONS).astype(
+        np.intp
+    ) % _DIRECTIONS
     blocked, seen = np.full(_DIRECTIONS, np.inf), np.zeros(_DIRECTIONS)
     np.minimum.at(blocked, direction[stands], distance[stands])
     np.maximum.at(seen, direction[ground], distance[ground])
     # Up to the farthest ground, but not beyond an obstacle; an obstacle shows that the ground before it is free.
     seen = np.where(np.isfinite(blocked), np.minimum(np.maximum(seen, blocked), blocked - size), seen)
-    cells = np.unique(np.floor(away[stands] / (size / 2)).astype(np.int64), axis=0)
+    cells = np.unique(np.floor(offsets[stands] / (size / 2)).astype(np.int64), axis=0)
     return Fan(yaw, origin, seen.astype(np.float32), ((cells + 0.5) * (size / 2)).astype(np.float32))
 
 
@@ -123,11 +125,11 @@ class OccupancyMap:
     """
 
     def __init__(self, settings: OccupancySettings, most: int) -> None:
-        self._settings, self._most = settings, most
+        self._settings, self._max_cells = settings, most
         self._entries: dict[int, _Entry] = {}  # by node
-        self._low, self._size = np.zeros(2, np.int64), 0.0
+        self._first_cell, self._size = np.zeros(2, np.int64), 0.0
         self._hits = self._seen = np.zeros((0, 0), np.int32)
-        self._before: Grid | None = None  # returned until everything is drawn with another cell size
+        self._previous_grid: Grid | None = None  # returned until everything is drawn with another cell size
 
     def update(
         self,
@@ -145,59 +147,63 @@ class OccupancyMap:
         end = time.monotonic() + seconds
         placed = np.ones(len(poses), np.bool_) if placed is None else placed
         self._make_room(poses[placed])
-        counts = _counts(poses, placed & clouds.kept[: len(poses)])
+        counts = _visit_weights(poses, placed & clouds.kept[: len(poses)])
         for node in [node for node in self._entries if not counts[node]]:
-            self._take_back(node)
+            self._erase(node)
             del self._entries[node]
         for node in np.flatnonzero(counts)[::-1].tolist():
             entry, count, moving = self._entries.get(node), int(counts[node]), clouds.moving(node)
-            if entry is not None and (entry.count, entry.moving) == (count, moving) and self._near(entry, poses[node]):
+            if (
+                entry is not None
+                and (entry.count, entry.moving) == (count, moving)
+                and self._is_current(entry, poses[node])
+            ):
                 continue
             if time.monotonic() > end:
                 return False
-            self._take_back(node)
+            self._erase(node)
             if entry is None or entry.moving is not moving:
                 fan = fan_of(clouds.seen(node), poses[node], self._settings, clouds.seen_from(node))
                 entry = self._entries[node] = _Entry(fan, moving)
             entry.count, entry.T = count, poses[node].copy()
             self._draw(entry, entry.T, 1)
-        self._before = None
+        self._previous_grid = None
         return True
 
     def grid(self) -> Grid:
         """The current grid: a cell is occupied if at least half of the counts that see it see an obstacle."""
-        if self._before is not None:
-            return self._before
+        if self._previous_grid is not None:
+            return self._previous_grid
         cells = np.full(self._seen.shape, UNKNOWN, np.uint8)
         cells[self._seen > 0] = FREE
         cells[(self._hits > 0) & (2 * self._hits >= self._seen)] = OCCUPIED
         known = cells != UNKNOWN
         spans = [np.flatnonzero(known.any(1 - axis)) for axis in (0, 1)]
         (x, columns), (y, rows) = [(s[0], s[-1] + 1) if len(s) else (0, 1) for s in spans]
-        corner = np.round((self._low + np.array([x, y])) * self._size, 6)
+        corner = np.round((self._first_cell + np.array([x, y])) * self._size, 6)
         cut = np.ascontiguousarray(cells[x:columns, y:rows].T[::-1])
         return Grid(cut, (float(corner[0]), float(corner[1])), self._size)
 
     def _make_room(self, poses: Array) -> None:
         """Make room for these keyframes; with another cell size, if there would be too many cells."""
-        size, end = self._settings.resolution, self._low + self._seen.shape
+        size, end = self._settings.resolution, self._first_cell + self._seen.shape
         first, last = self._corners(poses, size)
-        while np.prod(last - first) > self._most:
+        while np.prod(last - first) > self._max_cells:
             size *= 2
             first, last = self._corners(poses, size)
-        if size == self._size and (first >= self._low).all() and (last <= end).all():
+        if size == self._size and (first >= self._first_cell).all() and (last <= end).all():
             return
         if size == self._size:  # fans that are drawn stay, even if they are to be drawn at another pose
             both = self._corners(np.array([*poses, *(e.T for e in self._entries.values() if e.T is not None)]), size)
-            if np.prod(both[1] - both[0]) <= self._most:
-                self._move(*both)
+            if np.prod(both[1] - both[0]) <= self._max_cells:
+                self._resize(*both)
                 return
         if self._seen.any():
-            self._before = self.grid()
+            self._previous_grid = self.grid()
         for entry in self._entries.values():
             entry.T = None
         self._size, self._hits, self._seen = size, *(np.zeros((0, 0), np.int32) for _ in range(2))
-        self._move(first, last)
+        self._resize(first, last)
 
     def _corners(self, poses: Array, size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First cell, and the one after the last, within reach of fans at (N, 4, 4)."""
@@ -205,26 +211,26 @@ class OccupancyMap:
         low, high = poses[:, :2, 3].min(0) - reach, poses[:, :2, 3].max(0) + reach
         return np.floor(low / size).astype(np.int64), np.ceil(high / size).astype(np.int64)
 
-    def _move(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
+    def _resize(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> None:
         """Resize the grid to these corners, with a margin if there is room for it; existing cells are kept."""
         width, height = (last - first).tolist()
-        room = (((width - height) ** 2 + 4 * self._most) ** 0.5 - width - height) / 4  # on each side
+        room = (((width - height) ** 2 + 4 * self._max_cells) ** 0.5 - width - height) / 4  # on each side
         margin = int(max(0.0, min(_MARGIN / self._size, room)))
         low, shape, before = first - margin, last - first + 2 * margin, (self._hits, self._seen)
         self._hits, self._seen = (np.zeros(shape, np.int32) for _ in range(2))
-        a, b = np.maximum(low, self._low), np.minimum(low + shape, self._low + before[0].shape)
-        new, old = (tuple(map(slice, a - corner, b - corner)) for corner in (low, self._low))
+        a, b = np.maximum(low, self._first_cell), np.minimum(low + shape, self._first_cell + before[0].shape)
+        new, old = (tuple(map(slice, a - corner, b - corner)) for corner in (low, self._first_cell))
         if (a < b).all():
             self._hits[new], self._seen[new] = before[0][old], before[1][old]
-        self._low = low
+        self._first_cell = low
 
-    def _take_back(self, node: int) -> None:
+    def _erase(self, node: int) -> None:
         entry = self._entries.get(node)
         if entry is not None and entry.T is not None:
             self._draw(entry, entry.T, -1)
             entry.T = None
 
-    def _near(self, entry: _Entry, T_now: Array) -> bool:
+    def _is_current(self, entry: _Entry, T_now: Array) -> bool:
         """Whether a fan is drawn so close to T_now (4, 4) that it need not be redrawn."""
         if entry.T is None:
             return False
@@ -236,11 +242,11 @@ class OccupancyMap:
         fan, times = entry.fan, sign * entry.count
         turn = _yaw(T) - fan.yaw
         cos, sin = np.cos(turn), np.sin(turn)
-        low, (x, y) = self._low * self._size, (T[:2, 3] + [[cos, -sin], [sin, cos]] @ fan.origin).tolist()
+        low, (x, y) = self._first_cell * self._size, (T[:2, 3] + [[cos, -sin], [sin, cos]] @ fan.origin).tolist()
         _draw_fan(self._hits, self._seen, x - low[0], y - low[1], turn, self._size, fan.free, fan.stands, times)
 
 
-def _counts(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _visit_weights(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(N,) weight of each of (N, 4, 4) keyframes, by the number of later visits to its place; 0 if it is not `drawn`.
 
     Places are boxes, in all eight arrangements shifted by half a box: two close keyframes share one of them.
@@ -248,13 +254,13 @@ def _counts(poses: Array, drawn: NDArray[np.bool_]) -> NDArray[np.int64]:
     nodes, counts = np.flatnonzero(drawn), np.zeros(len(poses), np.int64)
     later = np.zeros(len(nodes), np.int64)
     for shift in np.ndindex(2, 2, 2):
-        box = np.floor(poses[nodes, :3, 3] / _PLACE + np.array(shift) / 2).astype(np.int64) @ _BOX_NUMBER
+        box = np.floor(poses[nodes, :3, 3] / _PLACE_SIZE + np.array(shift) / 2).astype(np.int64) @ _BOX_NUMBER
         order = np.argsort(box, kind="stable")
         first = np.diff(box[order], prepend=box[order[:1]] - 1) != 0
         visit = np.cumsum(first | (np.diff(nodes[order], prepend=0) > LAP))
         last = np.append(visit[np.flatnonzero(first)[1:] - 1], visit[-1:])[np.cumsum(first) - 1]
         later[order] = np.maximum(later[order], last - visit)
-    counts[nodes] = _NEWER ** (_VISITS - np.minimum(later, _VISITS))
+    counts[nodes] = _VISIT_FACTOR ** (_MAX_VISITS - np.minimum(later, _MAX_VISITS))
     return counts
 
 

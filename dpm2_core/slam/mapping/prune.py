@@ -21,7 +21,7 @@ from dpm2_core.slam.mapping.redundancy import LAP
 from dpm2_core.slam.store.map_data import MapData, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe
 
-_LEVER = 20.0  # m: a fix farther from its keyframe would depend more on the keyframe's heading than on its position
+_MAX_LEVER = 20.0  # m: a fix farther from its keyframe would depend more on the keyframe's heading than on its position
 
 
 def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
@@ -54,8 +54,8 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
         near = near[(near < node) & stays[near] & own[near] & (parts[near] == parts[node])]
         near = near[(node - near >= LAP) | (session[near] != session[node])]
         near = near[described[near] >= described[node]]
-        turned = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
-        stays[node] = np.min(turned) > np.radians(angle)
+        rotations = se3.angle(se3.inverse(data.poses[near]) @ data.poses[node]) if len(near) else np.inf
+        stays[node] = np.min(rotations) > np.radians(angle)
     return np.flatnonzero(~stays).tolist()
 
 
@@ -72,8 +72,8 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
     for node in kept:
         if (loan := data.clouds.loan(node)) is not None and loan.lender in gone:
             raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}")
-    parts, at = parts_of(data), np.array(kept, np.intp)
-    anchors = {node: _anchor(data, node, at[parts[at] == parts[node]]) for node in gone}
+    parts, kept_nodes = parts_of(data), np.array(kept, np.intp)
+    anchors = {node: _anchor(data, node, kept_nodes[parts[kept_nodes] == parts[node]]) for node in gone}
     trail = [
         RemovedKeyframe(
             keyframe.id,
@@ -90,7 +90,7 @@ def prune(data: MapData, nodes: Collection[int]) -> MapData:
         anchor = anchors.get(old.node, old.node)
         T_anchor_old = se3.inverse(data.poses[anchor]) @ data.poses[old.node]
         trail.append(replace(old, node=anchor, T_node_kf=T_anchor_old @ old.T_node_kf))
-    keyframes = _with_fixes(data, parts, sorted(gone), at)
+    keyframes = _with_fixes(data, parts, sorted(gone), kept_nodes)
     return subset(replace(data, keyframes=keyframes), kept, eliminate(data.edges, sorted(gone)), trail)
 
 
@@ -109,7 +109,7 @@ def _with_fixes(data: MapData, parts: NDArray[np.int32], gone: Sequence[int], ke
             continue
         heir = int(near[np.argmin(np.linalg.norm(data.poses[near, :3, 3] - data.poses[node, :3, 3], axis=1))])
         fix = fix.moved(se3.inverse(data.poses[heir]) @ data.poses[node])
-        if (lever := float(np.linalg.norm(fix.antenna))) <= _LEVER:
+        if (lever := float(np.linalg.norm(fix.antenna))) <= _MAX_LEVER:
             offered.append((float(np.trace(fix.covariance)), lever, heir, fix))
     for _, _, heir, fix in sorted(offered, key=lambda offer: offer[:2]):
         if keyframes[heir].fix is None:
@@ -138,40 +138,40 @@ def eliminate(edges: Sequence[Edge], nodes: Sequence[int]) -> list[Edge]:
     a node are removed with it. Of several compositions between the same two nodes the one with the smallest covariance
     is kept, else laps would add up.
     """
-    left: dict[int, Edge] = dict(enumerate(edges))
-    at: dict[int, set[int]] = {}
-    for number, edge in left.items():
-        at.setdefault(edge.from_node, set()).add(number)
-        at.setdefault(edge.to_node, set()).add(number)
-    count, made = len(left), dict[tuple[int, int, str], int]()
+    remaining: dict[int, Edge] = dict(enumerate(edges))
+    edges_of: dict[int, set[int]] = {}
+    for number, edge in remaining.items():
+        edges_of.setdefault(edge.from_node, set()).add(number)
+        edges_of.setdefault(edge.to_node, set()).add(number)
+    count, number_by_ends = len(remaining), dict[tuple[int, int, str], int]()
     for node in nodes:
-        numbers = sorted(at.pop(node, ()))
-        incident = [left.pop(number) for number in numbers]
+        numbers = sorted(edges_of.pop(node, ()))
+        incident = [remaining.pop(number) for number in numbers]
         for number, edge in zip(numbers, incident, strict=True):
-            at[edge.from_node if edge.to_node == node else edge.to_node].discard(number)
-        for edge in _joined(node, [edge for edge in incident if edge.ok]):
+            edges_of[edge.from_node if edge.to_node == node else edge.to_node].discard(number)
+        for edge in _replacement_edges(node, [edge for edge in incident if edge.ok]):
             ends = edge.from_node, edge.to_node, edge.kind
-            if (known := left.get(before := made.get(ends, -1))) is not None:
+            if (known := remaining.get(before := number_by_ends.get(ends, -1))) is not None:
                 if np.trace(known.covariance) <= np.trace(edge.covariance):
                     continue
-                del left[before]
-                at[edge.from_node].discard(before)
-                at[edge.to_node].discard(before)
-            left[count], made[ends] = edge, count
-            at[edge.from_node].add(count)
-            at[edge.to_node].add(count)
+                del remaining[before]
+                edges_of[edge.from_node].discard(before)
+                edges_of[edge.to_node].discard(before)
+            remaining[count], number_by_ends[ends] = edge, count
+            edges_of[edge.from_node].add(count)
+            edges_of[edge.to_node].add(count)
             count += 1
-    return list(left.values())
+    return list(remaining.values())
 
 
-def _joined(node: int, incident: list[Edge]) -> list[Edge]:
+def _replacement_edges(node: int, incident: list[Edge]) -> list[Edge]:
     """The edges between the neighbors of a node that replace the node's edges."""
     spokes = [edge if edge.from_node == node else inverted(edge) for edge in incident]
-    surest: dict[str, Edge] = {}
+    best: dict[str, Edge] = {}
     for spoke in sorted(spokes, key=lambda edge: float(np.trace(edge.covariance))):
-        surest.setdefault(spoke.kind, spoke)
-    hub = surest.get("odometry", surest.get("loop"))
-    pairs = [(hub if spoke is surest[spoke.kind] else surest[spoke.kind], spoke) for spoke in spokes]
+        best.setdefault(spoke.kind, spoke)
+    hub = best.get("odometry", best.get("loop"))
+    pairs = [(hub if spoke is best[spoke.kind] else best[spoke.kind], spoke) for spoke in spokes]
     out = [composed(inverted(one), other) for one, other in pairs if one and one.to_node != other.to_node]
     return [edge if edge.from_node < edge.to_node else inverted(edge) for edge in out]
 

@@ -30,7 +30,7 @@ from dpm2_core.slam.store.map_store import MapStore
 
 INDEX, VECTORS = "tiles.json", "places.npy"
 _BLOCK = 65_536  # vectors that are compared at once: 140 MB
-_SMALLEST, _MOST = 10.0, 1_000_000  # m, edge of a tile; number of tiles of a map
+_MIN_SIZE, _MAX_TILES = 10.0, 1_000_000  # m, edge of a tile; number of tiles of a map
 
 Tile = tuple[int, int]
 """A tile: position of its corner in x and y, in units of its edge."""
@@ -47,8 +47,8 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
     Raises:
         UsageError: the folder exists, or the tiles are too small. Dpm2Error: it could not be written.
     """
-    if not _SMALLEST <= size < math.inf:
-        raise UsageError(f"tiles of {size:g} m: want at least {_SMALLEST:g} m")
+    if not _MIN_SIZE <= size < math.inf:
+        raise UsageError(f"tiles of {size:g} m: want at least {_MIN_SIZE:g} m")
     if folder.exists():
         raise UsageError(f"{folder}: is there already")
     squares: dict[Tile, list[int]] = {}
@@ -56,23 +56,23 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
         if data.clouds.loan(node) is None:
             squares.setdefault((x, y), []).append(node)
     with new_folder(folder) as part:
-        vectors = np.array([_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
+        vectors = np.array([_place_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
         mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)
         np.save(part / VECTORS, centered(vectors, mean))
         for tile, nodes in squares.items():
-            save_as(subset(data, nodes, data.constraints, []), part / _name(tile))
+            save_as(subset(data, nodes, data.constraints, []), part / _file_name(tile))
         counts = [[*tile, len(nodes)] for tile, nodes in sorted(squares.items())]
         weights = sorted({session.weights for session in data.sessions if session.weights})
         write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
     return len(squares)
 
 
-def _vector(data: MapData, node: int) -> Vector:
+def _place_vector(data: MapData, node: int) -> Vector:
     descriptors = data.keyframes[node].descriptors or data.describe(node)
     return np.zeros(WIDTH, np.float32) if descriptors is None else pooled(descriptors)
 
 
-def _name(tile: Tile) -> str:
+def _file_name(tile: Tile) -> str:
     return f"{tile[0]}_{tile[1]}{SUFFIX}"
 
 
@@ -99,7 +99,7 @@ class TiledMap:
             self._counts: dict[Tile, int] = {(int(x), int(y)): int(count) for x, y, count in read["tiles"]}
             self._mean = np.array(read["mean"], np.float32)
             self._vectors = np.load(path / VECTORS, mmap_mode="r", allow_pickle=False)
-            sizes = _SMALLEST <= self.size < math.inf and 0 < len(self._counts) <= _MOST
+            sizes = _MIN_SIZE <= self.size < math.inf and 0 < len(self._counts) <= _MAX_TILES
             shapes = self._mean.shape, self._vectors.shape, self._vectors.dtype
             if not sizes or shapes != ((WIDTH,), (sum(self._counts.values()), WIDTH), np.float32):
                 raise ValueError
@@ -118,7 +118,7 @@ class TiledMap:
 
     def close(self) -> None:
         """Close all files."""
-        self._keep(())
+        self._close_others(())
 
     @property
     def described(self) -> bool:
@@ -133,8 +133,8 @@ class TiledMap:
     def around(self, xy: Array, reach: float) -> list[Tile]:
         """The existing tiles within `reach`, m, of a position (2,)."""
         low, high = (np.floor((xy + side * reach) / self.size).astype(int).tolist() for side in (-1, 1))
-        every = ((x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1))
-        return [tile for tile in every if tile in self._counts]
+        candidates = ((x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1))
+        return [tile for tile in candidates if tile in self._counts]
 
     def like(self, vector: Vector, count: int) -> list[Tile]:
         """The tiles of the `count` keyframes in the whole map that are most similar to a place vector (528,)."""
@@ -154,12 +154,12 @@ class TiledMap:
         Raises:
             Dpm2Error: all are missing or damaged.
         """
-        self._keep(tiles)
+        self._close_others(tiles)
         problems = list[Dpm2Error]()
         for tile in tiles:
             if tile not in self._files:
                 try:
-                    self._files[tile] = self._opened(tile)
+                    self._files[tile] = self._open_tile(tile)
                 except Dpm2Error as error:
                     problems.append(error)
         found = [self._files[tile][1] for tile in tiles if tile in self._files]
@@ -167,8 +167,8 @@ class TiledMap:
             raise problems[0]
         return reduce(lambda a, b: merge_maps(a, b, np.eye(4)), found), str(problems[0]) if problems else ""
 
-    def _opened(self, tile: Tile) -> tuple[MapStore, MapData]:
-        store = MapStore.open(self.path / _name(tile))
+    def _open_tile(self, tile: Tile) -> tuple[MapStore, MapData]:
+        store = MapStore.open(self.path / _file_name(tile))
         try:
             data = load_map(store)
             if len(data) != self._counts[tile]:
@@ -178,7 +178,7 @@ class TiledMap:
             raise
         return store, data
 
-    def _keep(self, tiles: Collection[Tile]) -> None:
+    def _close_others(self, tiles: Collection[Tile]) -> None:
         for tile in self.open - set(tiles):
             self._files.pop(tile)[0].close()
 
@@ -195,7 +195,7 @@ class TiledRelocalizer:
     ) -> None:
         """`make`: creates the relocalizer of a map in memory. `describe`: see `PlaceRecognition.descriptors`."""
         self._settings, self._tiles, self._make, self._describe = settings, tiles, make, describe
-        self._here: Relocalizer | None = None
+        self._relocalizer: Relocalizer | None = None
         self._problem = ""  # why a tile is missing
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:
@@ -212,8 +212,8 @@ class TiledRelocalizer:
             tiles = self._tiles.like(pooled(descriptors), CANDIDATES)
         else:
             tiles = self._tiles.around(hint[:2, 3], self._settings.hint_radius)
-        self._go_to(tiles)
-        return self._known(lambda here: here.find(keyframe, hint))
+        self._load_tiles(tiles)
+        return self._result_of(lambda relocalizer: relocalizer.find(keyframe, hint))
 
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """As `Relocalizer.verify`.
@@ -223,18 +223,19 @@ class TiledRelocalizer:
         """
         xy, reach = T_map_lidar[:2, 3], self._settings.surroundings
         if not self._tiles.open or not set(self._tiles.around(xy, reach)) <= self._tiles.open:
-            self._go_to(self._tiles.around(xy, max(self._tiles.size, reach)))  # more, so that the next call needs none
-        return self._known(lambda here: here.verify(keyframe, T_map_lidar))
+            # More, so that the next call needs none.
+            self._load_tiles(self._tiles.around(xy, max(self._tiles.size, reach)))
+        return self._result_of(lambda relocalizer: relocalizer.verify(keyframe, T_map_lidar))
 
-    def _go_to(self, tiles: Collection[Tile]) -> None:
-        self._here, self._problem = None, ""
+    def _load_tiles(self, tiles: Collection[Tile]) -> None:
+        self._relocalizer, self._problem = None, ""
         if tiles:
             data, self._problem = self._tiles.read(tiles)
-            self._here = self._make(data)
+            self._relocalizer = self._make(data)
 
-    def _known(self, asked: Callable[[Relocalizer], Registration]) -> Registration:
+    def _result_of(self, query: Callable[[Relocalizer], Registration]) -> Registration:
         """The result with the loaded tiles; if it is not ok and a tile is missing, raise the problem."""
-        result = nowhere("outside the map") if self._here is None else asked(self._here)
+        result = nowhere("outside the map") if self._relocalizer is None else query(self._relocalizer)
         if self._problem and not result.ok:
             raise Dpm2Error(self._problem)
         return result
