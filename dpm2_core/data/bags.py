@@ -250,8 +250,8 @@ class BagSource:
         return None
 
     def _recorded_correction(self) -> float | None:
-        topic, wanted = naming.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
-        message = self._bag.first(topic) if wanted else None
+        topic, is_auto = naming.VERTICAL_ANGLE_CORRECTION, self._settings.vertical_angle_correction_deg == "auto"
+        message = self._bag.first(topic) if is_auto else None
         return None if message is None else checked_correction(float(message.data), f"{self.path}: {topic}")
 
     def _clouds_with_messages(self) -> Iterator[tuple[int, int, bytes, dict[str, tuple[int, bytes]]]]:

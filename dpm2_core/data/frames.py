@@ -91,7 +91,7 @@ class FrameBuilder:
     Args:
         settings: how to read the messages.
         calibration: read again for each frame.
-        complain: called once for each different problem.
+        on_problem: called once for each different problem.
         decode: deserializes a message of a topic, or raises MessageError; the default takes messages as they are.
         imu, gnss: buffers of their messages; None if the sensor is not used.
 
@@ -105,25 +105,25 @@ class FrameBuilder:
         self,
         settings: InputSettings,
         calibration: Calibration,
-        complain: Callable[[str], None],
+        on_problem: Callable[[str], None],
         decode: Callable[[str, Any], Any] = lambda topic, message: message,
         imu: ImuBuffer | None = None,
         gnss: FixBuffer | None = None,
     ) -> None:
-        self._settings, self._calibration, self._complain, self._decode = settings, calibration, complain, decode
+        self._settings, self._calibration, self._on_problem, self._decode = settings, calibration, on_problem, decode
         self._reported: set[str] = set()
         self.problems: dict[str, str] = {}
         self.time_problem = ""
         self._imu, self._gnss = imu, gnss
         self.up: Up | None = (0.0, 0.0, 1.0)
 
-    def frame(self, stamp: int, cloud: Any, index: int, beside: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
+    def frame(self, stamp: int, cloud: Any, index: int, messages: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
         """The frame of a cloud with its stamp (ns) and the associated messages; `problem` is set if it is unreadable.
 
         Args:
-            beside: stamp (ns) and message of each camera and of a second LiDAR, by topic, if available.
+            messages: stamp (ns) and message of each camera and of a second LiDAR, by topic, if available.
         """
-        beside, topic = beside or {}, self._calibration.points_topic
+        messages, topic = messages or {}, self._calibration.points_topic
         try:
             cloud = self._decode(topic, cloud)
             self._check_frame(cloud.header.frame_id)
@@ -135,11 +135,13 @@ class FrameBuilder:
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
-        if (second := beside.get(self._calibration.second_topic)) is not None:
+        if (second := messages.get(self._calibration.second_topic)) is not None:
             points, offset = self._merged(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
         imu = None if self._imu is None else self._imu_samples(self._imu, lidar_frame, stamp, offset)
         fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
-        associated = [(camera, *beside[camera.topic]) for camera in self._calibration.cameras if camera.topic in beside]
+        associated = [
+            (camera, *messages[camera.topic]) for camera in self._calibration.cameras if camera.topic in messages
+        ]
         found = (self._image(lidar_frame, camera, message, (at - stamp) * 1e-9) for camera, at, message in associated)
         images = tuple(image for image in found if image is not None)
         return Frame(stamp, points, offset, images, index, up=self.up, imu=imu, fix=fix)
@@ -262,5 +264,5 @@ class FrameBuilder:
         text = f"{topic}: {problem.removeprefix(f'{topic}: ')}{suffix}"  # errors of damaged messages name the topic too
         if text not in self._reported and len(self._reported) < _MAX_REPORTS:
             self._reported.add(text)
-            self._complain(text)
+            self._on_problem(text)
         return problem

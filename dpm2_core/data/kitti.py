@@ -135,13 +135,13 @@ class KittiSource(VelodyneDrive):
             step = float(np.median(np.diff(times[:, 0]))) if len(times) > 1 else self._settings.period
             self.notes.append(f"{path}: {len(times)} times for {n} scans; the rest continue every {step:.3f} s")
             seconds = np.where(known, seconds, seconds[last] + (self.numbers - self.numbers[last]) * step)
-        if (off := out_of_order(seconds)).any():
-            first = int(np.argmax(off))
+        if (wrong := out_of_order(seconds)).any():
+            first = int(np.argmax(wrong))
             self.notes.append(
-                f"{path}: {off.sum()} times are not between their neighbors and are interpolated, the first"
+                f"{path}: {wrong.sum()} times are not between their neighbors and are interpolated, the first"
                 f" {seconds[first]:g} s of scan {self.numbers[first]}"
             )
-            seconds[off] = np.interp(self.numbers[off], self.numbers[~off], seconds[~off])
+            seconds[wrong] = np.interp(self.numbers[wrong], self.numbers[~wrong], seconds[~wrong])
         return np.round(seconds * 1e9).astype(np.int64)
 
     def _poses(self) -> Array | None:

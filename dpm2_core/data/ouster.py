@@ -90,11 +90,11 @@ class OusterSource:
         except Exception as error:  # as below
             self.notes.append(f"{self.path}: going on without the IMU: {_reason(error)}")
 
-    def _columns(self, sweep: Any, last: int) -> tuple[dict[str, NDArray[Any]], int]:
-        """PointCloud2 fields of the returned points, and the stamp, ns; the stamp `last` if no column was received."""
+    def _columns(self, sweep: Any, last_stamp: int) -> tuple[dict[str, NDArray[Any]], int]:
+        """PointCloud2 fields of the returned points, and the stamp, ns; `last_stamp` if no column was received."""
         received = (sweep.status & _RECEIVED_BIT).astype(bool)
         times = sweep.timestamp.astype(np.int64)
-        stamp = int(times[received][0]) if received.any() else last
+        stamp = int(times[received][0]) if received.any() else last_stamp
         ranges = sweep.field("RANGE")
         returned = (ranges > 0) & received
         xyz = self._project(ranges)[returned].astype(np.float32)

@@ -77,20 +77,20 @@ class SetBack:
     after more than `FEW` in a row, each stamped later than the one before."""
 
     def __init__(self) -> None:
-        self._late: list[tuple[int, Any]] = []
+        self._kept: list[tuple[int, Any]] = []
 
     def add(self, stamp: int, item: Any) -> list[Any]:
         """Add an item with its stamp (ns); returns all kept items once the clock is known to be set back, else none."""
-        if self._late and stamp <= self._late[-1][0]:
-            self._late.clear()
-        self._late.append((stamp, item))
-        if len(self._late) <= FEW:
+        if self._kept and stamp <= self._kept[-1][0]:
+            self._kept.clear()
+        self._kept.append((stamp, item))
+        if len(self._kept) <= FEW:
             return []
         return self.end()
 
     def end(self) -> list[Any]:
         """Called when an item arrives in order; returns the late items received before it."""
-        items, self._late = [item for _, item in self._late], []
+        items, self._kept = [item for _, item in self._kept], []
         return items
 
 

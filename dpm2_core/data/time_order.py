@@ -29,10 +29,10 @@ def out_of_order(times: Array) -> NDArray[np.bool_]:
     ordered = np.zeros(len(times), bool)
     ordered[_longest_increasing(times)] = True
     kept = np.flatnonzero(ordered)
-    off = np.zeros(len(times), bool)
+    wrong = np.zeros(len(times), bool)
     for before, after in pairwise(kept):
-        off[before + 1 : after] = after - before <= FEW + 1
-    return off
+        wrong[before + 1 : after] = after - before <= FEW + 1
+    return wrong
 
 
 def in_order(messages: Iterable[RawMessage], topic: str, corrected: Callable[[int, int], None]) -> Iterator[RawMessage]:
@@ -117,10 +117,10 @@ def _corrected_stamp(stamps: Sequence[int], index: int) -> int:
     if all(increase) or repeated:
         return window[index]
     relative = np.array([stamp - window[0] for stamp in window], np.float64)  # differences may exceed 64 bits
-    off = out_of_order(relative)
-    known = np.flatnonzero(~off)
+    wrong = out_of_order(relative)
+    known = np.flatnonzero(~wrong)
     stamp = window[0] + round(np.interp(index, known, relative[known]))
-    return stamp if off[index] and stamp < STAMP_END else window[index]
+    return stamp if wrong[index] and stamp < STAMP_END else window[index]
 
 
 def _longest_increasing(times: Array) -> list[int]:

@@ -218,14 +218,14 @@ def _neighbors(queries: Array, k: int, radius: float, grid: _Grid) -> Index:
     """See `PointGrid.neighbors`: all points within a distance that is increased until there are enough."""
     out = np.empty((len(queries), k), np.int32)
     squared, index = np.empty(len(grid[0]) + 1), np.empty(len(grid[0]) + 1, np.int32)
-    wanted = min(k, len(grid[0]))
+    count = min(k, len(grid[0]))
     for q in range(len(queries)):
         reach = min(_FIRST_REACH * grid[1][3], radius)
         found = _all_within(queries[q], reach, grid, squared, index)
-        while found == 0 or (found < wanted and reach < radius):
-            reach = 2 * reach if found == 0 else min(min(2.0, 1.2 * np.sqrt(wanted / found)) * reach, radius)
+        while found == 0 or (found < count and reach < radius):
+            reach = 2 * reach if found == 0 else min(min(2.0, 1.2 * np.sqrt(count / found)) * reach, radius)
             found = _all_within(queries[q], reach, grid, squared, index)
-        _select(squared, index, found, min(wanted, found))
+        _select(squared, index, found, min(count, found))
         for j in range(k):
             out[q, j] = index[j] if j < found and squared[j] <= radius * radius else index[0]
     return out

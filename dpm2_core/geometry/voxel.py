@@ -81,14 +81,18 @@ def _insert(keys: NDArray[np.int64], table: NDArray[np.int64]) -> None:
 
 @compiled([int64[::1](READ_F4, int64[::1], *[float32] * 3), int64[::1](READ_F8, int64[::1], *[float64] * 3)])
 def _first_in_cells(
-    points: NDArray[np.floating], table: NDArray[np.int64], scale: np.floating, least: np.floating, most: np.floating
+    points: NDArray[np.floating],
+    table: NDArray[np.int64],
+    scale: np.floating,
+    min_squared: np.floating,
+    max_squared: np.floating,
 ) -> NDArray[np.int64]:
-    """`voxel_first` with a hash table of the cells seen so far; `least` and `most` are squared distances."""
+    """`voxel_first` with a hash table of the cells seen so far; `min_squared` and `max_squared` are squared distances."""
     shift = _hash_shift(table)
     first, count, last_key = np.empty(len(points), np.int64), 0, np.int64(-1)
     for i in range(len(points)):
         squared = points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1] + points[i, 2] * points[i, 2]
-        if not (squared >= least and squared <= most):
+        if not (squared >= min_squared and squared <= max_squared):
             continue
         x, y, z = np.floor(points[i, 0] * scale), np.floor(points[i, 1] * scale), np.floor(points[i, 2] * scale)
         key = (np.int64(x) + _HALF_EXTENT << 42) | (np.int64(y) + _HALF_EXTENT << 21) | (np.int64(z) + _HALF_EXTENT)

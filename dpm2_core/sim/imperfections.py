@@ -28,23 +28,23 @@ class Returns:
 
     Attributes:
         distance: (R,) float32 m to the surface hit, even if it gives no return; the LiDAR's range if there is none.
-        intensity: (R,) float32 0..1. back: (R,) bool, whether there is a return.
+        intensity: (R,) float32 0..1. returned: (R,) bool, whether there is a return.
         retro: (R,) bool, whether it hit a retro-reflector.
     """
 
     distance: Float
     intensity: Float
-    back: Bool
+    returned: Bool
     retro: Bool
 
     def copy(self) -> Returns:
         """A copy with its own arrays."""
         return Returns(*(getattr(self, field.name).copy() for field in fields(self)))
 
-    def put(self, which: NDArray[np.intp], others: Returns) -> None:
-        """Replace the returns of K pulses, with indices `which` (K,), by `others`."""
+    def put(self, indices: NDArray[np.intp], others: Returns) -> None:
+        """Replace the returns of K pulses, with `indices` (K,), by `others`."""
         for field in fields(self):
-            getattr(self, field.name)[which] = getattr(others, field.name)
+            getattr(self, field.name)[indices] = getattr(others, field.name)
 
 
 class Draws(NamedTuple):
@@ -59,8 +59,8 @@ class SensorErrors:
     """Errors of one sensor, determined by its serial number; stateless between scans.
 
     Attributes:
-        range_bias: (R,) m. origin_height: (R,) m above the sensor. clear: (R,) fraction of the light that passes the
-            window.
+        range_bias: (R,) m. origin_height: (R,) m above the sensor. transmission: (R,) fraction of the light that
+            passes the window.
     """
 
     def __init__(self, config: LidarConfig, ring: NDArray[np.uint8], column: NDArray[np.intp]) -> None:
@@ -72,7 +72,7 @@ class SensorErrors:
         self._angles = np.radians(real.angle_bias * rng.standard_normal((2, beams))).astype(np.float32)
         upper, lower = real.emitters
         self.origin_height = np.where(ring < beams // 2, upper, lower).astype(np.float32)
-        self.clear = self._window(rng)[ring, column]
+        self.transmission = self._window(rng)[ring, column]
 
     def _window(self, rng: np.random.Generator) -> Float:
         """(beams, columns) fraction of the light that passes: spots of dirt, each some degrees wide."""
@@ -112,43 +112,43 @@ class SensorErrors:
         stray = np.zeros(len(self.ring), bool)
         if draws is None:
             return stray
-        distance, intensity, back, retro = returns.distance, returns.intensity, returns.back, returns.retro
+        distance, intensity, returned, retro = returns.distance, returns.intensity, returns.returned, returns.retro
         if self.settings.footprint:
-            self._mix_edges(distance, back, draws.edge)
+            self._mix_edges(distance, returned, draws.edge)
         if self.settings.glare:
-            stray |= self._glare(distance, intensity, back, retro, draws.halo)
+            stray |= self._glare(distance, intensity, returned, retro, draws.halo)
         if self.settings.drops:
-            stray |= self._drops(distance, intensity, back, draws.drop)
+            stray |= self._drops(distance, intensity, returned, draws.drop)
         return stray
 
-    def _mix_edges(self, distance: Float, back: Bool, chance: Float) -> None:
+    def _mix_edges(self, distance: Float, returned: Bool, chance: Float) -> None:
         """Move returns of pulses that hit two surfaces to between them."""
         difference = np.diff(distance, append=distance[-1:])
         gap = np.abs(difference)
         step = 2 * np.pi / self.config.columns
-        is_pair = back & np.append(back[1:], False) & np.append(self.ring[1:] == self.ring[:-1], False)
+        is_pair = returned & np.append(returned[1:], False) & np.append(self.ring[1:] == self.ring[:-1], False)
         share = min(0.5, self.settings.footprint / step)
         mixed = is_pair & (gap > _EDGE_GAP[0]) & (gap < _EDGE_GAP[1]) & (chance < share)
         distance[mixed] += difference[mixed] * (chance[mixed] / np.float32(share))
 
-    def _glare(self, distance: Float, intensity: Float, back: Bool, retro: Bool, chance: Float) -> Bool:
+    def _glare(self, distance: Float, intensity: Float, returned: Bool, retro: Bool, chance: Float) -> Bool:
         """Make pulses next to a retro-reflector, with nothing nearer, return at its distance."""
         retro_distance = np.full((self.config.beams, self.config.columns), np.inf, np.float32)
-        retro_returns = np.flatnonzero(retro & back)
+        retro_returns = np.flatnonzero(retro & returned)
         retro_distance[self.ring[retro_returns], self.column[retro_returns]] = distance[retro_returns]
         halo = cv2.erode(
             retro_distance, np.ones((2 * _GLARE_RADIUS + 1, 2 * _GLARE_RADIUS + 1), np.uint8), borderValue=float("inf")
         )
         glare_distance = halo[self.ring, self.column]
         is_glare = np.isfinite(glare_distance) & ~retro & (chance < self.settings.glare) & (distance > glare_distance)
-        distance[is_glare], intensity[is_glare], back[is_glare] = glare_distance[is_glare], np.float32(0.3), True
+        distance[is_glare], intensity[is_glare], returned[is_glare] = glare_distance[is_glare], np.float32(0.3), True
         return is_glare
 
-    def _drops(self, distance: Float, intensity: Float, back: Bool, chance: Float) -> Bool:
+    def _drops(self, distance: Float, intensity: Float, returned: Bool, chance: Float) -> Bool:
         """Rain, snow or dust: pulses that return from a drop before they reach a surface."""
         density = np.float32(self.settings.drops)
         # m, for a constant density along the beam
         drop_distance = -np.log(np.maximum(chance, np.float32(1e-7))) / density
         hit = (drop_distance < np.minimum(distance, _MAX_DROP_RANGE)) & (drop_distance > self.config.min_range)
-        distance[hit], intensity[hit], back[hit] = drop_distance[hit], np.float32(0.02), True
+        distance[hit], intensity[hit], returned[hit] = drop_distance[hit], np.float32(0.02), True
         return hit

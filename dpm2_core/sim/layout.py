@@ -31,7 +31,7 @@ class Layout:
 
     def __init__(self, road: Road, terrain: Terrain, preset: Preset, rng: np.random.Generator) -> None:
         self.terrain, self.preset, self.rng = terrain, preset, rng
-        self.taken = np.zeros(terrain.edge.shape, np.uint8)
+        self.occupied = np.zeros(terrain.edge.shape, np.uint8)
         self.drive = cKDTree(road.drive.xy)
 
     def meshes(self) -> Iterator[Mesh]:
@@ -63,11 +63,11 @@ class Layout:
         yield from self._scatter(tufts, 100 * preset.tufts, (preset.sidewalk + 0.6, preset.sidewalk + 7), 0.0)
 
     def _is_free(self, xy: Array) -> bool:
-        return not self.taken[self.terrain.cell(xy)].any()
+        return not self.occupied[self.terrain.cell(xy)].any()
 
     def _occupy(self, outline: ArrayLike) -> None:
         corners = np.rint((np.asarray(outline) - self.terrain.origin) / RESOLUTION).astype(np.int32)
-        cv2.fillConvexPoly(self.taken, corners, 1)
+        cv2.fillConvexPoly(self.occupied, corners, 1)
 
     def _scatter(
         self,
@@ -100,11 +100,11 @@ class Layout:
             keep = terrain.edge_at(xy) > band[0] - 0.25
             keep &= self.drive.query(xy)[0] > CLEAR_OF_DRIVE + extent[kind] * size
             row, column = terrain.cell(xy)
-            keep &= self.taken[row, column] == 0
+            keep &= self.occupied[row, column] == 0
             if radius:
                 close = cKDTree(xy).query_pairs(2 * radius, output_type="ndarray")
                 keep[close[keep[close].all(1), 1]] = False
-                self.taken[row[keep], column[keep]] = 1
+                self.occupied[row[keep], column[keep]] = 1
             xy, picked, kind, size = xy[keep], picked[keep], kind[keep], size[keep]
             yaw = rng.uniform(0, 2 * np.pi, len(xy))
             if scale is None:
@@ -117,8 +117,10 @@ class Layout:
             z = terrain.surface_at(xy)
             texture = rng.integers(0, 65536, len(xy))
             for k, template in enumerate(templates):
-                if (mine := kind == k).any():
-                    yield placed(template, pose(xy[mine], z[mine], yaw[mine], size[mine]), texture[mine], tint[mine])
+                if (chosen := kind == k).any():
+                    yield placed(
+                        template, pose(xy[chosen], z[chosen], yaw[chosen], size[chosen]), texture[chosen], tint[chosen]
+                    )
 
     def _parked(self, share: float) -> Iterator[Mesh]:
         rng, level = self.rng, -0.95
@@ -191,7 +193,7 @@ class Layout:
                 span = Kerbline(line.xy[part], line.outward[part], line.junction[part])
                 clear = self._is_free(span.xy) and (self.drive.query(span.xy)[0] > CLEAR_OF_DRIVE + 0.5).all()
                 if rng.random() < share and clear:
-                    self.taken[self.terrain.cell(span.xy)] = 1
+                    self.occupied[self.terrain.cell(span.xy)] = 1
                     yield from kinds[int(rng.choice(3, p=[0.45, 0.3, 0.25]))](span)
 
     def _hedge(self, line: Kerbline) -> Iterator[Mesh]:

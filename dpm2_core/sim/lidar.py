@@ -70,7 +70,7 @@ class Lidar:
         time: float,
         rng: np.random.Generator,
         twist: Array | None = None,
-        believed: Array | None = None,
+        deskew_twist: Array | None = None,
     ) -> Scan:
         """One revolution at a pose (4, 4).
 
@@ -79,7 +79,7 @@ class Lidar:
             twist: (6,) [rad/s, m/s] of the sensor in its own frame during the revolution, or its poses (columns, 4, 4)
                 T_stamp_column at the times of the columns: each point is then in the sensor frame at its own time, as
                 in a driver's raw cloud. None: already de-skewed, as KITTI's are.
-            believed: (6,) twist used to de-skew the points of a revolution in motion.
+            deskew_twist: (6,) twist used to de-skew the points of a revolution in motion.
         """
         aim = self.beams.directions(time)
         origins, directions = self._rays(T_world_lidar, self.errors.aimed(aim), twist)
@@ -93,23 +93,23 @@ class Lidar:
             self._mark_lanes(world, T_world_lidar, aim, returns, label)
         static_returns = returns.copy()
         self.errors.finish(static_returns, draws)
-        static = self._points(aim, static_returns, believed)
+        static = self._points(aim, static_returns, deskew_twist)
         if dynamic_objects := world.traffic.dynamic_objects(time, T_world_lidar[:3, 3]):
             single_origin = twist is None and not any(self.config.real.emitters)
             hits, toward = dynamic_objects.cast(origins[0] if single_origin else origins, directions, self.config.range)
             is_nearer = hits.distance < static_hits.distance[toward]
-            hits, which = hits.part(is_nearer), toward[is_nearer]
+            hits, rays = hits.part(is_nearer), toward[is_nearer]
             mesh = dynamic_objects.scene.mesh
-            moving_returns = self._returns(mesh, hits, directions[which], chance[:, which], jitter[:, which], which)
-            returns.put(which, moving_returns)
+            moving_returns = self._returns(mesh, hits, directions[rays], chance[:, rays], jitter[:, rays], rays)
+            returns.put(rays, moving_returns)
             number = dynamic_objects.number[hits.face].astype(np.uint32)
-            label[which] = MOVING_LABEL[mesh.label[hits.face]] | number << 16
+            label[rays] = MOVING_LABEL[mesh.label[hits.face]] | number << 16
         stray = self.errors.finish(returns, draws)
         label[stray] = Label.OUTLIER
-        back = returns.back
-        time_offset = self.beams.column_time[self.beams.column[back]]
-        points = self._points(aim, returns, believed)
-        return Scan(points, label[back], self.beams.ring[back], time_offset, static)
+        returned = returns.returned
+        time_offset = self.beams.column_time[self.beams.column[returned]]
+        points = self._points(aim, returns, deskew_twist)
+        return Scan(points, label[returned], self.beams.ring[returned], time_offset, static)
 
     def pose(self, world: World, time: float) -> Array:
         """T_world_lidar (4, 4) of the mounted sensor at a time of the drive, s."""
@@ -130,7 +130,7 @@ class Lidar:
         self, world: World, T_world_lidar: Array, aim: Float, returns: Returns, label: NDArray[np.uint32]
     ) -> None:
         """Brighten and label the returns from lane markings, in place."""
-        road = np.flatnonzero(returns.back & (label == Label.ROAD))
+        road = np.flatnonzero(returns.returned & (label == Label.ROAD))
         points = aim[road] * returns.distance[road, None]
         xy = points @ T_world_lidar[:2, :3].T.astype(np.float32) + T_world_lidar[:2, 3].astype(np.float32)
         footprint = np.full(len(xy), 0.03, np.float32)
@@ -152,16 +152,16 @@ class Lidar:
         directions = np.einsum("nij,nj->ni", R, aim)
         return T[:, :3, 3].astype(np.float32)[self.beams.column] + height * R[:, :, 2], directions
 
-    def _points(self, aim: Float, returns: Returns, believed: Array | None) -> Float:
-        """(N, 4) of the pulses that returned, de-skewed to the stamp if the motion is `believed`."""
-        back = returns.back
-        points = np.empty((int(back.sum()), 4), np.float32)
-        points[:, :3] = aim[back] * returns.distance[back, None]
-        points[:, 2] += self.errors.origin_height[back]
-        points[:, 3] = returns.intensity[back]
-        if believed is None:
+    def _points(self, aim: Float, returns: Returns, deskew_twist: Array | None) -> Float:
+        """(N, 4) of the pulses that returned, de-skewed to the stamp with `deskew_twist`, if given."""
+        returned = returns.returned
+        points = np.empty((int(returned.sum()), 4), np.float32)
+        points[:, :3] = aim[returned] * returns.distance[returned, None]
+        points[:, 2] += self.errors.origin_height[returned]
+        points[:, 3] = returns.intensity[returned]
+        if deskew_twist is None:
             return points
-        return deskew(points, self.beams.column_time[self.beams.column[back]], believed)
+        return deskew(points, self.beams.column_time[self.beams.column[returned]], deskew_twist)
 
     def _returns(
         self,
@@ -170,7 +170,7 @@ class Lidar:
         directions: Float,
         chance: Float,
         jitter: Float,
-        which: NDArray[np.intp] | slice = slice(None),
+        rays: NDArray[np.intp] | slice = slice(None),
     ) -> Returns:
         """Returns of the pulses (R,) on a mesh, given their hits."""
         config, real = self.config, self.config.real
@@ -183,20 +183,20 @@ class Lidar:
         distance = np.where(hits.face >= 0, hits.distance, config.range).astype(np.float32)
         # Strength of the returned pulse relative to the receiver's threshold.
         strength = reflectance * (cosine + np.float32(0.02)) * (np.float32(30) / np.maximum(distance, 5)) ** 2
-        strength *= self.errors.clear[which]
+        strength *= self.errors.transmission[rays]
         # Whole panes and panels vanish rather than single pulses: half of the fraction is drawn once per quad.
         panel = ((face >> 1) * 40503 & 0xFFFF).astype(np.float32) / np.float32(0xFFFF)
         absorbed = panel < MISS[material] if real.panes else MISS[material] * 2 * panel
         loss = config.dropout + absorbed + np.exp(-strength / np.float32(0.006 * (1 + real.weak)))
-        back = (hits.face >= 0) & (chance[0] > loss)
+        returned = (hits.face >= 0) & (chance[0] > loss)
         sigma = np.hypot(np.float32(config.noise), ROUGHNESS[material])
         if real.growth or real.footprint:
             sigma = np.hypot(sigma, self.errors.noise(distance, cosine))
-        measured = distance + sigma * jitter[0] + self.errors.range_bias[which]
-        back &= (measured >= config.min_range) & (measured <= config.range)
+        measured = distance + sigma * jitter[0] + self.errors.range_bias[rays]
+        returned &= (measured >= config.min_range) & (measured <= config.range)
         facing = np.where(RETRO[material], 1, 0.55 + 0.45 * np.sqrt(cosine)).astype(np.float32)
-        intensity = reflectance * facing * np.exp(-distance / 160) * self.gain[which] * self.errors.clear[which]
+        intensity = reflectance * facing * np.exp(-distance / 160) * self.gain[rays] * self.errors.transmission[rays]
         intensity += np.float32(0.03) * jitter[1]
         faint = DARK[material] + np.float32(0.6) / (1 + np.exp((np.float32(38) - distance) / 7))
         intensity = np.where(chance[1] < faint, 0, np.rint(intensity.clip(0, 1) * 100) / 100).astype(np.float32)
-        return Returns(measured, intensity, back, RETRO[material])
+        return Returns(measured, intensity, returned, RETRO[material])

@@ -261,7 +261,7 @@ def varied(preset: Preset, rng: np.random.Generator) -> Preset:
     return preset.model_copy(update=values)
 
 
-def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
+def with_traffic(preset: Preset, nominal: Preset, factor: float) -> Preset:
     """A world's own preset with `factor` times the traffic: 0 for none, 20 fills every lane.
 
     Above 1 the cars drive in columns, ahead, behind, alongside and oncoming, on a road that is wide enough for them.
@@ -272,9 +272,9 @@ def with_traffic(own: Preset, nominal: Preset, factor: float) -> Preset:
     """
     if not 0 <= factor <= 1000:
         raise UsageError(f"--traffic {factor:g}: want 0 to 1000 times the preset's")
-    if own.indoor and factor > 1:
+    if preset.indoor and factor > 1:
         raise UsageError(f"--traffic {factor:g}: there is none indoors; want 0 to 1")
     if factor <= 1:
-        return own.model_copy(update={"traffic": own.traffic * factor, "people": own.people * factor})
-    wide = {} if own.wide else {"lane": 1.8, "half_width": 9.4 if own.parked else 7.2}
-    return own.model_copy(update={"traffic": nominal.traffic * factor, "columns": True, **wide})
+        return preset.model_copy(update={"traffic": preset.traffic * factor, "people": preset.people * factor})
+    wide = {} if preset.wide else {"lane": 1.8, "half_width": 9.4 if preset.parked else 7.2}
+    return preset.model_copy(update={"traffic": nominal.traffic * factor, "columns": True, **wide})

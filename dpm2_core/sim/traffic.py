@@ -143,18 +143,18 @@ def _with_columns(others: Traffic, preset: Preset, rng: np.random.Generator) -> 
     library = [car(rng) for _ in range(12)] + [truck(rng) for _ in range(8)]
     lengths = np.array([np.ptp(mesh.vertices[:, 0]) for mesh in library])
     across = 2 * preset.lane
-    beside, oncoming = (lane, (across, across - lane)) if preset.wide else (-lane, (across, across + lane))
+    second_lane, oncoming = (lane, (across, across - lane)) if preset.wide else (-lane, (across, across + lane))
     parts = []
-    for lane_at, trucks in ((0.0, 0.4), (beside, 0.7), (oncoming[0], 0.4), (oncoming[1], 0.4)):
+    for lateral, trucks in ((0.0, 0.4), (second_lane, 0.7), (oncoming[0], 0.4), (oncoming[1], 0.4)):
         kind, at = _queue(lengths, trucks, 400 / preset.traffic, length, rng)
-        same_way = lane_at in (0.0, beside)
+        same_way = lateral in (0.0, second_lane)
         pace = rng.uniform(-1.5, 1.5) if same_way else -preset.speed * rng.uniform(0.7, 1.0)
-        if lane_at == 0:  # space for the car itself, and for cars ahead and behind to come 2 m nearer
+        if lateral == 0:  # space for the car itself, and for cars ahead and behind to come 2 m nearer
             pace = 0.0
             at = np.remainder(at + length / 2, length) - length / 2
             is_apart = np.abs(at) > 9 + lengths[kind] / 2
             kind, at = kind[is_apart], at[is_apart]
-        parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lane_at, same_way))))
+        parts.append((kind, at, *(np.full(len(at), value) for value in (pace, lateral, same_way))))
     kind, *queues = (np.concatenate(part) for part in zip(*parts, strict=True))
     queues += [rng.uniform(0, 6.3, len(kind)), np.full(len(kind), ALONGSIDE)]
     rest = others.start, others.speed, others.lateral, others.follows, others.phase, others.gap
