@@ -60,19 +60,19 @@ UNCHANGED = AugmentSettings(
 def augment(sample: Sample, settings: AugmentSettings, noise: np.random.Generator) -> Sample:
     """An augmented copy; its pose and extrinsics fit the changed cloud."""
     cloud = sample.cloud
-    for change in (_beams, _occlude, _drop):
+    for change in (_thin_beams, _occlude, _drop_points):
         changed = change(cloud, settings, noise)
         if len(changed) >= 4 * MIN_POINTS:  # never lose the scan altogether
             cloud = changed
     cloud = noise.permutation(cloud)  # so that farthest point sampling starts elsewhere
-    moved = random_motion(settings, noise)
+    T_new_old = random_motion(settings, noise)
     jitter = np.clip(noise.standard_normal(cloud.shape, np.float32), -3, 3) * np.float32(settings.jitter)
-    cloud = se3.transform(moved, cloud) + jitter
+    cloud = se3.transform(T_new_old, cloud) + jitter
     images = () if noise.random() < settings.image_drop else sample.images
     return Sample(
         cloud.astype(np.float32),
-        sample.pose @ se3.inverse(moved),
-        tuple(augment_image(image, moved, settings, noise) for image in images),
+        sample.pose @ se3.inverse(T_new_old),
+        tuple(augment_image(image, T_new_old, settings, noise) for image in images),
     )
 
 
@@ -80,16 +80,16 @@ def random_motion(settings: AugmentSettings, noise: np.random.Generator) -> Arra
     """T_new_old of the sensor frame."""
     yaw = noise.uniform(-settings.yaw, settings.yaw)
     tilt = noise.normal(0, 1, 2) * settings.tilt
-    turned = se3.exp([0, 0, yaw, 0, 0, 0]) @ se3.exp([*tilt, 0, 0, 0, 0])
-    turned[:3, 3] = noise.normal(0, 1, 3) * settings.shift
-    return turned
+    T_new_old = se3.exp([0, 0, yaw, 0, 0, 0]) @ se3.exp([*tilt, 0, 0, 0, 0])
+    T_new_old[:3, 3] = noise.normal(0, 1, 3) * settings.shift
+    return T_new_old
 
 
-def _drop(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
+def _drop_points(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
     return cloud[noise.random(len(cloud)) >= noise.uniform(0, settings.drop)]
 
 
-def _beams(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
+def _thin_beams(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator) -> Cloud:
     if noise.random() >= settings.beams:
         return cloud
     elevation = np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1]))
@@ -102,12 +102,12 @@ def _occlude(cloud: Cloud, settings: AugmentSettings, noise: np.random.Generator
         return cloud
     azimuth = np.arctan2(cloud[:, 1], cloud[:, 0])
     distance = np.linalg.norm(cloud, axis=1)
-    lost = np.zeros(len(cloud), bool)
+    is_hidden = np.zeros(len(cloud), bool)
     for shield in range(noise.integers(1, 4)):
         width = np.radians(noise.uniform(10, 150)) / (shield + 1)
         start = noise.uniform(-np.pi, np.pi)
-        lost |= ((azimuth - start) % (2 * np.pi) < width) & (distance >= noise.uniform(2, 10))
-    return cloud[~lost]
+        is_hidden |= ((azimuth - start) % (2 * np.pi) < width) & (distance >= noise.uniform(2, 10))
+    return cloud[~is_hidden]
 
 
 def augment_image(image: Image, T_new_old: Array, settings: AugmentSettings, noise: np.random.Generator) -> Image:

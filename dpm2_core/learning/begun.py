@@ -14,12 +14,12 @@ from typing import Any
 from dpm2_core.config import Settings
 from dpm2_core.errors import UsageError
 from dpm2_core.files import file_digest, json_text, make_folder, write_json
-from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS, held
+from dpm2_core.learning.checkpoint import CHECKPOINT, LOG, WEIGHTS, folder_lock
 
-_ASKED = "begun.json"
+_RECORD_FILE = "begun.json"
 """Settings and inputs with which the training in this folder began."""
-_FREE = {"workers", "save_every", "validate_every"}  # they do not change what is learned
-_CONTENT = "content of "
+_IGNORED_KEYS = {"workers", "save_every", "validate_every"}  # they do not change what is learned
+_CONTENT_PREFIX = "content of "
 
 
 def begin_training(
@@ -39,15 +39,18 @@ def begin_training(
         UsageError: another training is writing there.
     """
     make_folder(folder)
-    _check_free(folder)
-    asked, now = folder / _ASKED, _asked(settings, [*read, *([] if start is None else [start / CHECKPOINT])], data)
-    if not asked.is_file() or _before(asked) != now:
-        for old in (CHECKPOINT, LOG, WEIGHTS):
-            (folder / old).unlink(missing_ok=True)
+    _check_unlocked(folder)
+    record, current = (
+        folder / _RECORD_FILE,
+        _current_record(settings, [*read, *([] if start is None else [start / CHECKPOINT])], data),
+    )
+    if not record.is_file() or _read_record(record) != current:
+        for name in (CHECKPOINT, LOG, WEIGHTS):
+            (folder / name).unlink(missing_ok=True)
         if start is not None:
-            for kept in (CHECKPOINT, LOG):
-                shutil.copy(start / kept, folder / kept)
-        write_json(asked, now)  # last: if killed before this, the training starts again
+            for name in (CHECKPOINT, LOG):
+                shutil.copy(start / name, folder / name)
+        write_json(record, current)  # last: if killed before this, the training starts again
 
 
 def begin_or_resume(
@@ -67,23 +70,24 @@ def begin_or_resume(
             it began with something else. The message names the first setting that differs, and both values, or a
             setting that no longer exists.
     """
-    _check_free(folder)
-    asked, there = folder / _ASKED, (folder / CHECKPOINT).exists()
-    if there and not resume:
+    _check_unlocked(folder)
+    record, has_checkpoint = folder / _RECORD_FILE, (folder / CHECKPOINT).exists()
+    if has_checkpoint and not resume:
         raise UsageError(f"{folder}: contains a training; continue it with --resume, or choose another --out")
-    if resume and not there:
+    if resume and not has_checkpoint:
         raise UsageError(f"{folder}: no {CHECKPOINT} to resume")
-    now = _asked(settings, read, data)
-    if not resume or not asked.is_file():
-        write_json(asked, now)
+    current = _current_record(settings, read, data)
+    if not resume or not record.is_file():
+        write_json(record, current)
         return
-    by_default = type(settings).model_construct()  # for the overlap training, which needs `start`: the others
-    before = {**_plain(dict(_values(by_default))), **_before(asked)}  # a setting added later had its default
-    for key in [*now, *before]:
-        if key in now and before.get(key, now[key]) != now[key]:
-            name, old, new = _difference(key, before[key], now[key])
+    defaults = type(settings).model_construct()  # for the overlap training, which needs `start`: the others
+    # A setting that was added later had its default.
+    before = {**_as_read(dict(_relevant_values(defaults))), **_read_record(record)}
+    for key in [*current, *before]:
+        if key in current and before.get(key, current[key]) != current[key]:
+            name, old, new = _difference(key, before[key], current[key])
             raise UsageError(f"{folder}: began with {name} {old}, not {new}; --resume needs the same settings")
-        if key not in now and not key.startswith(_CONTENT):  # content of other files: the settings name these
+        if key not in current and not key.startswith(_CONTENT_PREFIX):  # content of files that the settings name
             raise UsageError(f"{folder}: began with {key} {before[key]}, a setting of another version of dpm2")
 
 
@@ -98,10 +102,10 @@ def is_first_process() -> bool:
     return os.environ.get("RANK", "0") == "0"
 
 
-def _check_free(folder: Path) -> None:
+def _check_unlocked(folder: Path) -> None:
     """Raise UsageError if a training is writing in a folder. Its own processes check this before any of them writes."""
     if folder.is_dir():
-        with held(folder, looking=True):
+        with folder_lock(folder, shared=True):
             pass
 
 
@@ -109,46 +113,46 @@ def _processes() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def _asked(settings: Settings, read: Sequence[Path], data: dict[str, Any] | None) -> dict[str, Any]:
+def _current_record(settings: Settings, read: Sequence[Path], data: dict[str, Any] | None) -> dict[str, Any]:
     """Everything that changes what is learned, in the form in which it is read from a file."""
-    content = {f"{_CONTENT}{path}": _content(path) for path in read}
-    return _plain({**dict(_values(settings)), **content, **(data or {}), "processes": _processes()})
+    content = {f"{_CONTENT_PREFIX}{path}": _digest(path) for path in read}
+    return _as_read({**dict(_relevant_values(settings)), **content, **(data or {}), "processes": _processes()})
 
 
-def _plain(tree: dict[str, Any]) -> dict[str, Any]:
+def _as_read(tree: dict[str, Any]) -> dict[str, Any]:
     """The tree in the form in which it is read from a file."""
     return dict(json.loads(json_text(tree)))
 
 
-def _before(asked: Path) -> dict[str, Any]:
+def _read_record(path: Path) -> dict[str, Any]:
     """The settings and inputs with which the training began.
 
     Raises:
         UsageError: the file is damaged.
     """
     try:
-        return dict(json.loads(asked.read_text(encoding="utf-8")))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{asked}: {error}") from None
+        raise UsageError(f"{path}: {error}") from None
 
 
-def _content(path: Path) -> str:
+def _digest(path: Path) -> str:
     return file_digest(path) if path.is_file() else "missing"
 
 
-def _values(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _relevant_values(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted keys and values of the settings that change what is learned."""
     for name, value in settings:
         if isinstance(value, Settings):
-            yield from _values(value, f"{prefix}{name}.")
-        elif name not in _FREE:
+            yield from _relevant_values(value, f"{prefix}{name}.")
+        elif name not in _IGNORED_KEYS:
             yield f"{prefix}{name}", settings.model_dump(mode="json", include={name})[name]
 
 
-def _difference(name: str, before: Any, now: Any) -> tuple[str, Any, Any]:
+def _difference(name: str, before: Any, after: Any) -> tuple[str, Any, Any]:
     """The first key in which two values differ, at any depth, and its values."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in [*now, *before]:
-            if before.get(key) != now.get(key):
-                return _difference(f"{name}.{key}", before.get(key), now.get(key))
-    return name, before, now
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in [*after, *before]:
+            if before.get(key) != after.get(key):
+                return _difference(f"{name}.{key}", before.get(key), after.get(key))
+    return name, before, after

@@ -25,18 +25,18 @@ CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.jsonl", "weights.safetensors"
 
 
 @contextmanager
-def held(folder: Path, looking: bool = False) -> Iterator[None]:
+def folder_lock(folder: Path, shared: bool = False) -> Iterator[None]:
     """Lock a folder against other trainings until the block ends or the process is killed, if the file system has
     locks.
 
-    `looking`: a shared lock, only to check that no training is writing, so that several may check at once.
+    `shared`: a shared lock, only to check that no training is writing, so that several may check at once.
 
     Raises:
         UsageError: another training has locked it.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, (fcntl.LOCK_SH if looking else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
         raise UsageError(f"{folder}: another training is writing here; choose another --out") from None
@@ -62,10 +62,10 @@ def save_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
         "optimiser": optimiser.state_dict(),
         "step": step,
     }
-    whole = BytesIO()  # for a file that cannot grow, torch raises errors of its own
-    torch.save(state, whole)
+    buffer = BytesIO()  # for a file that cannot grow, torch raises errors of its own
+    torch.save(state, buffer)
     with atomic_write(path, "wb") as file:
-        file.write(whole.getbuffer())
+        file.write(buffer.getbuffer())
 
 
 def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: torch.optim.Optimizer) -> int:
@@ -76,10 +76,10 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     """
     try:
         with path.open("rb") as file:
-            whole = _is_whole(file)
+            is_whole = _is_whole(file)
     except OSError as error:
         raise UsageError(f"{path}: no checkpoint: {error.strerror}") from None
-    if not whole:
+    if not is_whole:
         raise UsageError(f"{path}: damaged, or not a checkpoint; remove it to begin anew, without --resume")
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
@@ -124,8 +124,8 @@ class Log:
 
     def write(self, step: int, figures: dict[str, float]) -> None:
         """Log figures of a step; one that is not finite is written as null."""
-        known = {k: round(v, 6) if math.isfinite(v) else None for k, v in figures.items()}
-        self.file.write(json.dumps({"step": step, **known}) + "\n")
+        rounded = {k: round(v, 6) if math.isfinite(v) else None for k, v in figures.items()}
+        self.file.write(json.dumps({"step": step, **rounded}) + "\n")
         if self.board is not None:
             for name, value in figures.items():
                 self.board.add_scalar(name, value, step)

@@ -26,8 +26,8 @@ from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.views import Views, collate_views
 from dpm2_core.sim.settings import PRESET_NAMES
 
-_LEAST = 8 * MIN_POINTS  # fewest points of a training scan
-_PLACES = 100  # places that are tried
+_MIN_TRAINING_POINTS = 8 * MIN_POINTS  # fewest points of a training scan
+_MAX_TRIALS = 100  # places that are tried
 
 
 def _check_place(name: str) -> str:
@@ -158,35 +158,36 @@ class GroupDataset(Dataset[Batch]):
         for drive in self.drives.drives:
             check_fits(drive, network, settings.images)
 
-    def __getitem__(self, place: tuple[int, int]) -> Batch:
+    def __getitem__(self, step_and_rank: tuple[int, int]) -> Batch:
         """Batch of (step, rank of the process)."""
-        noise = np.random.default_rng([self.seed, *place])
+        noise = np.random.default_rng([self.seed, *step_and_rank])
         settings = self.settings
         pyramids: list[Pyramid] = []
         images = []
         poses = []
         for _ in range(settings.groups):
-            for sample in self._place(noise):
+            for sample in self._draw_place(noise):
                 images.append(sample.images if settings.images else ())
                 pyramids.append(build_pyramid(sample.cloud, self.network, images[-1]))
                 poses.append(sample.pose)
         views = collate_views(images, self.network.image) if settings.images else None
-        shaped = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)
-        return Batch(collate(pyramids), views, shaped)
+        pose_batch = torch.from_numpy(np.stack(poses)).view(settings.groups, -1, 4, 4)
+        return Batch(collate(pyramids), views, pose_batch)
 
-    def _place(self, noise: np.random.Generator) -> list[Sample]:
+    def _draw_place(self, noise: np.random.Generator) -> list[Sample]:
         """Augmented frames of a place; another place is drawn if one of them shows too little, as next to a truck.
 
         Raises:
             Dpm2Error: no such place is found.
         """
-        for _ in range(_PLACES):
+        for _ in range(_MAX_TRIALS):
             drive = self.drives.choose(noise)
             found = [fitted(drive[index], drive, self.network.points) for index in self.draw(drive, noise)]
-            if min(len(sample.cloud) for sample in found) >= _LEAST:
+            if min(len(sample.cloud) for sample in found) >= _MIN_TRAINING_POINTS:
                 return [augment(sample, self.settings.augment, noise) for sample in found]
         raise Dpm2Error(
-            f"{_PLACES} places of the packed drives were tried, and each has a scan of fewer than {_LEAST} points"
+            f"{_MAX_TRIALS} places of the packed drives were tried, and each has a scan of fewer than "
+            f"{_MIN_TRAINING_POINTS} points"
         )
 
     def batches(self, start: int, rank: int) -> Iterator[Batch]:
@@ -199,10 +200,10 @@ class GroupDataset(Dataset[Batch]):
                 sampler=((step, rank) for step in count(start)),
                 num_workers=workers,
                 prefetch_factor=4 if workers else None,
-                worker_init_fn=_one_thread,
+                worker_init_fn=_use_one_thread,
             )
         )
 
 
-def _one_thread(worker: int) -> None:
+def _use_one_thread(worker: int) -> None:
     torch.set_num_threads(1)

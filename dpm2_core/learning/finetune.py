@@ -50,19 +50,19 @@ class Finetuned(RegistrationTraining):
         self, points: PointBatch, poses: Tensor, plans: tuple[SetPairs, ...]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss and figures of G places of F scans with their reference poses (G, F, 4, 4)."""
-        by_trajectory, by_pairs = self.weights
+        trajectory_weight, pair_weight = self.weights
         total = poses.new_zeros(())
         figures: dict[str, Tensor] = {}
         tokens = self.model.encoder(points, None).tokens
-        if by_pairs:
+        if pair_weight:
             loss, figures = self.pair_loss(tokens, plans)
-            total = total + by_pairs * loss
-        if by_trajectory:
+            total = total + pair_weight * loss
+        if trajectory_weight:
             found, diverged = window_trajectories(self.model.decoder, tokens, poses)
             reference = torch.linalg.inv(poses[:, :1]) @ poses
             loss = torch.stack([trajectory_loss(a, b) for a, b in zip(found, reference, strict=True)]).mean()
             figures |= {"trajectory": loss, "diverged": diverged}
-            total = total + by_trajectory * loss
+            total = total + trajectory_weight * loss
         figures["loss"] = total
         return total, {name: value.detach().float() for name, value in figures.items()}
 
@@ -86,9 +86,9 @@ def window_trajectories(decoder: Decoder, tokens: Tokens, poses: Tensor) -> tupl
 def draw_road_segment(poses: Array, noise: np.random.Generator, frames: int, radius: float) -> NDArray[np.intp]:
     """`draw_group` in the order of the road, so that each scan follows the one before."""
     chosen = draw_group(poses, noise, frames, radius)
-    at = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
-    along = np.linalg.svd(at, full_matrices=False)[2][0]
-    return chosen[np.argsort(at @ along, kind="stable")]
+    positions = poses[chosen, :3, 3] - poses[chosen, :3, 3].mean(0)
+    direction = np.linalg.svd(positions, full_matrices=False)[2][0]
+    return chosen[np.argsort(positions @ direction, kind="stable")]
 
 
 def finetune(settings: FinetuneSettings, out: Path, data: Path | None = None) -> Path:
@@ -106,7 +106,7 @@ def finetune(settings: FinetuneSettings, out: Path, data: Path | None = None) ->
     def segments(drive: PackedDrive, noise: np.random.Generator) -> NDArray[np.intp]:
         return draw_road_segment(drive.poses, noise, settings.frames, settings.radius)
 
-    places = GroupDataset(_packed(settings, data or out), module.model.settings, segments, optimizer.seed)
+    places = GroupDataset(_group_settings(settings, data or out), module.model.settings, segments, optimizer.seed)
 
     def batches(start: int, rank: int) -> Iterator[tuple[PointBatch, Tensor, tuple[SetPairs]]]:
         for step, (points, _, poses) in enumerate(places.batches(start, rank), start):
@@ -133,7 +133,7 @@ def measure(weights: Path, settings: FinetuneSettings, out: Path, pairs: int = 1
     }
 
 
-def _packed(settings: FinetuneSettings, out: Path) -> GroupSettings:
+def _group_settings(settings: FinetuneSettings, out: Path) -> GroupSettings:
     packed = {str(out / DRIVES): 1 - settings.rehearsal_share}
     if settings.rehearsal_share:
         packed[settings.rehearsal or str(out / REHEARSAL)] = settings.rehearsal_share

@@ -26,7 +26,7 @@ from dpm2_core.slam.graph.graph_data import components
 from dpm2_core.slam.settings import Config, SlamSettings
 from dpm2_core.slam.system import SlamResult
 
-_APART = 1e4  # m: frames of unconnected parts make no pair
+_PART_DISTANCE = 1e4  # m: frames of unconnected parts make no pair
 
 
 class Referenced:
@@ -63,14 +63,14 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
     result = OfflineRun(source, Config(slam=settings)).run(step)
     if result.interrupted:  # an incomplete reference is not used
         raise KeyboardInterrupt
-    part, poses = _parts(result), result.poses.copy()
+    part, poses = _part_of_frames(result), result.poses.copy()
     poses[~np.array(result.registered, bool)] = np.nan
-    there = np.flatnonzero(known(poses))
-    last = there[:-1][np.diff(part[there]) != 0]
+    with_pose = np.flatnonzero(known(poses))
+    last = with_pose[:-1][np.diff(part[with_pose]) != 0]
     poses[last] = np.nan  # deskewing uses the motion to the next frame, which is not known
-    poses[:, 0, 3] += _APART * part
+    poses[:, 0, 3] += _PART_DISTANCE * part
     notes = []
-    if (count := len(np.unique(part[there]))) > 1:
+    if (count := len(np.unique(part[with_pose]))) > 1:
         notes.append(
             f"the SLAM does not know the relative poses of {count} parts of the drive: each is used separately"
         )
@@ -79,11 +79,15 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
     return Referenced(source, poses, notes, timed=not times)
 
 
-def _parts(result: Result) -> NDArray[np.int32]:
+def _part_of_frames(result: Result) -> NDArray[np.int32]:
     """(N,) number of the part of a drive that each frame is in: breaks divide a drive, and loops join parts again."""
     stretch = result.recorder.stretches
-    of = stretch[np.searchsorted(result.recorder.stamps, [keyframe.stamp for keyframe in result.mapper.keyframes])]
-    ties = [(of[loop.from_node], of[loop.to_node]) for loop in result.mapper.loops if loop.ok]
+    keyframe_stretch = stretch[
+        np.searchsorted(result.recorder.stamps, [keyframe.stamp for keyframe in result.mapper.keyframes])
+    ]
+    ties = [
+        (keyframe_stretch[loop.from_node], keyframe_stretch[loop.to_node]) for loop in result.mapper.loops if loop.ok
+    ]
     return components(int(stretch[-1]) + 1, np.array(ties, np.intp).reshape(-1, 2))[stretch]
 
 
@@ -102,13 +106,15 @@ def prepare(
     common = settings.model_dump(mode="json", include={"reference", "held_out", "input"})
     slam = slam.model_copy(update={"registration": settings.reference})
     notes, names = list[str](), [f"{i:02d}_{source.name.replace('/', '_')}" for i, source in enumerate(sources)]
-    for kept in (out / DRIVES, out / HELD_OUT):
-        if left := sorted({path.name for path in kept.glob("*/")} - set(names)):
-            raise UsageError(f"{kept / left[0]}: of a drive that is not asked for; remove it, or choose another folder")
+    for folder in (out / DRIVES, out / HELD_OUT):
+        if leftover := sorted({path.name for path in folder.glob("*/")} - set(names)):
+            raise UsageError(
+                f"{folder / leftover[0]}: of a drive that is not asked for; remove it, or choose another folder"
+            )
     for name, source in zip(names, sources, strict=True):
-        asked = {**common, "scans": len(source)}
+        requested = {**common, "scans": len(source)}
         if (out / DRIVES / name).exists():  # written last
-            check_same(out / DRIVES / name, asked)
+            check_same(out / DRIVES / name, requested)
             continue
         referenced = refer(source, slam, partial(advance, f"{name}: reference by SLAM"))
         notes += [f"{name}: {text}" for text in referenced.notes]
@@ -116,20 +122,20 @@ def prepare(
         if followed < 2 * settings.frames:
             raise UsageError(f"{source.name}: the SLAM followed {followed} of {len(source)} scans; nothing to learn")
         cut = round(len(source) * (1 - settings.held_out))
-        packing = _of_many(advance, f"{name}: packing")
+        packing = _text_progress(advance, f"{name}: packing")
         if _is_measurable(referenced.poses[cut:]):
-            pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, asked)
+            pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, requested)
         elif cut < len(source):
-            lacks = f"no pairs up to {NEAR:g} m and {NEAR:g} to {FAR:g} m apart, which the measurement needs"
-            notes.append(f"{name}: the {len(source) - cut} scans that are held out have {lacks}")
-        pack(referenced, out / DRIVES / name, network, range(cut), packing, asked)
+            missing = f"no pairs up to {NEAR:g} m and {NEAR:g} to {FAR:g} m apart, which the measurement needs"
+            notes.append(f"{name}: the {len(source) - cut} scans that are held out have {missing}")
+        pack(referenced, out / DRIVES / name, network, range(cut), packing, requested)
     if settings.rehearsal_share > 0 and not settings.rehearsal:
         worlds = GenerateSettings(worlds=6, first_seed=3000, frames=40, preset=network.preset)
-        generate(out / REHEARSAL, worlds, 1, _of_many(advance, "rehearsal: world"))
+        generate(out / REHEARSAL, worlds, 1, _text_progress(advance, "rehearsal: world"))
     return notes
 
 
-def _of_many(advance: Callable[[str], None], what: str) -> Advance:
+def _text_progress(advance: Callable[[str], None], what: str) -> Advance:
     return lambda done, total: advance(f"{what} {done} of {total}")
 
 

@@ -70,7 +70,7 @@ class GenerateSettings(Settings):
 
     @field_validator("mixture")
     @classmethod
-    def _of_something(cls, mixture: dict[PresetName, float]) -> dict[PresetName, float]:
+    def _check_shares(cls, mixture: dict[PresetName, float]) -> dict[PresetName, float]:
         if not sum(mixture.values()) > 0:
             raise ValueError("want a share above 0")
         return mixture
@@ -110,12 +110,12 @@ def generate_world(folder: Path, seed: int, settings: GenerateSettings) -> None:
         "scale": scale,
         "sensor": sensor,
         "crop": crop_of(network.points),
-        "settings": _asked(settings),
+        "settings": _world_settings(settings),
     }
     write_packed(folder, samples, about)
 
 
-def _asked(settings: GenerateSettings) -> dict[str, Any]:
+def _world_settings(settings: GenerateSettings) -> dict[str, Any]:
     """The settings that a world is made with, in addition to its seed."""
     return settings.model_dump(mode="json", exclude={"worlds", "first_seed"})
 
@@ -126,10 +126,12 @@ def check_same(folder: Path, asked: Mapping[str, Any]) -> None:
     Raises:
         UsageError: it was made with others; the message names the first that differs.
     """
-    made = PackedDrive(folder).about.get("settings")
-    for name, now in asked.items():
-        if isinstance(made, dict) and name in made and made[name] != now:
-            raise UsageError(f"{folder}: made with {name} {made[name]}, not {now}; remove it, or choose another folder")
+    recorded = PackedDrive(folder).about.get("settings")
+    for name, wanted in asked.items():
+        if isinstance(recorded, dict) and name in recorded and recorded[name] != wanted:
+            raise UsageError(
+                f"{folder}: made with {name} {recorded[name]}, not {wanted}; remove it, or choose another folder"
+            )
 
 
 def _lidar(world: World, settings: GenerateSettings, noise: np.random.Generator) -> Lidar:
@@ -161,7 +163,7 @@ def generate(out: Path, settings: GenerateSettings, workers: int, progress: Adva
     folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
     missing = [seed for seed in seeds if not folders[seed].exists()]
     for seed in sorted(set(seeds) - set(missing)):
-        check_same(folders[seed], _asked(settings))
+        check_same(folders[seed], _world_settings(settings))
     done = settings.worlds - len(missing)
     progress(done, settings.worlds)
     pool = ProcessPoolExecutor(workers)
@@ -198,7 +200,7 @@ def pack(
         raise UsageError(f"{source.name}: no ground truth poses, training needs them")
     chosen = frames or range(len(source))
     with packed_writer(folder) as writer:
-        before: tuple[Frame, Array] | None = None  # packed once the next pose is known, for its motion
+        previous: tuple[Frame, Array] | None = None  # packed once the next pose is known, for its motion
         twist, scale, first = np.zeros(6), 0.0, None
         for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
@@ -207,14 +209,14 @@ def pack(
             if position not in chosen or not readable or not np.isfinite(pose).all():
                 continue
             scale = scale or scale_of(frame.points)
-            first = first or (frame.index, _cameras(frame))
-            _check_cameras(source.name, first, (frame.index, _cameras(frame)))
-            if before is not None:
-                twist = _twist(before, (frame, pose))
-                _add(writer, _packed(*before, twist, network, scale))
-            before = frame, pose
-        if before is not None:
-            _add(writer, _packed(*before, twist, network, scale))
+            first = first or (frame.index, _camera_names(frame))
+            _check_cameras(source.name, first, (frame.index, _camera_names(frame)))
+            if previous is not None:
+                twist = _twist(previous, (frame, pose))
+                _add_if_large(writer, _packed_sample(*previous, twist, network, scale))
+            previous = frame, pose
+        if previous is not None:
+            _add_if_large(writer, _packed_sample(*previous, twist, network, scale))
         if not len(writer):
             raise UsageError(f"{source.name}: no readable frame with a pose")
         about = {"source": source.name, "scale": scale, "crop": crop_of(network.points)}
@@ -222,27 +224,27 @@ def pack(
     return len(writer)
 
 
-def _add(writer: PackedWriter, sample: Sample) -> None:
+def _add_if_large(writer: PackedWriter, sample: Sample) -> None:
     if len(sample.cloud) >= MIN_POINTS:  # within the crop
         writer.add(sample)
 
 
-def _cameras(frame: Frame) -> list[str]:
+def _camera_names(frame: Frame) -> list[str]:
     return [image.camera.name for image in frame.images]
 
 
-def _check_cameras(name: str, first: tuple[int, list[str]], now: tuple[int, list[str]]) -> None:
+def _check_cameras(name: str, first: tuple[int, list[str]], second: tuple[int, list[str]]) -> None:
     """Raise UsageError if two frames, each given by number and cameras, differ in their number of images."""
-    fewer, more = sorted((first, now), key=lambda seen: len(seen[1]))
+    fewer, more = sorted((first, second), key=lambda seen: len(seen[1]))
     if len(fewer[1]) < len(more[1]):
-        lacking = ", ".join(sorted(set(more[1]) - set(fewer[1])) or more[1])
+        missing = ", ".join(sorted(set(more[1]) - set(fewer[1])) or more[1])
         raise UsageError(
-            f"{name}: frame {fewer[0]} has no usable image of {lacking}, frame {more[0]} has one; "
+            f"{name}: frame {fewer[0]} has no usable image of {missing}, frame {more[0]} has one; "
             "--set input.images=false packs the drive without images"
         )
 
 
-def _packed(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, scale: float) -> Sample:
+def _packed_sample(frame: Frame, pose: Array, twist: Array, network: NetworkSettings, scale: float) -> Sample:
     points = frame.points
     if frame.time_offset is not None:
         points = deskew(points, frame.time_offset, twist)
@@ -264,7 +266,7 @@ def _sample(points: Points, pose: Array, images: tuple[Image, ...], network: Net
     return Sample(cloud, T, tuple(in_encoded_axes(image, np.eye(3, dtype=np.float32), scale) for image in images))
 
 
-def _twist(before: tuple[Frame, Array], after: tuple[Frame, Array]) -> Array:
+def _twist(first: tuple[Frame, Array], second: tuple[Frame, Array]) -> Array:
     """(6,) [rad/s, m/s] from one stamped pose to the next."""
-    seconds = max(1e-3, (after[0].stamp - before[0].stamp) * 1e-9)
-    return se3.way(before[1], after[1]) / seconds
+    seconds = max(1e-3, (second[0].stamp - first[0].stamp) * 1e-9)
+    return se3.way(first[1], second[1]) / seconds

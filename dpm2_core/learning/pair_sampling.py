@@ -66,7 +66,7 @@ def sample_set_pairs(
 
 
 @full_precision
-def _turned(axis: Tensor, T: Tensor) -> Tensor:
+def _rotate_axes(axis: Tensor, T: Tensor) -> Tensor:
     """Axes (B, N, 2), rotated by T (B, 4, 4), not yet of length 1."""
     return axis @ T[:, :2, :2].transpose(1, 2)
 
@@ -84,10 +84,10 @@ def merge_tokens(tokens: Tokens, index: Tensor, T: Tensor, view_aligned: bool) -
     T = T.flatten(0, 1)
     xyz, axis = transform(T, members.xyz), members.axis
     if view_aligned:
-        axis = _turned(axis, T)
+        axis = _rotate_axes(axis, T)
         axis = axis / axis.norm(dim=-1, keepdim=True).clamp(min=1e-6)
 
-    def joined(x: Tensor) -> Tensor:
+    def merge_frames(x: Tensor) -> Tensor:
         return x.reshape(batch, -1, *x.shape[2:])
 
-    return Tokens(joined(xyz), joined(members.features), joined(axis), joined(members.mask))
+    return Tokens(merge_frames(xyz), merge_frames(members.features), merge_frames(axis), merge_frames(members.mask))

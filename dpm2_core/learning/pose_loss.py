@@ -40,8 +40,8 @@ def differentiable_poses(
         solved = solve_batch(decoder, source, target, correlated)
     if solved is None:
         return truth, torch.zeros(len(truth), dtype=torch.bool, device=truth.device)
-    off = (solved.T[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
-    found = off < DIVERGED  # False for NaN
+    error = (solved.T[:, :3, 3] - truth[:, :3, 3]).norm(dim=-1)
+    found = error < DIVERGED  # False for NaN
     start = torch.where(found[:, None, None], solved.T, truth)
     scores = guided_scores(match_scores(decoder, correlated), start, source, target)
     T, _ = weighted_gauss_newton(start, correspond(decoder, source, target, correlated, scores), rounds=2)

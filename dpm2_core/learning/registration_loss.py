@@ -16,7 +16,7 @@ from dpm2_core.network.losses import Labels, cosine, info_nce, label_pairs, maha
 from dpm2_core.network.matching import softmax_both, take
 from dpm2_core.network.tokens import Tokens
 
-_OWN_LIMIT = 6.0  # m: the network's own matches that are wrong by more are not used for the offsets
+_MAX_OWN_ERROR = 6.0  # m: the network's own matches that are wrong by more are not used for the offsets
 
 
 class LossSettings(Settings):
@@ -93,8 +93,8 @@ def offset_pairs(
     if not settings.own:
         return flat, weight
     own = softmax_both(scores, *masks).flatten(1).topk(settings.own)[1]
-    good = (labels.distance.flatten(1).gather(1, own) <= _OWN_LIMIT).float()
-    return torch.cat([flat, own], 1), torch.cat([weight, good], 1)
+    is_close = (labels.distance.flatten(1).gather(1, own) <= _MAX_OWN_ERROR).float()
+    return torch.cat([flat, own], 1), torch.cat([weight, is_close], 1)
 
 
 def offset_loss(
@@ -109,18 +109,18 @@ def offset_loss(
     i, j = flat // m, flat % m
     x, y = take(source.xyz, i), take(target.xyz, j)
     a, b = take(correlated.source, i), take(correlated.target, j)
-    there, L_there = decoder.offset(a, b)
-    back, L_back = decoder.offset(b, a)
+    forward, L_forward = decoder.offset(a, b)
+    backward, L_backward = decoder.offset(b, a)
     inverse = torch.linalg.inv(T.double()).to(T.dtype)
     residual = torch.cat(
         [
-            residuals_in_view(there, transform(inverse, y) - x, take(source.axis, i)),
-            residuals_in_view(back, transform(T, x) - y, take(target.axis, j)),
+            residuals_in_view(forward, transform(inverse, y) - x, take(source.axis, i)),
+            residuals_in_view(backward, transform(T, x) - y, take(target.axis, j)),
         ]
     )
     weights = weight.repeat(2, 1)
     if decoder.settings.precision:
-        loss = student_offset(residual, torch.cat([L_there, L_back]), weights)
+        loss = student_offset(residual, torch.cat([L_forward, L_backward]), weights)
     else:
         loss = mahalanobis_offset(residual.flatten(0, 1), weights.flatten())
     return loss, residual.detach().norm(dim=-1)

@@ -115,10 +115,10 @@ class ImageDataset:
 
 def shown(points: NDArray[np.float32], camera: Camera) -> NDArray[np.bool_]:
     """Which points (N, 3), m, in the LiDAR frame project into the camera's image."""
-    moved = se3.transform(se3.inverse(camera.T_lidar_cam), points)
-    ahead = moved[:, 2] > 0.1
-    uv = (moved @ camera.K.T)[:, :2] / np.where(ahead, moved[:, 2], 1.0)[:, None]
-    return ahead & (uv >= 0).all(1) & (uv < camera.size).all(1)
+    camera_points = se3.transform(se3.inverse(camera.T_lidar_cam), points)
+    in_front = camera_points[:, 2] > 0.1
+    uv = (camera_points @ camera.K.T)[:, :2] / np.where(in_front, camera_points[:, 2], 1.0)[:, None]
+    return in_front & (uv >= 0).all(1) & (uv < camera.size).all(1)
 
 
 class ImageTraining(nn.Module):

@@ -117,9 +117,9 @@ class OverlapTraining(nn.Module):
             source, target = tokens.at(number[:, :1].expand(-1, FRAMES - 1)), tokens.at(number[:, 1:])
             correlated = self.model.decoder(source, target)
             solved = solve_batch(self.model.decoder, source, target, correlated)
-            nothing = source.xyz.new_zeros(len(source.xyz), POSE_FEATURES)
-            posed = nothing if solved is None else overlap_features(solved)
-        return self.model.decoder.overlap(*correlated, source.mask, target.mask, posed), solved
+            no_pose = source.xyz.new_zeros(len(source.xyz), POSE_FEATURES)
+            pose_features = no_pose if solved is None else overlap_features(solved)
+        return self.model.decoder.overlap(*correlated, source.mask, target.mask, pose_features), solved
 
 
 def pair_distances(poses: Tensor) -> Tensor:
@@ -170,8 +170,8 @@ def validator(
     """A function that measures the average precision on fixed batches of unseen worlds, with their images if they have
     any. Scans are not augmented, and no preset is emphasized, whatever the training does with its own."""
     images = settings.data.images and any(drive.has_images for drive in open_packed(Path(settings.validation)))
-    measured = {"packed": {settings.validation: 1.0}, "images": images, "augment": UNCHANGED, "emphasis": {}}
-    options = settings.data.model_copy(update=measured)
+    changes = {"packed": {settings.validation: 1.0}, "images": images, "augment": UNCHANGED, "emphasis": {}}
+    options = settings.data.model_copy(update=changes)
     data = GroupDataset(options, network, _draw, seed=1)
     batch = cache(lambda number: data[number, 0])
 

@@ -48,8 +48,8 @@ class RegistrationTraining(nn.Module):
         fusion = self.model.encoder.fusion
         self.image_head: nn.Module | None = None
         if network.image.backbone != "none" and not self.model.encoder.painted and loss.image > 0:
-            own = None if fusion is None else fusion.pixel
-            self.image_head = nn.Linear(network.image.pyramid, network.channels) if own is None else own
+            pixel_head = None if fusion is None else fusion.pixel
+            self.image_head = nn.Linear(network.image.pyramid, network.channels) if pixel_head is None else pixel_head
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode; an encoder that does not learn stays in evaluation mode, with its running means."""

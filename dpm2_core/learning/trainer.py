@@ -23,12 +23,14 @@ from dpm2_core.config import Settings
 from dpm2_core.console import QUIET, progress_bar
 from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import make_folder
-from dpm2_core.learning.checkpoint import CHECKPOINT, Log, held, load_checkpoint, save_checkpoint
+from dpm2_core.learning.checkpoint import CHECKPOINT, Log, folder_lock, load_checkpoint, save_checkpoint
 from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
 M = TypeVar("M", bound=nn.Module)
-_DIVERGED = 100  # steps in a row without a finite gradient: none of them changes the weights, which do not recover
+_MAX_SKIPPED_STEPS = (
+    100  # steps in a row without a finite gradient: none of them changes the weights, which do not recover
+)
 
 
 class StepSettings(Settings):
@@ -140,8 +142,8 @@ def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> No
     for average, value in zip(ema.buffers(), module.buffers(), strict=True):
         average.copy_(value)
     averaged: list[Tensor] = list(ema.parameters())
-    now: list[Tensor] = list(module.parameters())
-    torch._foreach_lerp_(averaged, now, 1 - decay)  # exact for weights that do not learn
+    current: list[Tensor] = list(module.parameters())
+    torch._foreach_lerp_(averaged, current, 1 - decay)  # exact for weights that do not learn
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Trainer(Generic[M]):
         """
         keep_memory()
         make_folder(self.out)
-        with process_group() as (rank, world, device), nullcontext() if rank else held(self.out):
+        with process_group() as (rank, world, device), nullcontext() if rank else folder_lock(self.out):
             module = self.module.to(device).train()  # frozen parts stay in evaluation mode
             ema = copy.deepcopy(module).requires_grad_(False).eval()  # validation changes no running means
             optimizer = make_optimizer(module, self.settings)
@@ -198,13 +200,13 @@ class Trainer(Generic[M]):
                     waited = time.perf_counter() - begin
                     figures = self._step(wrapped, ema, optimizer, to_device(batch, device), step)
                     skipped = 0 if math.isfinite(figures["norm"]) else skipped + 1
-                    if skipped == _DIVERGED:
+                    if skipped == _MAX_SKIPPED_STEPS:
                         raise Dpm2Error(f"diverged: no finite gradient since step {step + 1 - skipped} of {steps.stop}")
                     figures |= {"seconds": time.perf_counter() - begin, "waited": waited}
                     progress.update(task, advance=1, description=f"loss {figures['loss']:.3f}")
                     if log is not None:
                         log.write(step, figures)
-                        self._keep(ema, optimizer, log, step + 1, last=step == steps[-1])
+                        self._validate_and_save(ema, optimizer, log, step + 1, last=step == steps[-1])
             if log is not None:
                 log.close()
                 if steps and skipped == len(steps):
@@ -235,7 +237,7 @@ class Trainer(Generic[M]):
                 value.data.copy_(before)
         return {name: float(value) for name, value in figures.items()} | {"norm": float(norm), "rate": rate}
 
-    def _keep(self, ema: M, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
+    def _validate_and_save(self, ema: M, optimizer: torch.optim.Optimizer, log: Log, done: int, last: bool) -> None:
         """Validate, then save a checkpoint, if due after `done` steps: a run stopped in between repeats both."""
         if self.validate is not None and (last or done % self.settings.validate_every == 0):
             log.write(done - 1, self.validate(ema))
