@@ -12,7 +12,7 @@ from dpm2_core.network import compiled_bias
 from dpm2_core.network.precision import product_type
 
 
-def hiding(mask: Tensor | None) -> Tensor | None:
+def effective_mask(mask: Tensor | None) -> Tensor | None:
     """The mask, or None if it hides nothing, as for one frame: saves passes. A GPU would have to wait for the check."""
     return None if mask is not None and mask.device.type == "cpu" and bool(mask.all()) else mask
 
@@ -22,7 +22,7 @@ def zscore(values: Tensor, mask: Tensor | None = None) -> Tensor:
 
     A constant row, or one without any token, becomes zeros.
     """
-    mask = hiding(mask)
+    mask = effective_mask(mask)
     if mask is None:  # not by std_mean, which takes ten times as long on a CPU
         centered = values - values.mean(-1, keepdim=True)
         return centered / centered.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-4)
@@ -98,7 +98,7 @@ class Attention(nn.Module):
             mask: True where a token may be read, broadcastable to (B, heads, N, T), or None.
         """
         batch, n, width = x.shape
-        mask = hiding(mask)
+        mask = effective_mask(mask)
         value = self._split(self.value(tokens))
         weights = self.weights(x, tokens, bias, mask)
         with torch.autocast(x.device.type, enabled=False):

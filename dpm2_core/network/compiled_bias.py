@@ -32,9 +32,9 @@ def relative_bias(xyz: Tensor, axis: Tensor, weight: Tensor, reach: tuple[float,
         weight: (M, DIRECTIONS + DISTANCES). reach: (DISTANCES,) m, of the functions of distance.
     """
     out = torch.empty(len(xyz), len(weight), xyz.shape[1], xyz.shape[1], dtype=product_type(xyz.float()))
-    for points, axes, made in zip(xyz.float().numpy(), axis.float().numpy(), _bits(out), strict=True):
+    for points, axes, bits in zip(xyz.float().numpy(), axis.float().numpy(), _bits(out), strict=True):
         fields = np.ascontiguousarray(points.T), np.ascontiguousarray(axes), weight.detach().numpy()
-        _relative(*fields, _rates(tuple(1 / r for r in reach)), made)
+        _relative_bias_of_set(*fields, _rates(tuple(1 / r for r in reach)), bits)
     return out
 
 
@@ -47,7 +47,7 @@ def near_bias(distance: Tensor, counted: Tensor, alphas: tuple[float, ...]) -> T
     """
     out = torch.empty(len(distance), len(alphas), *distance.shape[1:], dtype=product_type(distance.float()))
     for row in zip(distance.float().contiguous().numpy(), counted.contiguous().numpy(), _bits(out), strict=True):
-        _near(row[0], row[1], _rates(alphas), row[2])
+        _near_bias_of_set(row[0], row[1], _rates(alphas), row[2])
     return out
 
 
@@ -67,18 +67,18 @@ def _power_of_two(x: Array, rate: float, out: Array) -> None:
     exponent = np.empty(len(out), np.int32)
     power = exponent.view(np.float32)
     for j in range(len(out)):
-        at = max(x[j] * rate, np.float32(-120))
-        whole = np.floor(at)
-        exponent[j] = (np.int32(whole) + np.int32(127)) << np.int32(23)
-        at -= whole
-        high = np.float32(0.05582631) + at * (np.float32(0.00898934) + at * np.float32(0.00187757))
-        out[j] = np.float32(1) + at * (np.float32(0.69315308) + at * (np.float32(0.24015361) + at * high))
+        y = max(x[j] * rate, np.float32(-120))
+        floor = np.floor(y)
+        exponent[j] = (np.int32(floor) + np.int32(127)) << np.int32(23)
+        y -= floor
+        high = np.float32(0.05582631) + y * (np.float32(0.00898934) + y * np.float32(0.00187757))
+        out[j] = np.float32(1) + y * (np.float32(0.69315308) + y * (np.float32(0.24015361) + y * high))
     for j in range(len(out)):
         out[j] *= power[j]
 
 
 @compiled("void(f4[::1], i2[::1])")
-def _write(values: Array, out: Bits) -> None:
+def _write_rounded(values: Array, out: Bits) -> None:
     """Copy the values as float32, or rounded to the nearest bfloat16 (ties to even) if `out` has no more room."""
     if len(out) > len(values):
         out.view(np.float32)[:] = values
@@ -89,7 +89,7 @@ def _write(values: Array, out: Bits) -> None:
 
 
 @compiled("void(f4[:, ::1], f4[:, ::1], i8, f4[:, ::1], f4[::1])")
-def _seen_from(xyz: Array, axis: Array, i: int, directions: Array, distance: Array) -> None:
+def _directions_from(xyz: Array, axis: Array, i: int, directions: Array, distance: Array) -> None:
     """The functions of direction, and the distance, of all points (3, N) from point i."""
     c, s, one = axis[i, 0], axis[i, 1], np.float32(1)
     for j in range(len(distance)):
@@ -102,14 +102,14 @@ def _seen_from(xyz: Array, axis: Array, i: int, directions: Array, distance: Arr
 
 
 @compiled("void(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i2[:, :, ::1])")
-def _relative(xyz: Array, axis: Array, weight: Array, rates: Array, out: Bits) -> None:
+def _relative_bias_of_set(xyz: Array, axis: Array, weight: Array, rates: Array, out: Bits) -> None:
     """`relative_bias` of one set (3, N). Every inner loop runs over the points, many at a time. The functions are
     written out, because a loop over them would write each sum ten times."""
     n = len(axis)
     f = np.empty((DIRECTIONS + DISTANCES, n), np.float32)
     distance, total = np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
-        _seen_from(xyz, axis, i, f, distance)
+        _directions_from(xyz, axis, i, f, distance)
         for r in range(DISTANCES):
             _power_of_two(distance, rates[r], f[DIRECTIONS + r])
         for m in range(len(weight)):
@@ -118,11 +118,11 @@ def _relative(xyz: Array, axis: Array, weight: Array, rates: Array, out: Bits) -
                 direction = w[0] * f[0, j] + w[1] * f[1, j] + w[2] * f[2, j] + w[3] * f[3, j] + w[4] * f[4, j]
                 near = w[5] * f[5, j] + w[6] * f[6, j] + w[7] * f[7, j] + w[8] * f[8, j] + w[9] * f[9, j]
                 total[j] = direction + near
-            _write(total, out[m, i])
+            _write_rounded(total, out[m, i])
 
 
 @compiled("void(f4[:, ::1], b1[:, ::1], f4[::1], i2[:, :, ::1])")
-def _near(distance: Array, counted: NDArray[np.bool_], rates: Array, out: Bits) -> None:
+def _near_bias_of_set(distance: Array, counted: NDArray[np.bool_], rates: Array, out: Bits) -> None:
     """`near_bias` of one set."""
     size = distance.shape[1]
     value, one = np.empty(size, np.float32), np.ones(size, np.float32)
@@ -133,4 +133,4 @@ def _near(distance: Array, counted: NDArray[np.bool_], rates: Array, out: Bits) 
                 value[j] = value[j] if counted[i, j] else np.float32(0)
             value -= np.dot(value, one) / np.float32(size)
             value /= max(np.sqrt(np.dot(value, value) / np.float32(size)), np.float32(1e-4))
-            _write(value, out[r, i])
+            _write_rounded(value, out[r, i])

@@ -17,9 +17,9 @@ TOLERANCE = 1.0  # m, residual of a match that supports a pose
 HYPOTHESES = 12
 MEMBERS = 12  # matches that make up a hypothesis
 ROUNDS = 2  # of refitting each hypothesis to all that support it
-HEADS = 32  # matches that seed the hypotheses of `alternatives`; none that an earlier hypothesis brings together
+MAX_SEEDS = 32  # matches that seed the hypotheses of `alternatives`; none that an earlier hypothesis brings together
 APART_M, APART_DEG = 2.0, 10.0  # poses nearer than this count as one: they lead to the same solution
-_POWER = 10  # iterations
+_POWER_ITERATIONS = 10
 
 
 def consensus(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
@@ -60,42 +60,42 @@ def alternatives(source: Tensor, target: Tensor, weight: Tensor, known: Tensor, 
 def _support(source: Array, target: Array, weight: Array) -> Array:
     """(K, K), column i: agreement of each match with match i, times the weight of the matches that agree with both."""
     k = len(weight)
-    agree, support, both = np.empty((k, k), np.float32), np.empty((k, k), np.float32), np.empty(k, np.float32)
+    agree, support, common = np.empty((k, k), np.float32), np.empty((k, k), np.float32), np.empty(k, np.float32)
     for i in range(k):
         for j in range(k):
-            there = here = np.float32(0)
+            target_squared = source_squared = np.float32(0)
             for a in range(3):
-                there += (target[i, a] - target[j, a]) ** 2
-                here += (source[i, a] - source[j, a]) ** 2
-            change = (np.sqrt(here) - np.sqrt(there)) / np.float32(STRETCH)
+                target_squared += (target[i, a] - target[j, a]) ** 2
+                source_squared += (source[i, a] - source[j, a]) ** 2
+            change = (np.sqrt(source_squared) - np.sqrt(target_squared)) / np.float32(STRETCH)
             agree[i, j] = max(1 - change * change, 0)
     for i in range(k):
-        both[:] = 0
+        common[:] = 0
         for j in range(k):
             shared = agree[i, j] * weight[j]
             if shared > 0:
                 for other in range(k):
-                    both[other] += shared * agree[j, other]
+                    common[other] += shared * agree[j, other]
         for j in range(k):
-            support[j, i] = agree[i, j] * both[j] if weight[j] > 0 else 0
+            support[j, i] = agree[i, j] * common[j] if weight[j] > 0 else 0
     return support
 
 
 @compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1])")
-def _fitted(source: Array, target: Array, weight: Array) -> Array:
+def _fit_pose(source: Array, target: Array, weight: Array) -> Array:
     """`kabsch.weighted_kabsch` of one set of matches."""
-    total, here, there, C = 0.0, np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    total, source_mean, target_mean, C = 0.0, np.zeros(3), np.zeros(3), np.zeros((3, 3))
     for n in range(len(weight)):
         total += weight[n]
         for a in range(3):
-            here[a] += weight[n] * source[n, a]
-            there[a] += weight[n] * target[n, a]
-    here, there = here / max(total, 1e-12), there / max(total, 1e-12)
+            source_mean[a] += weight[n] * source[n, a]
+            target_mean[a] += weight[n] * target[n, a]
+    source_mean, target_mean = source_mean / max(total, 1e-12), target_mean / max(total, 1e-12)
     for n in range(len(weight)):
         if weight[n] > 0:
             for a in range(3):
                 for b in range(3):
-                    C[a, b] += weight[n] * (target[n, a] - there[a]) * (source[n, b] - here[b])
+                    C[a, b] += weight[n] * (target[n, a] - target_mean[a]) * (source[n, b] - source_mean[b])
     U, _, Vt = np.linalg.svd(C)
     for a in range(3):  # make both right-handed: a reflection is not a pose
         b, c = (a + 1) % 3, (a + 2) % 3
@@ -103,15 +103,15 @@ def _fitted(source: Array, target: Array, weight: Array) -> Array:
         Vt[2, a] = Vt[0, b] * Vt[1, c] - Vt[0, c] * Vt[1, b]
     T = np.eye(4)
     for a in range(3):
-        T[a, 3] = there[a]
+        T[a, 3] = target_mean[a]
         for b in range(3):
             T[a, b] = U[a, 0] * Vt[0, b] + U[a, 1] * Vt[1, b] + U[a, 2] * Vt[2, b]
-            T[a, 3] -= T[a, b] * here[b]
+            T[a, 3] -= T[a, b] * source_mean[b]
     return T
 
 
 @compiled("void(f8[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
-def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Array) -> None:
+def _support_weights(T: Array, source: Array, target: Array, weight: Array, out: Array) -> None:
     """Weights (K,) of the matches that a pose (4, 4) brings together."""
     for n in range(len(weight)):
         squared = 0.0
@@ -122,14 +122,14 @@ def _supporting(T: Array, source: Array, target: Array, weight: Array, out: Arra
 
 
 @compiled("f8[:, ::1](f4[:, ::1], f4[:, ::1], f4[::1], f4[::1])")
-def _refitted(source: Array, target: Array, weight: Array, score: Array) -> Array:
+def _refit_pose(source: Array, target: Array, weight: Array, score: Array) -> Array:
     """The pose (4, 4) fitted to matches with weights `score` (K,), then refitted to all matches that support it;
     `score` is overwritten with the weights of these."""
-    T = _fitted(source, target, score)
+    T = _fit_pose(source, target, score)
     for _ in range(ROUNDS):
-        _supporting(T, source, target, weight, score)
-        T = _fitted(source, target, score)
-    _supporting(T, source, target, weight, score)
+        _support_weights(T, source, target, weight, score)
+        T = _fit_pose(source, target, score)
+    _support_weights(T, source, target, weight, score)
     return T
 
 
@@ -139,20 +139,20 @@ def _hypothesis(support: Array, source: Array, target: Array, weight: Array) -> 
     members = np.argsort(-support)[:MEMBERS]
     score = np.zeros_like(support)
     score[members] = support[members]
-    return _refitted(source, target, weight, score), score
+    return _refit_pose(source, target, weight, score), score
 
 
 def _consensus(source: Array, target: Array, weight: Array) -> Array:
     support = _support(source, target, weight)
-    leading = weight
-    for _ in range(_POWER):
-        leading = leading @ support
-        leading = leading / max(float(np.linalg.norm(leading)), 1e-12)
-    poses = [_hypothesis(support[:, head], source, target, weight) for head in np.argsort(-leading)[:HYPOTHESES]]
+    eigenvector = weight
+    for _ in range(_POWER_ITERATIONS):
+        eigenvector = eigenvector @ support
+        eigenvector = eigenvector / max(float(np.linalg.norm(eigenvector)), 1e-12)
+    poses = [_hypothesis(support[:, seed], source, target, weight) for seed in np.argsort(-eigenvector)[:HYPOTHESES]]
     return max(poses, key=lambda hypothesis: float(hypothesis[1].sum()))[0]
 
 
-def _same(one: Array, other: Array) -> bool:
+def _is_same_pose(one: Array, other: Array) -> bool:
     """Whether two poses (4, 4) lead to the same solution."""
     shift = one[:3, 3] - other[:3, 3]
     return bool(
@@ -164,14 +164,14 @@ def _alternatives(source: Array, target: Array, weight: Array, known: Array, mos
     support = _support(source, target, weight)
     explained = weight <= 0
     tried: list[tuple[int, Array]] = []  # number of matches that a pose brings together, and the pose
-    for head in np.argsort(-support.sum(0)):
-        if not explained[head] and len(tried) < HEADS:
-            T, score = _hypothesis(support[:, head], source, target, weight)
+    for seed in np.argsort(-support.sum(0)):
+        if not explained[seed] and len(tried) < MAX_SEEDS:
+            T, score = _hypothesis(support[:, seed], source, target, weight)
             tried.append((int((score > 0).sum()), T))
             explained |= score > 0
-            explained[head] = True
+            explained[seed] = True
     chosen = [known]
     for _, T in sorted(tried, key=lambda hypothesis: -hypothesis[0]):
-        if len(chosen) <= most and not any(_same(T, other) for other in chosen):
+        if len(chosen) <= most and not any(_is_same_pose(T, other) for other in chosen):
             chosen.append(T)
     return np.stack(chosen[1:] + [known] * (most + 1 - len(chosen)))

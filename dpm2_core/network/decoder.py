@@ -40,13 +40,13 @@ class DecoderLayer(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(3))
 
-    def alone(self, x: Tensor, code: Tensor | None, bias: Tensor | None, mask: Tensor) -> Tensor:
+    def self_attend(self, x: Tensor, code: Tensor | None, bias: Tensor | None, mask: Tensor) -> Tensor:
         """Self-attention of a set x (B, N, C)."""
         x = x if code is None else x + code
         x = self.norms[0](x + self.self_attention(x, x, bias, mask))
         return x if code is None else x + code
 
-    def across(self, x: Tensor, other: Tensor, other_mask: Tensor) -> Tensor:
+    def cross_attend(self, x: Tensor, other: Tensor, other_mask: Tensor) -> Tensor:
         """Cross-attention of x (B, N, C) to other (B, M, C), then the MLP."""
         x = self.norms[1](x + self.cross_attention(x, other, None, other_mask))
         return self.norms[2](x + self.mlp(x))
@@ -86,7 +86,7 @@ class Decoder(nn.Module):
         mask = tokens.mask[:, None, None]
         first = self.layers[0]
         assert isinstance(first, DecoderLayer)
-        return Prepared(first.alone(self.project(tokens.features), code, biases[0], mask), code, biases, mask)
+        return Prepared(first.self_attend(self.project(tokens.features), code, biases[0], mask), code, biases, mask)
 
     def correlate(self, source: Prepared, target: Prepared) -> Correlated:
         """Correlate two batches of sets that are prepared."""
@@ -94,7 +94,7 @@ class Decoder(nn.Module):
         for i, layer in enumerate(self.layers):
             assert isinstance(layer, DecoderLayer)
             if i > 0:
-                x = layer.alone(x, source.code, source.biases[i], source.mask)
-                y = layer.alone(y, target.code, target.biases[i], target.mask)
-            x, y = layer.across(x, y, target.mask), layer.across(y, x, source.mask)
+                x = layer.self_attend(x, source.code, source.biases[i], source.mask)
+                y = layer.self_attend(y, target.code, target.biases[i], target.mask)
+            x, y = layer.cross_attend(x, y, target.mask), layer.cross_attend(y, x, source.mask)
         return Correlated(x, y)

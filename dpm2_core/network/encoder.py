@@ -97,17 +97,17 @@ class Encoder(nn.Module):
             return self._encode(cloud, images)
         R = levelling(up)
         views = [in_encoded_axes(image, R, scale) for image in images]
-        made = self._encode(np.ascontiguousarray(cloud @ R.T), views)
-        return replace(made, xyz=made.xyz @ R / np.float32(scale), up=up, scale=scale)
+        descriptors = self._encode(np.ascontiguousarray(cloud @ R.T), views)
+        return replace(descriptors, xyz=descriptors.xyz @ R / np.float32(scale), up=up, scale=scale)
 
     def _encode(self, cloud: NDArray[np.float32], images: Sequence[Image]) -> Descriptors:
         """Descriptors of a cropped (M, 3) cloud, in its own axes."""
         points = collate([build_pyramid(cloud, self.settings, images)])
         views = collate_views([images], self.settings.image)
-        made = self.encode_batch(points, views)[0]
-        if not np.isfinite(made.step).all():
+        descriptors = self.encode_batch(points, views)[0]
+        if not np.isfinite(descriptors.step).all():
             raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")
-        return made
+        return descriptors
 
     @torch.inference_mode()
     def encode_batch(self, points: PointBatch, views: Views | None) -> list[Descriptors]:

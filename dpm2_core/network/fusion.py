@@ -41,11 +41,11 @@ class ReferencePoints(nn.Module):
             if fusion.reference_features and sampled and stage.points >= fusion.points
         ]
         if not sampled:
-            noise = torch.Generator().manual_seed(0)  # the same positions in every frame: descriptors must repeat
+            generator = torch.Generator().manual_seed(0)  # the same positions in every frame: descriptors must repeat
             if fusion.reference == "uniform":
-                xyz = torch.rand(self.n, 3, generator=noise) * 2 - 1
+                xyz = torch.rand(self.n, 3, generator=generator) * 2 - 1
             else:
-                xyz = torch.randn(self.n, 3, generator=noise) / 3
+                xyz = torch.randn(self.n, 3, generator=generator) / 3
             self.register_buffer("fixed", xyz * torch.tensor([points.far, points.far, 3.0]))
         channels = 3 + sum(scale_channels[i] for i in self.levels)
         width = settings.channels
@@ -89,8 +89,8 @@ class FusionLayer(nn.Module):
         sampled = fusion.kind == "roi_pooling"
         self.self_attention = Attention(width, fusion.heads)
         self.lidar = Attention(width, fusion.heads, learnable)
-        attends = camera and not sampled and fusion.kind != "point_painting"
-        self.image = Attention(width, fusion.heads, learnable) if attends else None
+        has_image_attention = camera and not sampled and fusion.kind != "point_painting"
+        self.image = Attention(width, fusion.heads, learnable) if has_image_attention else None
         self.sampled = nn.Linear(width, width) if camera and sampled else None
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2))
         self.fuse = nn.Sequential(
@@ -107,10 +107,10 @@ class FusionLayer(nn.Module):
         return bias * self.gains[branch].to(bias.dtype) if bias is not None and len(self.gains) else bias
 
     def forward(
-        self, references: Tensor, among: tuple[Tensor | None, Tensor], lidar: Branch, image: Branch | None
+        self, references: Tensor, bias_and_mask: tuple[Tensor | None, Tensor], lidar: Branch, image: Branch | None
     ) -> Tensor:
-        """references (B, N, C); `among` is bias and mask of the self-attention."""
-        x = self.norms[0](references + self.self_attention(references, references, *among))
+        """references (B, N, C); `bias_and_mask`: of the self-attention."""
+        x = self.norms[0](references + self.self_attention(references, references, *bias_and_mask))
         parts = [x, self.lidar(x, lidar.tokens, self._bias(0, lidar.bias), lidar.mask)]
         if self.camera:
             if image is None:
@@ -118,10 +118,10 @@ class FusionLayer(nn.Module):
             elif self.sampled is not None:
                 parts.append(self.sampled(image.tokens) * image.mask[:, 0, :, :1])
             else:
-                parts.append(self._read(x, image))
+                parts.append(self._read_image(x, image))
         return self.norms[1](x + self.fuse(torch.cat(parts, -1)))
 
-    def _read(self, x: Tensor, image: Branch) -> Tensor:
+    def _read_image(self, x: Tensor, image: Branch) -> Tensor:
         """Image attention of reference points x (B, N, C); zeros for those that do not read the image."""
         assert self.image is not None
         bias = self._bias(1, image.bias)
@@ -141,12 +141,12 @@ class Fusion(nn.Module):
         self.settings = fusion
         self.references = ReferencePoints(settings, scale_channels)
         self.lidar_in = nn.ModuleList(nn.Linear(scale_channels[i], width) for i in fusion.levels)
-        reads = settings.image.backbone != "none" and fusion.kind != "point_painting"
-        if reads:
+        reads_images = settings.image.backbone != "none" and fusion.kind != "point_painting"
+        if reads_images:
             self.image_in = nn.Linear(settings.image.pyramid, width)
             self.image_norm = nn.LayerNorm(width)
         self.pixel = None
-        if reads and fusion.pixel:
+        if reads_images and fusion.pixel:
             self.pixel = nn.Linear(settings.image.pyramid, settings.channels)
             self.pixel_in = nn.Linear(settings.channels, settings.channels, bias=False)
             nn.init.zeros_(self.pixel_in.weight)  # starts as the network without it
@@ -164,8 +164,8 @@ class Fusion(nn.Module):
         (B, N, TEXTURE) of the reference points that are image corners, zeros for the others."""
         refs = self.references(scales)
         chosen = [scales[i] for i in self.settings.levels]
-        lidar = self._lidar(refs, chosen)
-        image = self._image(refs, views, maps) if views is not None else None
+        lidar = self._lidar_branch(refs, chosen)
+        image = self._image_branch(refs, views, maps) if views is not None else None
         self_mask = refs.mask[:, None, None]
         biases = [None] * len(self.layers) if self.relative is None else self.relative(refs.xyz, refs.axis)
         x = refs.features
@@ -176,13 +176,13 @@ class Fusion(nn.Module):
         x = self.out(x)
         if self.pixel is not None and views is not None:
             features, seen = image_features(refs.xyz, views, maps)
-            own = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
-            x = x + self.pixel_in(own) * seen[..., None]
+            pixel_features = nn.functional.normalize(self.pixel(features).float(), dim=-1).to(x.dtype)
+            x = x + self.pixel_in(pixel_features) * seen[..., None]
         if self.texture is not None:
             x = x + self.texture(texture.to(x.dtype))
         return refs._replace(features=x)
 
-    def _lidar(self, refs: Tokens, scales: list[Scale]) -> Branch:
+    def _lidar_branch(self, refs: Tokens, scales: list[Scale]) -> Branch:
         features = torch.cat([project(s.features) for project, s in zip(self.lidar_in, scales, strict=True)], 1)
         xyz, mask = torch.cat([s.xyz for s in scales], 1), torch.cat([s.mask for s in scales], 1)
         features = self.lidar_norm(features)
@@ -193,7 +193,7 @@ class Fusion(nn.Module):
             bias = point_bias(refs.xyz, xyz, mask, self.settings.alpha_lidar)
         return Branch(features, bias, mask[:, None, None])
 
-    def _image(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch | None:
+    def _image_branch(self, refs: Tokens, views: Views, maps: list[FeatureMap]) -> Branch | None:
         """The branch of the images; None if no reference point is in an image."""
         batch, count = views.present.shape
         kind = self.settings.kind

@@ -42,8 +42,8 @@ class OffsetHead(nn.Module):
 
         Without predicted precision L is the identity.
         """
-        both = torch.cat([a, b], -1)
-        out = self.out(torch.relu(self.deep(both) + self.skip(both))).float()
+        pair = torch.cat([a, b], -1)
+        out = self.out(torch.relu(self.deep(pair) + self.skip(pair))).float()
         offset = out[..., :3]
         if not self.precision:
             return offset, torch.eye(3, device=out.device).expand(*out.shape[:-1], 3, 3)
@@ -81,7 +81,7 @@ class ConfidenceHead(nn.Linear):
 
 
 POSE_FEATURES = 3  # of `solved.overlap_features`
-_MIDDLE, _SPREAD = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these: near and far pairs separate about there
+_FEATURE_MEAN, _FEATURE_SCALE = (0.3, 1.0, 0.5), (0.15, 0.5, 0.15)  # of these: near and far pairs separate about there
 
 
 class OverlapHead(nn.Module):
@@ -96,8 +96,8 @@ class OverlapHead(nn.Module):
     def __init__(self, width: int, pose: bool) -> None:
         super().__init__()
         self.points = None if pose else PointMLP(width)
-        given = POSE_FEATURES if pose else 2 * width
-        self.classify = nn.Sequential(nn.Linear(given, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+        inputs = POSE_FEATURES if pose else 2 * width
+        self.classify = nn.Sequential(nn.Linear(inputs, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
 
     def forward(
         self, source: Tensor, target: Tensor, source_mask: Tensor, target_mask: Tensor, overlap_features: Tensor
@@ -105,8 +105,8 @@ class OverlapHead(nn.Module):
         """Logits (B,) of source (B, N, C) and target (B, M, C) with masks (B, N) and (B, M), and
         `solved.overlap_features` (B, POSE_FEATURES); each mode reads only its own inputs."""
         if self.points is None:
-            middle, spread = (overlap_features.new_tensor(values) for values in (_MIDDLE, _SPREAD))
-            return self.classify((overlap_features - middle) / spread)[..., 0].float()
+            mean, scale = (overlap_features.new_tensor(values) for values in (_FEATURE_MEAN, _FEATURE_SCALE))
+            return self.classify((overlap_features - mean) / scale)[..., 0].float()
         pooled = []
         for features, mask in ((source, source_mask), (target, target_mask)):
             weight = mask[..., None].to(features.dtype)

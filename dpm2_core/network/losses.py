@@ -65,12 +65,12 @@ def info_nce(scores: Tensor, labels: Labels, neutral_is_negative: bool) -> Tenso
     for axis, positive in ((2, labels.forward), (1, labels.backward)):
         used = positive >= 0
         index = positive.clamp(min=0).unsqueeze(axis)
-        right = scores.gather(axis, index).squeeze(axis)
+        positive_scores = scores.gather(axis, index).squeeze(axis)
         kept = scores
         if not neutral_is_negative:
             neutral = labels.near.scatter(axis, index, False)
             kept = scores.masked_fill(neutral, -1e4)
-        losses.append(((kept.logsumexp(axis) - right) * used).sum() / used.sum().clamp(min=1))
+        losses.append(((kept.logsumexp(axis) - positive_scores) * used).sum() / used.sum().clamp(min=1))
     return (losses[0] + losses[1]) / 2
 
 

@@ -79,13 +79,13 @@ def correspond(
     a, b = take(correlated.source, i), take(correlated.target, j)
     axis = torch.cat([take(source.axis, i), take(target.axis, j)])
     offset, L = decoder.offset(torch.cat([a, b]), torch.cat([b, a]))  # both directions at once
-    (there, back), (L_there, L_back) = (part.chunk(2) for part in into_set_frame(offset, L, axis))
+    (forward, backward), (L_forward, L_backward) = (part.chunk(2) for part in into_set_frame(offset, L, axis))
     weights = weight * (offset.norm(dim=-1) <= settings.offset_limit).unflatten(0, (2, -1))
     return Correspondences(
-        torch.cat([x + there, x], 1),
-        torch.cat([y, y + back], 1),
+        torch.cat([x + forward, x], 1),
+        torch.cat([y, y + backward], 1),
         weights.transpose(0, 1).flatten(1),
-        torch.cat([L_there, L_back], 1),
+        torch.cat([L_forward, L_backward], 1),
     )
 
 

@@ -23,7 +23,7 @@ from dpm2_core.network.registrations import register_batch
 from dpm2_core.network.settings import NetworkSettings
 from dpm2_core.network.tokens import Tokens, to_tokens
 
-_KEPT = 4  # prepared sets that are cached: a scan, the map before a pause and the one after it
+_MAX_PREPARED = 4  # prepared sets that are cached: a scan, the map before a pause and the one after it
 
 
 class DeepPointMap2(nn.Module):
@@ -58,7 +58,7 @@ class DeepPointMap2(nn.Module):
         with mixed_precision(self._device):
             (y, prepared_target), (x, prepared_source) = self._prepare(target), self._prepare(source)
             correlated = self.decoder.correlate(prepared_source, prepared_target)
-            return _of_sets(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
+            return _in_set_frames(register_batch(self.decoder, x, y, correlated, self.solver)[0], source, target)
 
     def _prepare(self, descriptors: Descriptors) -> tuple[Tokens, Prepared]:
         """A set prepared for the decoder, computed or from the cache."""
@@ -67,7 +67,9 @@ class DeepPointMap2(nn.Module):
             tokens = self._tokens([descriptors])
             entry = descriptors, tokens, self.decoder.prepare(tokens)
         others = tuple(kept for kept in self._prepared if kept[0] is not descriptors)
-        self._prepared = (entry, *others)[:_KEPT]  # a new tuple: the SLAM's threads have shallow copies of the network
+        self._prepared = (entry, *others)[
+            :_MAX_PREPARED
+        ]  # a new tuple: the SLAM's threads have shallow copies of the network
         return entry[1:]
 
     @torch.inference_mode()
@@ -77,7 +79,7 @@ class DeepPointMap2(nn.Module):
         with mixed_precision(self._device):
             correlated = self.decoder(source, target)
             found = register_batch(self.decoder, source, target, correlated, self.solver)
-        return [_of_sets(*row) for row in zip(found, sources, targets, strict=True)]
+        return [_in_set_frames(*row) for row in zip(found, sources, targets, strict=True)]
 
     @torch.inference_mode()
     def agreement(self, source: Descriptors, targets: Sequence[Descriptors]) -> list[float]:
@@ -102,10 +104,10 @@ class DeepPointMap2(nn.Module):
             correlated = self.decoder(x, y)
             pairs = correspond(self.decoder, x, y, correlated, match_scores(self.decoder, correlated))
         half = pairs.weight.shape[1] // 2  # then the same pairs again, in the other direction
-        at_source = pairs.source[0, half:].double().cpu().numpy() / source.scale
-        at_target = pairs.target[0, :half].double().cpu().numpy() / target.scale
+        source_points = pairs.source[0, half:].double().cpu().numpy() / source.scale
+        target_points = pairs.target[0, :half].double().cpu().numpy() / target.scale
         weight = pairs.weight[0, :half].double().cpu().numpy()
-        return at_source @ source.R_level_set, at_target @ target.R_level_set, weight
+        return source_points @ source.R_level_set, target_points @ target.R_level_set, weight
 
     @property
     def _device(self) -> torch.device:
@@ -116,21 +118,21 @@ class DeepPointMap2(nn.Module):
         return to_tokens([s.as_encoded() for s in sets], self.decoder.view_aligned, self._device)
 
 
-def _of_sets(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
+def _in_set_frames(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
     """Convert a registration of encoded sets, in leveled axes and enlarged, to the sets' own axes and scale."""
     if source.scale != target.scale:
         return replace(encoded, ok=False, confidence=0.0, overlap=0.0, reason="one is a room, the other is not")
     if source.scale != 1:
-        encoded = _reduced(encoded, source.scale)
+        encoded = _rescaled(encoded, source.scale)
     if source.up is None and target.up is None:
         return encoded
-    at_source, at_target = (se3.make(d.R_level_set, np.zeros(3)) for d in (source, target))
-    T = se3.orthonormalized(se3.inverse(at_target) @ encoded.T_target_source @ at_source)
-    A = se3.adjoint(se3.inverse(at_source))
+    T_level_source, T_level_target = (se3.make(d.R_level_set, np.zeros(3)) for d in (source, target))
+    T = se3.orthonormalized(se3.inverse(T_level_target) @ encoded.T_target_source @ T_level_source)
+    A = se3.adjoint(se3.inverse(T_level_source))
     return replace(encoded, T_target_source=T, covariance=A @ encoded.covariance @ A.T)
 
 
-def _reduced(result: Registration, scale: float) -> Registration:
+def _rescaled(result: Registration, scale: float) -> Registration:
     """The registration in true scale, from one of a scene that was enlarged by `scale`."""
     T, S = result.T_target_source.copy(), np.repeat([1.0, 1 / scale], 3)
     T[:3, 3] /= scale

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dpm2_core.network.pooling import as_machine_code, largest_sums, places_in_view
+from dpm2_core.network.pooling import largest_sums, positions_in_view, use_compiled
 from dpm2_core.network.pyramid import PointBatch
 from dpm2_core.network.settings import PointsSettings, StageSettings
 
@@ -85,9 +85,9 @@ class Pooled(nn.Module):
         if not self.pool_first:
             joined = torch.cat([gather(features, index), relative.to(features.dtype)], -1)
             return torch.relu(self.norm(self.linear(joined))).amax(2)
-        of_features, of_places = self.linear.weight.split(self.split, 1)
-        own = nn.functional.linear(features, of_features, self.linear.bias)
-        return torch.relu(self.norm(pool_neighbors(own, index, relative, of_places)))
+        W_features, W_positions = self.linear.weight.split(self.split, 1)
+        projected = nn.functional.linear(features, W_features, self.linear.bias)
+        return torch.relu(self.norm(pool_neighbors(projected, index, relative, W_positions)))
 
 
 def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
@@ -95,15 +95,15 @@ def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, w
 
     own (B, m, C) and index (B, n, k), or None for `relative` alone; relative (B, n, k, P), weight (C, P): (B, n, C).
     """
-    if as_machine_code(relative):
+    if use_compiled(relative):
         return largest_sums(own, index, relative, weight)
     with torch.no_grad():
         sums = nn.functional.linear(relative, weight)
         if own is not None and index is not None:
             sums = gather(own, index).add_(sums)
         best = argmax_neighbor(sums)
-    n_places = relative.shape[-1]
-    chosen = relative.gather(2, best[..., None].expand(*best.shape, n_places))
+    n_positions = relative.shape[-1]
+    chosen = relative.gather(2, best[..., None].expand(*best.shape, n_positions))
     out = (chosen * weight).sum(-1)
     if own is not None and index is not None:
         out = out + own.gather(1, index.gather(2, best))
@@ -131,15 +131,15 @@ class Aggregation(nn.Module):
 
     def forward(self, xyz: Tensor, centers: Tensor, features: Tensor, index: Tensor) -> Tensor:
         """xyz (B, m, 3) that begins with centers (B, n, 3), features (B, m, C), index (B, n, k) into m: (B, n, out)."""
-        if self.view_aligned and as_machine_code(xyz):
-            return self.pooled(features, index, places_in_view(xyz, view_axes(xyz), index, self.radius))
+        if self.view_aligned and use_compiled(xyz):
+            return self.pooled(features, index, positions_in_view(xyz, view_axes(xyz), index, self.radius))
         delta = (gather(xyz, index) - centers[:, :, None]) / self.radius
         if not self.view_aligned:
             return self.pooled(features, index, delta)
         axis = view_axes(centers)[:, :, None]
-        turn = gather(view_axes(xyz), index)  # the neighbor's own axis; next, in the center's frame
-        turned = to_view(torch.cat([turn, turn[..., :1]], -1), axis)[..., :2]
-        return self.pooled(features, index, torch.cat([to_view(delta, axis), turned], -1))
+        neighbor_axis = gather(view_axes(xyz), index)  # the neighbor's own axis; next, in the center's frame
+        relative_axis = to_view(torch.cat([neighbor_axis, neighbor_axis[..., :1]], -1), axis)[..., :2]
+        return self.pooled(features, index, torch.cat([to_view(delta, axis), relative_axis], -1))
 
 
 class PatchAbstraction(nn.Module):
@@ -168,17 +168,17 @@ class PatchAbstraction(nn.Module):
             axis = view_axes(centers)
             centers, patches = to_view(centers, axis), to_view(patches, axis[:, :, None])
         local = patches / self.radius
-        of_stem, of_place = self.linear.weight.split((self.stem.out_features, 3), 1)
-        of_delta = of_place + of_stem @ self.stem.weight * (self.radius / self.far)
+        W_stem, W_position = self.linear.weight.split((self.stem.out_features, 3), 1)
+        W_delta = W_position + W_stem @ self.stem.weight * (self.radius / self.far)
         at_center = self.linear(nn.functional.pad(self.stem(centers / self.far), (0, 3)))
-        given, weight = local, of_delta
+        inputs, weight = local, W_delta
         if self.paint is not None:
             painted = local.new_zeros(*local.shape[:-1], COLORS) if colors is None else colors.to(local)
-            given, weight = torch.cat([local, painted], -1), torch.cat([of_delta, self.paint.weight], 1)
+            inputs, weight = torch.cat([local, painted], -1), torch.cat([W_delta, self.paint.weight], 1)
         if self.pool_first:
-            out = torch.relu(self.norm(pool_neighbors(None, None, given, weight) + at_center))
+            out = torch.relu(self.norm(pool_neighbors(None, None, inputs, weight) + at_center))
         else:
-            out = nn.functional.linear(given, weight) + at_center[:, :, None]
+            out = nn.functional.linear(inputs, weight) + at_center[:, :, None]
             out = torch.relu(self.norm(out)).amax(2)
         if self.moments is None:
             return out
@@ -222,8 +222,8 @@ class FeaturePropagation(nn.Module):
         delta = gather(coarse.xyz, index) - fine.xyz[:, :, None]
         weight = 1 / ((delta * delta).sum(-1) + 1e-6)
         weight = (weight / weight.sum(-1, keepdim=True)).to(coarse.features.dtype)
-        carried = (gather(coarse.features, index) * weight[..., None]).sum(2)
-        return Scale(fine.xyz, self.layers(torch.cat([carried, fine.features], -1)), fine.mask)
+        interpolated = (gather(coarse.features, index) * weight[..., None]).sum(2)
+        return Scale(fine.xyz, self.layers(torch.cat([interpolated, fine.features], -1)), fine.mask)
 
 
 class PointNeXt(nn.Module):
@@ -255,8 +255,8 @@ class PointNeXt(nn.Module):
             if level == 0:
                 features = self.patch(xyz, batch.patches, colors)
             else:
-                before = scales[-1]
-                features = self.abstractions[level - 1](before.xyz, xyz, before.features, batch.groups[level - 1])
+                finer = scales[-1]
+                features = self.abstractions[level - 1](finer.xyz, xyz, finer.features, batch.groups[level - 1])
             for block, index in zip(self.residuals[level], batch.locals[level], strict=True):  # type: ignore[call-overload]
                 features = block(xyz, features, index)
             mask = torch.arange(size, device=xyz.device) < batch.valid[:, None]

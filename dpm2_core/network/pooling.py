@@ -13,7 +13,7 @@ from dpm2_core.geometry.compiled import compiled
 Array = NDArray[np.float32]
 
 
-def as_machine_code(values: Tensor) -> bool:
+def use_compiled(values: Tensor) -> bool:
     """Whether this is inference on the CPU."""
     return torch.is_inference_mode_enabled() and values.device.type == "cpu"
 
@@ -23,16 +23,16 @@ def largest_sums(own: Tensor | None, index: Tensor | None, relative: Tensor, wei
     batch, n, k, _ = relative.shape
     out = torch.empty(batch, n, len(weight))
     weights = weight.float().t().contiguous().numpy()
-    nothing = np.zeros((1, len(weight)), np.float32), np.zeros((n, k), np.int64)
+    no_features = np.zeros((1, len(weight)), np.float32), np.zeros((n, k), np.int64)
     for b in range(batch):
-        values, neighbors = nothing
+        values, neighbors = no_features
         if own is not None and index is not None:
             values, neighbors = own[b].float().contiguous().numpy(), index[b].numpy()
         _largest_sums(values, neighbors, relative[b].float().contiguous().numpy(), weights, out[b].numpy())
     return out if own is None else out.to(own.dtype)
 
 
-def places_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -> Tensor:
+def positions_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -> Tensor:
     """Positions of neighbors, in units of the radius, and their view axes, both in the view frames of the centers.
 
     xyz (B, m, 3) of which the first n are the centers, axes (B, m, 2), index (B, n, k) into m: (B, n, k, 5), see
@@ -40,7 +40,7 @@ def places_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -> T
     """
     out = torch.empty(*index.shape, 5)
     for b in range(len(xyz)):
-        _places(xyz[b].contiguous().numpy(), axes[b].numpy(), index[b].numpy(), radius, out[b].numpy())
+        _positions_in_view(xyz[b].contiguous().numpy(), axes[b].numpy(), index[b].numpy(), radius, out[b].numpy())
     return out
 
 
@@ -63,7 +63,7 @@ def _largest_sums(own: Array, index: NDArray[np.int64], relative: Array, weight:
 
 
 @compiled("void(f4[:, ::1], f4[:, ::1], i8[:, ::1], f4, f4[:, :, ::1])")
-def _places(xyz: Array, axes: Array, index: NDArray[np.int64], radius: float, out: Array) -> None:
+def _positions_in_view(xyz: Array, axes: Array, index: NDArray[np.int64], radius: float, out: Array) -> None:
     for i in range(len(index)):
         c, s = axes[i, 0], axes[i, 1]
         for k in range(index.shape[1]):

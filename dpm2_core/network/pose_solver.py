@@ -34,12 +34,12 @@ from dpm2_core.network.solved import Solved, confidence_of
 from dpm2_core.network.tokens import Tokens
 
 MIN_INLIERS = 30
-BEST = 30  # pairs whose mean probability measures how well the matches support a pose
+BEST_PAIRS = 30  # pairs whose mean probability measures how well the matches support a pose
 CHI2 = 11.3  # 99 % quantile with 3 degrees of freedom: inliers of the precision-weighted solve
-FEW = 0.5  # share of the pairs: if fewer of them fit, other poses are tried, too
-TRIED = 8  # other poses, at most
-CLEARLY = 1.0  # logit by which the most probable of them must exceed that of the first pose to replace it
-MOST_CONFIDENT, SURE = 64, 0.5  # the solver `confident` starts from this number of pairs, and all of this probability
+MIN_SHARE = 0.5  # share of the pairs: if fewer of them fit, other poses are tried, too
+MAX_ALTERNATIVES = 8  # other poses
+MIN_LOGIT_GAIN = 1.0  # logit by which the most probable of them must exceed that of the first pose to replace it
+STARTING_PAIRS, STARTING_PROBABILITY = 64, 0.5  # the solver `confident` starts from these
 
 Solver = Literal["consensus", "confident"]
 """Method that computes a pose from pairs: a consensus, with which they are matched again; or, as in the paper, a robust
@@ -60,8 +60,8 @@ def agreement(source: Tokens, target: Tokens, temperature: float, ratio: float) 
     weight, i, j = best_pairs(softmax_both(scores, source.mask, target.mask), source.mask, target.mask, ratio)
     if weight.shape[1] == 0:
         return weight.new_zeros(len(weight))
-    at_source, at_target = take(source.xyz, i), take(target.xyz, j)
-    error = (transform(consensus(at_source, at_target, weight), at_source) - at_target).norm(dim=-1)
+    source_points, target_points = take(source.xyz, i), take(target.xyz, j)
+    error = (transform(consensus(source_points, target_points, weight), source_points) - target_points).norm(dim=-1)
     return ((error <= TOLERANCE) & (weight > 0)).float().mean(1)
 
 
@@ -75,9 +75,10 @@ def supporting(pairs: Correspondences, T: Tensor) -> Tensor:
 
 
 def most_confident(pairs: Correspondences) -> Tensor:
-    """The pairs (B, 2K) that the paper's solver starts from: the `MOST_CONFIDENT`, and all of probability `SURE`."""
-    least = pairs.weight.topk(min(MOST_CONFIDENT, pairs.weight.shape[1]))[0][:, -1:]
-    return (pairs.weight >= least.clamp(max=SURE)) & (pairs.weight > 0)
+    """The pairs (B, 2K) that the paper's solver starts from: the `STARTING_PAIRS` most confident ones, and all
+    of probability `STARTING_PROBABILITY`."""
+    threshold = pairs.weight.topk(min(STARTING_PAIRS, pairs.weight.shape[1]))[0][:, -1:]
+    return (pairs.weight >= threshold.clamp(max=STARTING_PROBABILITY)) & (pairs.weight > 0)
 
 
 def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> tuple[Tensor, Tensor]:
@@ -95,8 +96,8 @@ def robust_kabsch(pairs: Correspondences, inliers: Tensor, rounds: int = 3) -> t
         error = (transform(T, pairs.source) - pairs.target).norm(dim=-1)
         count = inliers.sum(1, keepdim=True).clamp(min=1)
         mean = (error * inliers).sum(1, keepdim=True) / count
-        spread = (((error - mean) ** 2 * inliers).sum(1, keepdim=True) / count).sqrt()
-        chosen = (error <= mean + 3 * spread) & usable
+        deviation = (((error - mean) ** 2 * inliers).sum(1, keepdim=True) / count).sqrt()
+        chosen = (error <= mean + 3 * deviation) & usable
         enough = chosen.sum(1, keepdim=True) >= MIN_INLIERS
         inliers = torch.where(enough, chosen, inliers)
         T = weighted_kabsch(pairs.source, pairs.target, pairs.weight * inliers)
@@ -125,12 +126,12 @@ def solve_batch(
     matched = Matched(source, target, correlated, scores, unguided)
     if solver == "confident":
         T, information, inliers = _solve_svd(unguided, most_confident(unguided))
-        return _judged(decoder, matched, unguided, (T, information, inliers))
-    solved = _solved_from(decoder, matched, first_pose(unguided))
-    return _reconsidered(decoder, matched, solved) if decoder.settings.precision else solved
+        return _assess(decoder, matched, unguided, (T, information, inliers))
+    solved = _solve_from(decoder, matched, first_pose(unguided))
+    return _try_alternatives(decoder, matched, solved) if decoder.settings.precision else solved
 
 
-def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
+def _solve_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
     """Solve from rough poses (B, 4, 4); then match again, only what is near under the current pose, and solve again."""
     source, target, correlated, scores, pairs = matched
     solve = _solve_precise if decoder.settings.precision else _solve_svd_near
@@ -138,10 +139,10 @@ def _solved_from(decoder: Decoder, matched: Matched, T: Tensor) -> Solved:
     for _ in range(decoder.settings.guided):
         pairs = correspond(decoder, source, target, correlated, guided_scores(scores, T, source, target))
         T, information, inliers = solve(pairs, T)
-    return _judged(decoder, matched, pairs, (T, information, inliers))
+    return _assess(decoder, matched, pairs, (T, information, inliers))
 
 
-def _judged(
+def _assess(
     decoder: Decoder, matched: Matched, pairs: Correspondences, solution: tuple[Tensor, Tensor, Tensor]
 ) -> Solved:
     """Poses (B, 4, 4), information (B, 6, 6) and inliers (B, 2K) of pairs, with figures of their quality."""
@@ -150,24 +151,24 @@ def _judged(
     count = inliers.sum(1)
     wanted = pairs_wanted(matched.source.mask, matched.target.mask, decoder.settings.pair_ratio)
     share = count / (2 * wanted).clamp(min=1)
-    return Solved(T, covariance, _residual(pairs, T, inliers), count, _borne_out(matched.unguided, T), share)
+    return Solved(T, covariance, _residual(pairs, T, inliers), count, _support(matched.unguided, T), share)
 
 
-def _reconsidered(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
+def _try_alternatives(decoder: Decoder, matched: Matched, solved: Solved) -> Solved:
     """The solution, replaced where few pairs fit, as on both sides of a corner, and another pose is clearly more
     probable."""
-    rows = (solved.share < FEW).nonzero()[:, 0]
+    rows = (solved.share < MIN_SHARE).nonzero()[:, 0]
     if len(rows) == 0:
         return solved
     matched = _rows(matched, rows)
     half = matched.unguided.source.shape[1] // 2
     source, target, weight = (field[:, :half] for field in matched.unguided[:3])
-    starts = alternatives(source, target, weight, solved.T[rows], TRIED)
-    own = torch.arange(len(rows), device=rows.device)
-    others = _solved_from(decoder, _rows(matched, own.repeat_interleave(TRIED)), starts.flatten(0, 1))
-    most, best = confidence_of(decoder, others).view(-1, TRIED).max(1)
-    clear = most > confidence_of(decoder, solved)[rows] + CLEARLY
-    return _with_rows(solved, rows[clear], _rows(others, (own * TRIED + best)[clear]))
+    starts = alternatives(source, target, weight, solved.T[rows], MAX_ALTERNATIVES)
+    member = torch.arange(len(rows), device=rows.device)
+    others = _solve_from(decoder, _rows(matched, member.repeat_interleave(MAX_ALTERNATIVES)), starts.flatten(0, 1))
+    best_logit, best = confidence_of(decoder, others).view(-1, MAX_ALTERNATIVES).max(1)
+    is_better = best_logit > confidence_of(decoder, solved)[rows] + MIN_LOGIT_GAIN
+    return _with_rows(solved, rows[is_better], _rows(others, (member * MAX_ALTERNATIVES + best)[is_better]))
 
 
 def _rows(batch: Any, index: Tensor) -> Any:
@@ -222,8 +223,8 @@ def _residual(pairs: Correspondences, T: Tensor, inliers: Tensor) -> Tensor:
     return ((error**2 * inliers).sum(1) / inliers.sum(1).clamp(min=1)).sqrt()
 
 
-def _borne_out(unguided: Correspondences, T: Tensor) -> Tensor:
+def _support(unguided: Correspondences, T: Tensor) -> Tensor:
     """Mean probability (B,) of the best pairs, matched without the poses, that the poses bring together."""
     error = (transform(T, unguided.source.double()) - unguided.target).norm(dim=-1)
     weight = unguided.weight * (error <= TOLERANCE)
-    return weight.topk(min(BEST, weight.shape[1]))[0].mean(1)
+    return weight.topk(min(BEST_PAIRS, weight.shape[1]))[0].mean(1)

@@ -80,14 +80,14 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: 
     stages = settings.stages
     first = stages[0]
     grid = _grid(cloud, first.radius / 1.5)  # most neighborhoods are full before the radius
-    xyz, texture = _sampled(cloud, grid, network, images)
+    xyz, texture = _sample_points(cloud, grid, network, images)
     count = len(xyz)
     index = neighbours(grid, xyz, first.neighbours, first.radius)
     patches = np.zeros((first.points, first.neighbours, 3), np.float16)
     patches[:count] = cloud[index] - xyz[:, None]
 
-    finer = [*(stage.radius for stage in stages[1:]), stages[-1].radius]
-    grids = [_grid(xyz[: stage.points], radius) for stage, radius in zip(stages, finer, strict=True)]
+    grid_radii = [*(stage.radius for stage in stages[1:]), stages[-1].radius]
+    grids = [_grid(xyz[: stage.points], radius) for stage, radius in zip(stages, grid_radii, strict=True)]
     groups = tuple(
         _padded(neighbours(grids[i], xyz[: stage.points], stage.neighbours, stage.radius), stage.points)
         for i, stage in enumerate(stages[1:])
@@ -103,12 +103,12 @@ def build_pyramid(cloud: NDArray[np.float32], network: NetworkSettings, images: 
         _padded(neighbours(grids[i + 1], xyz[: stages[i].points], 3, np.inf), stages[i].points)
         for i in range(len(stages) - 2, len(stages) - 2 - settings.upsample, -1)
     )
-    full = np.zeros((first.points, 3), np.float32)
-    full[:count] = xyz
-    return Pyramid(full, count, patches, groups, locals_, ups, texture.astype(np.float16))
+    padded_xyz = np.zeros((first.points, 3), np.float32)
+    padded_xyz[:count] = xyz
+    return Pyramid(padded_xyz, count, patches, groups, locals_, ups, texture.astype(np.float16))
 
 
-def _sampled(
+def _sample_points(
     cloud: NDArray[np.float32], grid: PointGrid, network: NetworkSettings, images: Sequence[Image]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The points (N, 3) of the first level, the reference points first, and the texture of these."""
@@ -117,7 +117,7 @@ def _sampled(
     texture = np.zeros((max(len(xyz), fusion.points), TEXTURE), np.float32)
     if fusion.reference == "salient":
         references = min(fusion.points, len(xyz))
-        corners = _corners(cloud, images, network, int(fusion.corners * references))
+        corners = _find_corners(cloud, images, network, int(fusion.corners * references))
         others = references - len(corners.xyz)
         xyz = interleaved(xyz, vertical_edges(cloud, grid, int(fusion.edges * others)), others)
         xyz = interleaved(xyz, corners.xyz, references)
@@ -125,14 +125,18 @@ def _sampled(
     return xyz, texture[: fusion.points]
 
 
-def _corners(cloud: NDArray[np.float32], images: Sequence[Image], network: NetworkSettings, most: int) -> Corners:
+def _find_corners(
+    cloud: NDArray[np.float32], images: Sequence[Image], network: NetworkSettings, max_corners: int
+) -> Corners:
     """Corners of all images, the same limit for each; none for a network without a camera."""
-    if network.image.backbone == "none" or not images or most < len(images):
+    if network.image.backbone == "none" or not images or max_corners < len(images):
         return no_corners()
     found = []
     for image in images:
         small = small_image(image, network.image)
-        found.append(image_corners(small.pixels, small.camera.K, small.camera.T_lidar_cam, cloud, most // len(images)))
+        found.append(
+            image_corners(small.pixels, small.camera.K, small.camera.T_lidar_cam, cloud, max_corners // len(images))
+        )
     return Corners(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

@@ -28,12 +28,12 @@ def register_batch(
         return [Registration.failed("neural", "0 matching descriptors, want 3")] * len(source.xyz)
     if decoder.settings.precision and solver == "consensus":  # the head was trained on its figures
         confidence = confidence_of(decoder, solved).sigmoid()
-        improbable = [_improbable(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
+        fit_objections = [_fit_objection(*row) for row in zip(solved.share.tolist(), confidence.tolist(), strict=True)]
     else:
-        confidence = solved.borne_out
-        improbable = [_unmatched(value) for value in confidence.tolist()]
-    few = [_few(count) for count in solved.inliers.tolist()]
-    objections = [first or second for first, second in zip(few, improbable, strict=True)]
+        confidence = solved.support
+        fit_objections = [_match_objection(value) for value in confidence.tolist()]
+    count_objections = [_count_objection(count) for count in solved.inliers.tolist()]
+    objections = [first or second for first, second in zip(count_objections, fit_objections, strict=True)]
     overlap = overlap_probability(decoder, source, target, correlated, solved)
     figures = (field.tolist() for field in (confidence, solved.residual, overlap))
     return [
@@ -50,21 +50,21 @@ def overlap_probability(
     return decoder.overlap(*correlated, source.mask, target.mask, overlap_features(solved)).sigmoid()
 
 
-def _few(count: int) -> str:
+def _count_objection(count: int) -> str:
     """Why this number of pairs gives no pose; empty if it does."""
     return f"{count} matching descriptors, want 3" if count < 3 else ""
 
 
-def _improbable(share: float, confidence: float) -> str:
+def _fit_objection(share: float, confidence: float) -> str:
     """Why a pose is rejected that brings this share of the pairs together; empty if it is not."""
     if share < LEAST_SHARE:
         return f"only {share:.0%} of the matched descriptors fit one motion"
     return "" if confidence >= LEAST else f"right with a probability of only {confidence:.0%}"
 
 
-def _unmatched(borne_out: float) -> str:
+def _match_objection(support: float) -> str:
     """The same for a pose that is judged only by the mean probability of the matches that support it."""
-    return "" if borne_out >= LEAST_MATCHED else f"descriptors match with a confidence of only {borne_out:.2f}"
+    return "" if support >= LEAST_MATCHED else f"descriptors match with a confidence of only {support:.2f}"
 
 
 def _registration(

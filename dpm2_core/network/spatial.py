@@ -9,7 +9,7 @@ from torch import Tensor
 from dpm2_core.geometry.full_precision import full_precision
 from dpm2_core.geometry.rays import pixel_rays, point_ray_distance, project
 from dpm2_core.network import compiled_bias
-from dpm2_core.network.attention import hiding, zscore
+from dpm2_core.network.attention import effective_mask, zscore
 from dpm2_core.network.convnext import FeatureMap
 from dpm2_core.network.precision import product_type
 from dpm2_core.network.views import Views
@@ -35,7 +35,7 @@ def _near_bias(distance: Tensor, counted: Tensor, mask: Tensor, alphas: tuple[fl
 
     bf16 under autocast: the largest tensors of the network, read by every layer.
     """
-    if compiled_bias.applies(distance) and hiding(mask) is None:
+    if compiled_bias.applies(distance) and effective_mask(mask) is None:
         return compiled_bias.near_bias(distance, counted, alphas)
     alpha = torch.tensor(alphas, device=distance.device).view(1, -1, 1, 1)
     bias = zscore(torch.exp(-alpha * distance[:, None]) * counted[:, None], mask[:, None])
@@ -75,8 +75,8 @@ def ray_bias(points: Tensor, views: Views, uv: Tensor, alphas: tuple[float, ...]
 def seen_from(points: Tensor, views: Views, view: int) -> Tensor:
     """Which points (B, N, 3) project into a view's image, if it is present: (B, N)."""
     height, width = views.pixels.shape[-2:]
-    at, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
-    inside = (depth > 0.1) & (at[..., 0] >= 0) & (at[..., 0] < width) & (at[..., 1] >= 0) & (at[..., 1] < height)
+    uv, depth = project(points, views.K[:, view].float(), views.T_lidar_cam[:, view].float())
+    inside = (depth > 0.1) & (uv[..., 0] >= 0) & (uv[..., 0] < width) & (uv[..., 1] >= 0) & (uv[..., 1] < height)
     return inside & views.present[:, view, None]
 
 

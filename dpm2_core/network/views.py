@@ -33,14 +33,14 @@ class Views(NamedTuple):
 
 def collate_views(images: Sequence[Sequence[Image]], settings: ImageSettings) -> Views | None:
     """Resize and stack the images of each frame; absent ones are masked, None if no frame has any."""
-    most = max((len(frame) for frame in images), default=0)
-    if most == 0:
+    max_images = max((len(frame) for frame in images), default=0)
+    if max_images == 0:
         return None
     height, width = settings.size
-    pixels = np.zeros((len(images), most, 3, height, width), np.uint8)
-    K = np.tile(np.eye(3, dtype=np.float32), (len(images), most, 1, 1))
-    T = np.tile(np.eye(4, dtype=np.float32), (len(images), most, 1, 1))
-    present = np.zeros((len(images), most), bool)
+    pixels = np.zeros((len(images), max_images, 3, height, width), np.uint8)
+    K = np.tile(np.eye(3, dtype=np.float32), (len(images), max_images, 1, 1))
+    T = np.tile(np.eye(4, dtype=np.float32), (len(images), max_images, 1, 1))
+    present = np.zeros((len(images), max_images), bool)
     for b, frame in enumerate(images):
         for v, image in enumerate(frame):
             small = small_image(image, settings)

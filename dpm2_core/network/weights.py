@@ -24,8 +24,8 @@ from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, settings_from
 
 T = TypeVar("T", bound=Settings)
-_LARGEST = 1 << 16  # no number in a description is greater: channels, points, pixels
-_TIMM = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; its other names are addresses
+_MAX_NUMBER = 1 << 16  # no number in a description is greater: channels, points, pixels
+_TIMM_NAME = re.compile(r"timm:[\w.]+")  # a network that timm itself builds; its other names are addresses
 
 
 def save_weights(model: DeepPointMap2, path: Path, about: dict[str, str], half: bool = True) -> None:
@@ -45,10 +45,10 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[
         for name, value in state.items()
     }
     with atomic_write(path, "wb") as file:
-        file.write(_in_order(save(stored, metadata)))
+        file.write(_with_sorted_metadata(save(stored, metadata)))
 
 
-def _in_order(file: bytes) -> bytes:
+def _with_sorted_metadata(file: bytes) -> bytes:
     """A safetensors file with its metadata sorted by name: the package writes it in the random order of a hash map."""
     end = 8 + int.from_bytes(file[:8], "little")
     header = json.loads(file[8:end])
@@ -89,7 +89,7 @@ def load_weights(model: DeepPointMap2, path: Path) -> dict[str, str]:
         UsageError: missing file, another format, weights of another preset or shape.
     """
     state, metadata = read_tensors(path)
-    _fill(model, path, state, metadata)
+    _load_checked(model, path, state, metadata)
     return metadata
 
 
@@ -109,7 +109,9 @@ def load_fitting(model: DeepPointMap2, path: Path) -> list[str]:
     return sorted(own.keys() - fitting.keys())
 
 
-def _fill(model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], metadata: Mapping[str, str]) -> None:
+def _load_checked(
+    model: DeepPointMap2, path: Path, state: Mapping[str, torch.Tensor], metadata: Mapping[str, str]
+) -> None:
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
         raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
@@ -151,7 +153,7 @@ def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
     settings = _network_settings(path, metadata)
     check_fit(path, state, lambda: DeepPointMap2(settings))
     model = DeepPointMap2(settings)
-    _fill(model, path, state, metadata)
+    _load_checked(model, path, state, metadata)
     model.decoder.overlap_trained = metadata.get("phase") == "2"
     return model.eval().requires_grad_(False), metadata
 
@@ -159,7 +161,7 @@ def load_model_and_metadata(path: Path) -> tuple[DeepPointMap2, dict[str, str]]:
 def _network_settings(path: Path, metadata: Mapping[str, str]) -> NetworkSettings:
     settings = described(path, metadata, NetworkSettings)
     backbone = settings.image.backbone
-    if backbone.startswith("timm:") and not _TIMM.fullmatch(backbone):
+    if backbone.startswith("timm:") and not _TIMM_NAME.fullmatch(backbone):
         raise UsageError(f"{path}: image.backbone {backbone}: weights do not choose what is downloaded")
     return settings
 
@@ -210,12 +212,12 @@ def _check_finite(path: Path, state: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_numbers(path: Path, value: Any, name: str = "network") -> None:
-    """Raise UsageError if a number or the length of a list in a description is above `_LARGEST`."""
+    """Raise UsageError if a number or the length of a list in a description is above `_MAX_NUMBER`."""
     if isinstance(value, dict):
         for key, item in value.items():
             _check_numbers(path, item, f"{name}.{key}")
     elif isinstance(value, list):
-        for item in [len(value), *value[:_LARGEST]]:
+        for item in [len(value), *value[:_MAX_NUMBER]]:
             _check_numbers(path, item, name)
-    elif isinstance(value, int | float) and not abs(value) <= _LARGEST:
-        raise UsageError(f"{path}: {name} is {value}; at most {_LARGEST} makes sense")
+    elif isinstance(value, int | float) and not abs(value) <= _MAX_NUMBER:
+        raise UsageError(f"{path}: {name} is {value}; at most {_MAX_NUMBER} makes sense")

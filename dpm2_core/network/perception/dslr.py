@@ -28,7 +28,7 @@ from dpm2_core.network.perception.range_image import (
 )
 from dpm2_core.network.perception.task_weights import load_network
 
-_TALLEST = 42  # rows that the decoder makes; the image is cropped from them
+_MAX_ROWS = 42  # rows that the decoder makes; the image is cropped from them
 
 
 class DslrSettings(Settings):
@@ -121,8 +121,8 @@ class Dslr(nn.Module):
         """
         super().__init__()
         self.settings = settings = settings or DslrSettings()
-        if settings.image.rows > _TALLEST:
-            raise UsageError(f"DSLR: images of {settings.image.rows} rows; want at most {_TALLEST}")
+        if settings.image.rows > _MAX_ROWS:
+            raise UsageError(f"DSLR: images of {settings.image.rows} rows; want at most {_MAX_ROWS}")
         self.static_encoder, self.decoder = RangeEncoder(settings), RangeDecoder(settings)
         self.discriminator = PairDiscriminator(settings)
         self.apply(initialize)

@@ -57,18 +57,18 @@ class DynamicObjectNet(nn.Module):
         self.head = nn.Conv2d(c, planes, 1)
         half = settings.cells // 2
         axis = (torch.arange(half) + 0.5) / half * 2 - 1
-        away = torch.hypot(axis[:, None], axis[None])  # points are fewer at larger distances
-        self.register_buffer("range", away[None, None], persistent=False)
+        distance = torch.hypot(axis[:, None], axis[None])  # points are fewer at larger distances
+        self.register_buffer("range", distance[None, None], persistent=False)
 
     def forward(self, occupied: Tensor) -> Tensor:
         x = functional.pixel_unshuffle(occupied, 2).contiguous(memory_format=torch.channels_last)
         x = self.stem(torch.cat([x, self.range.to(x.dtype).expand(len(x), -1, -1, -1)], 1))
-        finer = []
+        skips = []
         for block in self.down:
-            finer.append(x)
+            skips.append(x)
             x = block(x)
         for lift, block in zip(self.lift, self.up, strict=True):
-            x = block(functional.interpolate(lift(x), scale_factor=2.0) + finer.pop())
+            x = block(functional.interpolate(lift(x), scale_factor=2.0) + skips.pop())
         return functional.pixel_shuffle(self.head(x), 2)
 
     @torch.inference_mode()

@@ -68,7 +68,7 @@ class GroundNet(nn.Module):
         Raises:
             UsageError: a scan has another shape.
         """
-        x = torch.stack([self._scattered(scan) for scan in scans])
+        x = torch.stack([self._pillar_grid(scan) for scan in scans])
         indices = []
         for block in self.down:
             x, index = functional.max_pool2d(block(x), 2, return_indices=True)
@@ -77,23 +77,23 @@ class GroundNet(nn.Module):
             x = block(functional.max_unpool2d(x, index, [2, 2]))
         return self.head(x)[:, 0] - self.settings.sensor_height
 
-    def _scattered(self, scan: Tensor) -> Tensor:
+    def _pillar_grid(self, scan: Tensor) -> Tensor:
         """(channels, cells, cells) features of the pillars of one scan, zero for cells without points."""
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise UsageError(f"GroundNet: a scan of shape {tuple(scan.shape)}; want (N, 4)")
         s = self.settings
         scan = scan[scan.isfinite().all(1)]
-        above = scan[:, 2] + s.sensor_height
+        height = scan[:, 2] + s.sensor_height
         cell, inside = cell_of(scan, s)
-        keep = inside & (above.abs() < s.height_range)
-        scan, cell, above = scan[keep], cell[keep], above[keep]
-        xyz = torch.cat([scan[:, :2], above[:, None]], 1)
+        keep = inside & (height.abs() < s.height_range)
+        scan, cell, height = scan[keep], cell[keep], height[keep]
+        xyz = torch.cat([scan[:, :2], height[:, None]], 1)
         count, total = _sums(cell, xyz, s)
         mean = total / count.clamp(min=1)[:, None]
         grid = torch.stack([cell // s.cells, cell % s.cells], 1)
         center = (grid + 0.5 - s.cells / 2) * s.cell
-        own = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - center], 1)
-        features = functional.relu(self.pillar(own))
+        point_features = torch.cat([xyz, scan[:, 3:], xyz - mean[cell], xyz[:, :2] - center], 1)
+        features = functional.relu(self.pillar(point_features))
         out = features.new_zeros(s.cells**2, features.shape[1])
         out = out.scatter_reduce(0, cell[:, None].expand_as(features), features, "amax")  # ReLU: zero is the minimum
         return out.T.unflatten(1, (s.cells, s.cells))
@@ -149,10 +149,10 @@ def ground_loss(elevation: Tensor, labels: Tensor, known: Tensor, settings: Grou
     error = functional.smooth_l1_loss(elevation, requested, reduction="none")
     fit = (error * known).sum() / known.sum().clamp(min=1)
     if settings.curvature == "squared":
-        bend = sum(elevation.diff(n=2, dim=axis).square().mean() for axis in (1, 2))
+        curvature = sum(elevation.diff(n=2, dim=axis).square().mean() for axis in (1, 2))
     else:
-        bend = sum(elevation.diff(dim=a).diff(dim=b).abs().mean() for a in (1, 2) for b in (1, 2))
-    return (1 - settings.smoothness) * fit + settings.smoothness * bend
+        curvature = sum(elevation.diff(dim=a).diff(dim=b).abs().mean() for a in (1, 2) for b in (1, 2))
+    return (1 - settings.smoothness) * fit + settings.smoothness * curvature
 
 
 def height_above(points: Tensor, elevation: Tensor, settings: GroundSettings) -> Tensor:
@@ -193,20 +193,23 @@ def ground_metrics(
     inside = cell_of(points, settings)[1]
     found = (height_above(points, elevation, settings) > settings.threshold)[inside]
     obstacle = ~ground[inside]
-    both = (found & obstacle).sum().item()
-    neither = (~found & ~obstacle).sum().item()
-    false, missed = (found & ~obstacle).sum().item(), (~found & obstacle).sum().item()
-    iou, ground_iou = _ratio(both, both + false + missed), _ratio(neither, neither + false + missed)
+    true_positive = (found & obstacle).sum().item()
+    true_negative = (~found & ~obstacle).sum().item()
+    false_positive, false_negative = (found & ~obstacle).sum().item(), (~found & obstacle).sum().item()
+    iou, ground_iou = (
+        _ratio(true_positive, true_positive + false_positive + false_negative),
+        _ratio(true_negative, true_negative + false_positive + false_negative),
+    )
     ious = [value for value in (iou, ground_iou) if not math.isnan(value)]
     return {
         "mse": float((elevation - labels)[known].square().mean()) if bool(known.any()) else math.nan,
         "miou": _ratio(sum(ious), len(ious)),
-        "precision": _ratio(both, both + false),
-        "recall": _ratio(both, both + missed),
+        "precision": _ratio(true_positive, true_positive + false_positive),
+        "recall": _ratio(true_positive, true_positive + false_negative),
         "mse_authors": _mse_authors(points[ground], elevation, settings),
         "ground_iou": ground_iou,
-        "ground_precision": _ratio(neither, neither + missed),
-        "ground_recall": _ratio(neither, neither + false),
+        "ground_precision": _ratio(true_negative, true_negative + false_negative),
+        "ground_recall": _ratio(true_negative, true_negative + false_positive),
     }
 
 

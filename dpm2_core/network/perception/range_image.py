@@ -18,7 +18,7 @@ from dpm2_core.errors import UsageError
 
 CHANNELS = 2
 """Channels of an image: d = sqrt(x^2 + y^2) and z, both in units of `scale`."""
-_REACH = 2  # slots on each side that one step of filling covers: a 5 x 5 pool
+_FILL_RADIUS = 2  # slots on each side that one step of filling covers: a 5 x 5 pool
 
 
 class RangeImageSettings(Settings):
@@ -40,7 +40,7 @@ class RangeImageSettings(Settings):
 
     @field_validator("beams")
     @classmethod
-    def _descend(cls, beams: tuple[tuple[float, float, int], ...]) -> tuple[tuple[float, float, int], ...]:
+    def _check_descending(cls, beams: tuple[tuple[float, float, int], ...]) -> tuple[tuple[float, float, int], ...]:
         angles = [angle for top, bottom, count in beams for angle in ((top, bottom) if count > 1 else (top,))]
         if not angles or min(count for *_, count in beams) < 1 or sorted(set(angles), reverse=True) != angles:
             raise ValueError("want groups (first deg, last deg, count), each beam below the one before")
@@ -53,11 +53,11 @@ def elevations(settings: RangeImageSettings) -> Tensor:
     Raises:
         UsageError: the sensor has fewer beams than `first + rows`.
     """
-    every = torch.cat([torch.linspace(top, bottom, count) for top, bottom, count in settings.beams])
-    rows = torch.deg2rad(every[settings.first : settings.first + settings.rows])
+    all_beams = torch.cat([torch.linspace(top, bottom, count) for top, bottom, count in settings.beams])
+    rows = torch.deg2rad(all_beams[settings.first : settings.first + settings.rows])
     if len(rows) < settings.rows:
         last = settings.first + settings.rows - 1
-        raise UsageError(f"range image: rows {settings.first} to {last} of a sensor with {len(every)} beams")
+        raise UsageError(f"range image: rows {settings.first} to {last} of a sensor with {len(all_beams)} beams")
     return rows
 
 
@@ -78,12 +78,12 @@ def slots(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]
     d = torch.hypot(points[:, 0], points[:, 1])
     inside = points[:, :3].isfinite().all(1) & (d >= settings.min_distance) & (d < settings.scale)
     elevation = torch.atan2(points[:, 2], d)
-    middle = (beams[1:] + beams[:-1]) / 2
-    above, below = beams[0] - middle[0], middle[-1] - beams[-1]  # half the spacing to a beam beyond the image
+    boundaries = (beams[1:] + beams[:-1]) / 2
+    above, below = beams[0] - boundaries[0], boundaries[-1] - beams[-1]  # half the spacing to a beam beyond the image
     inside &= (elevation <= beams[0] + above) & (elevation > beams[-1] - below)
-    row = torch.searchsorted(-middle, -elevation.nan_to_num())
-    turn = torch.remainder(torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi), 1).nan_to_num()
-    return row * settings.columns + (turn * settings.columns).long().clamp(max=settings.columns - 1), inside
+    row = torch.searchsorted(-boundaries, -elevation.nan_to_num())
+    revolution = torch.remainder(torch.atan2(points[:, 1], points[:, 0]) / (2 * math.pi), 1).nan_to_num()
+    return row * settings.columns + (revolution * settings.columns).long().clamp(max=settings.columns - 1), inside
 
 
 def project(points: Tensor, settings: RangeImageSettings) -> tuple[Tensor, Tensor]:
@@ -116,11 +116,11 @@ def fill(image: Tensor, mask: Tensor) -> Tensor:
     shape, (R, C) = image.shape, image.shape[-2:]
     image, mask = image.reshape(-1, CHANNELS, R, C), mask.reshape(-1, 1, R, C)
     while bool((~mask & mask.flatten(1).any(1)[:, None, None, None]).any()):
-        d, z = (_around(channel.masked_fill(~mask, -torch.inf)) for channel in image.split(1, 1))
-        far, index = functional.max_pool2d(d, 2 * _REACH + 1, 1, (_REACH, 0), return_indices=True)
-        height = z.flatten(2).gather(2, index.flatten(2)).view_as(far)
-        found = ~mask & far.isfinite()
-        image = torch.where(found, torch.cat([far, height], 1), image)
+        d, z = (_wrap_columns(channel.masked_fill(~mask, -torch.inf)) for channel in image.split(1, 1))
+        farthest, index = functional.max_pool2d(d, 2 * _FILL_RADIUS + 1, 1, (_FILL_RADIUS, 0), return_indices=True)
+        height = z.flatten(2).gather(2, index.flatten(2)).view_as(farthest)
+        found = ~mask & farthest.isfinite()
+        image = torch.where(found, torch.cat([farthest, height], 1), image)
         mask = mask | found
     return image.view(shape)
 
@@ -136,6 +136,6 @@ def to_points(image: Tensor, scale: float) -> Tensor:
     return scale * torch.stack([d * angle.cos(), d * angle.sin(), z], -1).flatten(-3, -2)
 
 
-def _around(channel: Tensor) -> Tensor:
+def _wrap_columns(channel: Tensor) -> Tensor:
     """(B, 1, R, C), padded at each end with the columns of the other end."""
-    return torch.cat([channel[..., -_REACH:], channel, channel[..., :_REACH]], -1)
+    return torch.cat([channel[..., -_FILL_RADIUS:], channel, channel[..., :_FILL_RADIUS]], -1)
