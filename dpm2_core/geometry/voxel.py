@@ -87,7 +87,7 @@ def _first_in_cells(
     min_squared: np.floating,
     max_squared: np.floating,
 ) -> NDArray[np.int64]:
-    """`voxel_first` with a hash table of the cells seen so far; `min_squared` and `max_squared` are squared distances."""
+    """`voxel_first` with a hash table of the cells seen so far; between two squared distances."""
     shift = _hash_shift(table)
     first, count, last_key = np.empty(len(points), np.int64), 0, np.int64(-1)
     for i in range(len(points)):
