@@ -41,7 +41,7 @@ def check_map(
     with tempfile.TemporaryDirectory(prefix="dpm2_check_") as folder:
         copy = Path(folder) / "map"  # opening replays FILE-wal, which would change the damaged file
         _copy(path, copy)
-        with closing(_opened(copy, path, findings)) as sql:
+        with closing(_open_copy(copy, path, findings)) as sql:
             data = Salvage(sql, copy.stat().st_size, findings).run()
             findings.keyframes = len(data)
             if recover is not None:
@@ -66,7 +66,7 @@ def _copy(path: Path, copy: Path) -> None:
         copy_with_log(source, copy)
 
 
-def _opened(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
+def _open_copy(copy: Path, path: Path, findings: Findings) -> sqlite3.Connection:
     """The copy of the map as a database; with a new first page if the old one is invalid."""
     try:
         sql: sqlite3.Connection = connect(copy, "rw")

@@ -24,13 +24,13 @@ QUANTUM = 0.01
 """Step of the coordinates, m: half the noise of a good LiDAR, so that rounding (sigma 3 mm) is insignificant."""
 COARSEST = 1.0
 """Largest step, m: no LiDAR's cloud reaches beyond 32 km."""
-_FINEST = 1e-4
+_MIN_QUANTUM = 1e-4
 MAX_POINTS = 1 << 21
 """Maximum per cloud: eight sensors with 128 beams of 2,048 points together."""
 _HEADER = struct.Struct("<If")  # points, quantum
-_ORIGIN, _ELSEWHERE = struct.Struct("<3f"), 1 << 31  # after the header if this bit of the number of points is set
-_BYTES = 7  # of a point, inflated
-_LARGEST = 32767
+_ORIGIN, _HAS_ORIGIN = struct.Struct("<3f"), 1 << 31  # after the header if this bit of the number of points is set
+_BYTES_PER_POINT = 7  # of a point, inflated
+_INT16_MAX = 32767
 
 
 class CodecError(UsageError, ValueError):
@@ -49,11 +49,11 @@ def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
     if not np.isfinite(points).all():
         raise CodecError("a cloud with coordinates that are not finite")
     reach = float(np.abs(points[:, :3]).max(initial=0.0))
-    quantum = float(np.float32(max(QUANTUM, reach * 1.0001 / _LARGEST)))
+    quantum = float(np.float32(max(QUANTUM, reach * 1.0001 / _INT16_MAX)))
     if quantum > COARSEST or len(points) > MAX_POINTS:
         raise CodecError(f"a cloud of {len(points)} points that reaches {reach:.0f} m: too large")
     seen_from = [0.0] * 3 if origin is None else origin.tolist()
-    if not np.abs(seen_from).max() <= _LARGEST:
+    if not np.abs(seen_from).max() <= _INT16_MAX:
         raise CodecError(f"a cloud seen from {seen_from} m: too far away")
     steps = np.rint(points[:, :3].astype(np.float64) / quantum).astype(np.int64)
     # Differences wrap around at 16 bits, and unwrap when they are summed with 16 bits.
@@ -62,7 +62,7 @@ def pack_cloud(points: Points, origin: Array | None = None) -> bytes:
     intensity = np.rint(np.clip(points[:, 3], 0, 1) * 255).astype(np.uint8)
     head = _HEADER.pack(len(points), quantum)
     if any(seen_from):
-        head = _HEADER.pack(len(points) | _ELSEWHERE, quantum) + _ORIGIN.pack(*seen_from)
+        head = _HEADER.pack(len(points) | _HAS_ORIGIN, quantum) + _ORIGIN.pack(*seen_from)
     return head + zlib.compress(planes.tobytes() + intensity.tobytes(), 4)
 
 
@@ -72,12 +72,12 @@ def unpack_cloud(data: bytes) -> Points:
     Raises:
         CodecError: the bytes are not a packed cloud.
     """
-    count, quantum, _, deflated = _parts(data)
+    count, quantum, _, deflated = _split(data)
     if count > MAX_POINTS:
         raise CodecError(f"not a packed cloud: {count} points, at most {MAX_POINTS} are allowed")
-    if not _FINEST <= quantum <= COARSEST:  # neither is NaN
-        raise CodecError(f"not a packed cloud: a step of {quantum:g} m, {_FINEST:g} to {COARSEST:g} are allowed")
-    raw = _inflated(deflated, _BYTES * count, f"packed cloud of {count} points")
+    if not _MIN_QUANTUM <= quantum <= COARSEST:  # neither is NaN
+        raise CodecError(f"not a packed cloud: a step of {quantum:g} m, {_MIN_QUANTUM:g} to {COARSEST:g} are allowed")
+    raw = _inflate(deflated, _BYTES_PER_POINT * count, f"packed cloud of {count} points")
     planes = np.frombuffer(raw, np.uint8, 6 * count).reshape(3, 2, count)
     delta = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<i2")[..., 0]
     points = np.empty((count, 4), np.float32)
@@ -92,23 +92,23 @@ def origin_of(data: bytes) -> Array:
     Raises:
         CodecError: the bytes are not a packed cloud.
     """
-    return _parts(data)[2]
+    return _split(data)[2]
 
 
-def _parts(data: bytes) -> tuple[int, float, Array, bytes]:
+def _split(data: bytes) -> tuple[int, float, Array, bytes]:
     """Number of points, quantum, position of the LiDAR, and the deflated bytes."""
     if len(data) < _HEADER.size:
         raise CodecError(f"not a packed cloud: {len(data)} bytes")
     count, quantum = _HEADER.unpack_from(data)
-    if not count & _ELSEWHERE:
+    if not count & _HAS_ORIGIN:
         return count, quantum, np.zeros(3), data[_HEADER.size :]
     end = _HEADER.size + _ORIGIN.size
     if len(data) < end:
         raise CodecError(f"not a packed cloud: {len(data)} bytes")
     origin = np.array(_ORIGIN.unpack_from(data, _HEADER.size))
-    if not np.abs(origin).max() <= _LARGEST:  # false for NaN
+    if not np.abs(origin).max() <= _INT16_MAX:  # false for NaN
         raise CodecError(f"not a packed cloud: seen from {origin.tolist()} m")
-    return count & ~_ELSEWHERE, quantum, origin, data[end:]
+    return count & ~_HAS_ORIGIN, quantum, origin, data[end:]
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> bytes:
@@ -122,11 +122,11 @@ def unpack_mask(data: bytes, count: int) -> NDArray[np.bool_]:
     Raises:
         CodecError: the bytes are not a mask of this size.
     """
-    raw = _inflated(data, (count + 7) // 8, f"packed mask of {count} points")
+    raw = _inflate(data, (count + 7) // 8, f"packed mask of {count} points")
     return np.unpackbits(np.frombuffer(raw, np.uint8))[:count].astype(bool)
 
 
-def _inflated(data: bytes, size: int, what: str) -> bytes:
+def _inflate(data: bytes, size: int, what: str) -> bytes:
     """Exactly `size` bytes; at most one more is ever in memory."""
     inflater = zlib.decompressobj()
     try:

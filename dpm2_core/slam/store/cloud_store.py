@@ -36,7 +36,7 @@ class SpillFile:
     """
 
     def __init__(self) -> None:
-        self._where: list[tuple[int, int] | bytes] = []  # offset and length, or the bytes themselves
+        self._locations: list[tuple[int, int] | bytes] = []  # offset and length, or the bytes themselves
         self._end = 0
         self._file: BinaryIO | None = None  # None before the first piece
 
@@ -48,20 +48,20 @@ class SpillFile:
             self._file.seek(self._end)
             if self._file.write(data) != len(data):
                 raise OSError("disk full")
-            self._where.append((self._end, len(data)))
+            self._locations.append((self._end, len(data)))
             self._end += len(data)
         except OSError:
-            self._where.append(data)
-        return len(self._where) - 1
+            self._locations.append(data)
+        return len(self._locations) - 1
 
     def read(self, number: int) -> bytes:
         """A piece by its number."""
-        where = self._where[number]
-        if isinstance(where, bytes):
-            return where
+        location = self._locations[number]
+        if isinstance(location, bytes):
+            return location
         assert self._file is not None
-        self._file.seek(where[0])
-        return self._file.read(where[1])
+        self._file.seek(location[0])
+        return self._file.read(location[1])
 
 
 class CloudStore(LazySequence[Points]):
@@ -91,38 +91,38 @@ class CloudStore(LazySequence[Points]):
             name: of the map, for errors.
         """
         self.name = name
-        self._stored = stored
+        self._read_stored = stored
         self._spill = SpillFile()
-        self._where: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
+        self._locations: list[int | bytes | None] = [None] * len(moving)  # number in the temporary file; None: map file
         self._moving = {index: mask for index, mask in enumerate(moving) if mask is not None}
         self._loans = dict(loans or {})
-        self._newest = {loan.lender: index for index, loan in sorted(self._loans.items())}  # borrower of each lender
+        self._newest_borrower = {loan.lender: index for index, loan in sorted(self._loans.items())}  # of each lender
 
     def append(self, packed: bytes) -> None:
         """Add the cloud of the next keyframe: in memory until the map file has it, or until the next one is added."""
-        if self._where and isinstance(last := self._where[-1], bytes):
-            self._where[-1] = self._spill.append(last)
-        self._where.append(packed)
+        if self._locations and isinstance(last := self._locations[-1], bytes):
+            self._locations[-1] = self._spill.append(last)
+        self._locations.append(packed)
 
     def set_stored(self, index: int) -> None:
         """The map file has this cloud now."""
-        self._where[index] = None
+        self._locations[index] = None
 
     def borrow(self, index: int, loan: Loan) -> int | None:
         """Let a keyframe borrow from an older one with its own cloud; returns the keyframe whose cloud is dropped."""
-        before = self._newest.get(loan.lender)
+        previous = self._newest_borrower.get(loan.lender)
         self._loans[index] = loan
-        if before is None:
-            self._newest[loan.lender] = index
+        if previous is None:
+            self._newest_borrower[loan.lender] = index
             return None
-        gone, self._newest[loan.lender] = sorted((before, index))
-        self._where[gone] = None
-        self._moving.pop(gone, None)
-        return gone
+        dropped, self._newest_borrower[loan.lender] = sorted((previous, index))
+        self._locations[dropped] = None
+        self._moving.pop(dropped, None)
+        return dropped
 
     def may_borrow(self, index: int) -> bool:
         """Whether a keyframe neither borrows nor lends."""
-        return index not in self._loans and index not in self._newest
+        return index not in self._loans and index not in self._newest_borrower
 
     def loan(self, index: int) -> Loan | None:
         """The keyframe's loan; None if it shows its own cloud."""
@@ -139,13 +139,13 @@ class CloudStore(LazySequence[Points]):
     def kept(self) -> NDArray[np.bool_]:
         """(N,) mask of keyframes that have their own clouds: those that do not borrow, and the newest borrowers."""
         kept = self.own
-        kept[list(self._newest.values())] = True
+        kept[list(self._newest_borrower.values())] = True
         return kept
 
     def keeps(self, index: int) -> bool:
         """Whether a keyframe has its own cloud."""
         loan = self._loans.get(index)
-        return loan is None or self._newest[loan.lender] == index
+        return loan is None or self._newest_borrower[loan.lender] == index
 
     def set_moving(self, index: int, moving: NDArray[np.bool_]) -> None:
         """Leave out those points (M,) of a cloud from now on."""
@@ -157,12 +157,12 @@ class CloudStore(LazySequence[Points]):
 
     def packed(self, index: int) -> bytes | None:
         """The bytes of a keyframe's own cloud; None if it was given up."""
-        where = self._where[index]
+        location = self._locations[index]
         if not self.keeps(index):
             return None
-        if isinstance(where, int):
-            return self._spill.read(where)
-        return where if where is not None or self._stored is None else self._stored(index)
+        if isinstance(location, int):
+            return self._spill.read(location)
+        return location if location is not None or self._read_stored is None else self._read_stored(index)
 
     def whole(self, index: int) -> Points:
         """A keyframe's own cloud (M, 4) with all its points; empty if it was given up.
@@ -171,7 +171,7 @@ class CloudStore(LazySequence[Points]):
             Dpm2Error: it is damaged.
         """
         data = self.packed(range(len(self))[index])
-        with self._named(index):
+        with self._naming_keyframe(index):
             return NO_POINTS if data is None else unpack_cloud(data)
 
     def seen(self, index: int) -> Points:
@@ -181,7 +181,7 @@ class CloudStore(LazySequence[Points]):
             Dpm2Error: it is damaged.
         """
         cloud, moving = self.whole(index), self._moving.get(index)
-        with self._named(index):
+        with self._naming_keyframe(index):
             return cloud if moving is None or not len(cloud) else cloud[~unpack_mask(moving, len(cloud))]
 
     def seen_from(self, index: int) -> Array:
@@ -191,7 +191,7 @@ class CloudStore(LazySequence[Points]):
             Dpm2Error: it is damaged.
         """
         data = self.packed(index)
-        with self._named(index):
+        with self._naming_keyframe(index):
             return np.zeros(3) if data is None else origin_of(data)
 
     def origin(self, index: int) -> Array:
@@ -205,14 +205,14 @@ class CloudStore(LazySequence[Points]):
         return self.seen_from(index)
 
     @contextmanager
-    def _named(self, index: int) -> Iterator[None]:
+    def _naming_keyframe(self, index: int) -> Iterator[None]:
         try:
             yield
         except CodecError as error:
             raise Dpm2Error(f"{self.name}: keyframe {index}: {error}; see dpm2 map check") from None
 
     def __len__(self) -> int:
-        return len(self._where)
+        return len(self._locations)
 
     def item(self, index: int) -> Points:
         """(M, 4) without moving points.

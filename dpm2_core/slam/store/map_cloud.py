@@ -12,7 +12,7 @@ from dpm2_core.geometry import se3
 from dpm2_core.geometry.voxel import VoxelCells
 from dpm2_core.slam.store.cloud_store import CloudStore
 
-_TOGETHER = 50  # clouds between two pauses
+_BATCH = 50  # clouds between two pauses
 
 
 def map_cloud(clouds: CloudStore, poses: Array, voxel: float, nodes: Iterable[int] | None = None) -> Points:
@@ -37,6 +37,6 @@ def map_cloud_in_steps(
         if clouds.loan(node) is None:
             cloud = se3.transform(poses[node], clouds[node])
             parts.append(cloud[cells.first(cloud)])
-        if count % _TOGETHER == 0:
+        if count % _BATCH == 0:
             yield
     return np.concatenate(parts)

@@ -19,8 +19,8 @@ from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, name_map, 
 
 BUSY = 5.0
 """s to wait for another program: a reader never blocks the writer for long; another writer is an error."""
-_HEAD = b"SQLite format 3"
-_MAKING = Lock()  # `part_beside` returns one file for the whole process
+_MAGIC = b"SQLite format 3"
+_CREATE_LOCK = Lock()  # `part_beside` returns one file for the whole process
 
 
 class MapConnection(NamedTuple):
@@ -44,8 +44,8 @@ def create_map(path: Path) -> MapConnection:
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         target = path.resolve()  # a symbolic link stays a link
-        with _MAKING, named(path, target):
-            _make(target)
+        with _CREATE_LOCK, named(path, target):
+            _create(target)
         try:
             return open_map(path, read_only=False)
         except BaseException:
@@ -53,7 +53,7 @@ def create_map(path: Path) -> MapConnection:
             raise
 
 
-def _make(path: Path) -> None:
+def _create(path: Path) -> None:
     part = part_beside(path)
     try:
         part.touch()
@@ -74,20 +74,20 @@ def open_map(path: Path, read_only: bool) -> MapConnection:
     if not path.is_file():
         raise UsageError(f"{path}: no such map file")
     with explained(path):
-        if _head(path)[:15] != _HEAD:
+        if _read_header(path)[:15] != _MAGIC:
             raise UsageError(f"{path}: not a dpm2 map")
         if foreign := foreign_log(path):
             raise UsageError(f"{path}: {foreign}")
-        opened = _open_to_read(path) if read_only else MapConnection(_connect(path, "rw"))
+        connection = _open_to_read(path) if read_only else MapConnection(_connect(path, "rw"))
         try:
-            schema.check(opened.sql, path)
+            schema.check(connection.sql, path)
             if not read_only:
-                opened.sql.execute("PRAGMA journal_mode = WAL")
-                opened.sql.execute("PRAGMA synchronous = NORMAL")
+                connection.sql.execute("PRAGMA journal_mode = WAL")
+                connection.sql.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
-            opened.close()
+            connection.close()
             raise
-        return opened
+        return connection
 
 
 def _connect(path: Path, mode: str) -> Connection:
@@ -98,7 +98,7 @@ def _open_to_read(path: Path) -> MapConnection:
     """Open it in place if it is complete; with FILE-wal as a reader of both; else from a copy."""
     wal = Path(f"{path.resolve()}-wal")  # SQLite names it after the file, not after a link to it
     if not wal.exists() or not wal.stat().st_size:
-        if _head(path)[18] == 1:  # closed, with a rollback journal: a reader leaves no files
+        if _read_header(path)[18] == 1:  # closed, with a rollback journal: a reader leaves no files
             return MapConnection(_connect(path, "ro"))
         return MapConnection(_connect(path, "ro&immutable=1"))
     connection = _connect(path, "ro")
@@ -113,7 +113,7 @@ def _open_to_read(path: Path) -> MapConnection:
         return MapConnection(_connect(copy, "rw"), folder)
 
 
-def _head(path: Path) -> bytes:
+def _read_header(path: Path) -> bytes:
     """The first 100 bytes, with zeros if the file is shorter; see the SQLite file format."""
     with path.open("rb") as file:
         return file.read(100).ljust(100, b"\0")

@@ -88,25 +88,25 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
     keyframes, loans = _load_keyframes(store, descriptors)
     nodes = range(len(keyframes))
     edges = []
-    for number, edge in _made(store, "edges", edge_of):
-        with _of("edge", number):
+    for number, edge in _read_objects(store, "edges", edge_of):
+        with _naming_row("edge", number):
             check_ends(edge, nodes)
         edges.append(edge)
     owner = [(keyframe.robot, keyframe.session) for keyframe in keyframes]
     for node, edge in odometry_by_node(edges).items():
         if owner[edge.from_node] == owner[node]:
             keyframes[node] = replace(keyframes[node], edge=edge.registration)
-    for _, (node, fix) in _made(store, "fixes", fix_of):
+    for _, (node, fix) in _read_objects(store, "fixes", fix_of):
         if node not in nodes:
             raise ValueError(f"a fix of keyframe {node}, which is not there")
         keyframes[node] = replace(keyframes[node], fix=fix)
-    poses = dict(_made(store, "poses", lambda row: pose_of(row[1])))
+    poses = dict(_read_objects(store, "poses", lambda row: pose_of(row[1])))
     if missing := set(nodes) - poses.keys():
         raise ValueError(f"keyframe {min(missing)} has no pose")
     moving: dict[int, bytes] = dict(store.rows("moving"))
     if not all(isinstance(mask, bytes) for mask in moving.values()):
         raise ValueError("invalid mask of moving points")
-    trail = [pruned for _, pruned in _made(store, "trail", removed_of)]
+    trail = [pruned for _, pruned in _read_objects(store, "trail", removed_of)]
     if any(pruned.node not in nodes for pruned in trail):
         raise ValueError("a pruned keyframe that refers to no existing one")
     return MapData(
@@ -114,20 +114,20 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
         np.array([poses[node] for node in nodes]).reshape(-1, 4, 4),
         edges,
         trail,
-        [made for _, made in _made(store, "sessions", session_of)],
+        [made for _, made in _read_objects(store, "sessions", session_of)],
         CloudStore(
             lambda node: store.payload(node, "cloud"), [moving.get(node) for node in nodes], loans, str(store.path)
         ),
         lambda node: store.payload(node, "thumbnail"),
         lambda node: None if (packed := store.payload(node, "descriptors")) is None else unpack_descriptors(packed),
-        next((made for _, made in _made(store, "georeference", georeference_of)), None),
+        next((made for _, made in _read_objects(store, "georeference", georeference_of)), None),
     )
 
 
 def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], dict[int, Loan]]:
     """Keyframes with their odometry pose, and descriptors if requested; and the loans of those that borrow."""
     keyframes, loans = [], {}
-    for position, (_, (node, keyframe, loan)) in enumerate(_made(store, "keyframes", keyframe_of)):
+    for position, (_, (node, keyframe, loan)) in enumerate(_read_objects(store, "keyframes", keyframe_of)):
         if node != position:
             raise ValueError(f"keyframe {position} is missing")
         keyframes.append(keyframe)
@@ -140,7 +140,7 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
         widths = set()
         for node in range(len(keyframes)):
             if (data := store.payload(node, "descriptors")) is not None:
-                with _of("keyframe", node):
+                with _naming_row("keyframe", node):
                     keyframes[node] = replace(keyframes[node], descriptors=(made := unpack_descriptors(data)))
                     widths.add(made.features.shape[1])
         if len(widths) > 1:
@@ -150,16 +150,16 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
     return keyframes, loans
 
 
-def _made(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
+def _read_objects(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
     """Number and object of each row of a table; errors name their row."""
     for row in store.rows(table):
-        with _of("fix" if table == "fixes" else table.removesuffix("s"), row[0]):
+        with _naming_row("fix" if table == "fixes" else table.removesuffix("s"), row[0]):
             made = make(row)
         yield row[0], made
 
 
 @contextmanager
-def _of(what: str, number: int) -> Iterator[None]:
+def _naming_row(what: str, number: int) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
@@ -234,20 +234,20 @@ def subset(data: MapData, nodes: Sequence[int], edges: Iterable[Edge], trail: It
 
     All arguments have the numbers of `data`; the result is renumbered.
     """
-    where = list(nodes)
-    new = {node: i for i, node in enumerate(where)}
-    loans = {new[node]: Loan(new[loan.lender], loan.T_kf_lender) for node in where if (loan := data.clouds.loan(node))}
-    clouds = CloudStore(lambda i: data.clouds.packed(where[i]), [data.clouds.moving(node) for node in where], loans,
+    kept = list(nodes)
+    new = {node: i for i, node in enumerate(kept)}
+    loans = {new[node]: Loan(new[loan.lender], loan.T_kf_lender) for node in kept if (loan := data.clouds.loan(node))}
+    clouds = CloudStore(lambda i: data.clouds.packed(kept[i]), [data.clouds.moving(node) for node in kept], loans,
                         data.clouds.name)  # fmt: skip
     return MapData(
-        [data.keyframes[node] for node in where],
-        data.poses[where],
+        [data.keyframes[node] for node in kept],
+        data.poses[kept],
         [e.between(new[e.from_node], new[e.to_node]) for e in edges if e.from_node in new and e.to_node in new],
         [replace(pruned, node=new[pruned.node]) for pruned in trail if pruned.node in new],
         data.sessions,
         clouds,
-        lambda node: data.thumbnail(where[node]),
-        lambda node: data.describe(where[node]),
+        lambda node: data.thumbnail(kept[node]),
+        lambda node: data.describe(kept[node]),
         data.georeference,
     )
 
@@ -268,7 +268,7 @@ def ways(data: MapData) -> list[Way]:
     A session has several if the odometry restarted, as when a recording was played again; among removed keyframes this
     is not known. Ids give the order, not stamps, since a clock may be set back.
     """
-    led = odometry_by_node(data.edges)
+    chain = odometry_by_node(data.edges)
     steps: list[tuple[str, int, int, int, int | None, Array]] = [
         (k.robot, k.session, k.id, k.stamp, node, data.poses[node]) for node, k in enumerate(data.keyframes)
     ]
@@ -276,11 +276,11 @@ def ways(data: MapData) -> list[Way]:
     steps.sort(key=lambda step: step[:4])
     found = []
     for (robot, session), drive in groupby(steps, lambda step: step[:2]):
-        way = list(drive)
-        nodes = enumerate(pairwise([step[4] for step in way]), 1)
-        cuts = [at for at, (before, node) in nodes if None not in (before, node) and node not in led]
-        for start, end in pairwise([0, *cuts, len(way)]):
-            _, _, _, stamps, _, poses = zip(*way[start:end], strict=True)
+        drive_steps = list(drive)
+        nodes = enumerate(pairwise([step[4] for step in drive_steps]), 1)
+        cuts = [at for at, (before, node) in nodes if None not in (before, node) and node not in chain]
+        for start, end in pairwise([0, *cuts, len(drive_steps)]):
+            _, _, _, stamps, _, poses = zip(*drive_steps[start:end], strict=True)
             found.append(Way(robot, session, list(stamps), np.array(poses)))
     return found
 
@@ -292,21 +292,21 @@ def trajectory(data: MapData) -> tuple[list[int], Array]:
     """
     stamps, poses, ends = list[int](), [data.poses[:0]], set[tuple[str, int]]()
     for way in sorted(ways(data), key=lambda way: way.stamps[0]):
-        again = int((way.robot, way.stamps[0]) in ends)
+        repeated = int((way.robot, way.stamps[0]) in ends)
         ends.add((way.robot, way.stamps[-1]))
-        stamps += way.stamps[again:]
-        poses.append(way.poses[again:])
+        stamps += way.stamps[repeated:]
+        poses.append(way.poses[repeated:])
     return stamps, np.concatenate(poses)
 
 
 def odometry_by_node(edges: Iterable[Edge]) -> dict[int, Edge]:
     """The odometry edges by the node that they lead to: no node has two predecessors, or two successors."""
     chain: dict[int, Edge] = {}
-    left: set[int] = set()
+    with_successor: set[int] = set()
     # Nearest nodes first: edges that pruning has composed may skip nodes.
     odometry = (edge for edge in edges if edge.ok and edge.kind == "odometry" and edge.from_node < edge.to_node)
     for edge in sorted(odometry, key=lambda edge: edge.to_node - edge.from_node):
-        if edge.to_node not in chain and edge.from_node not in left:
+        if edge.to_node not in chain and edge.from_node not in with_successor:
             chain[edge.to_node] = edge
-            left.add(edge.from_node)
+            with_successor.add(edge.from_node)
     return chain

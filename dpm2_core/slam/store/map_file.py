@@ -14,8 +14,8 @@ from dpm2_core.files import explaining
 SUFFIX = ".dpm2map"
 """Suffix of a map file's name, unless another one is given."""
 
-_CLOSED, _LOGGED = 1, 2  # see `_write_version`
-_WHAT_TO_DO = "move it to where that map is, or remove it"
+_WITHOUT_LOG, _WITH_LOG = 1, 2  # see `_write_version`
+_ADVICE = "move it to where that map is, or remove it"
 
 
 def copy_with_log(path: Path, copy: Path) -> None:
@@ -40,7 +40,7 @@ def missing_log(path: Path) -> str:
         OSError: it could not be read.
     """
     wal = Path(f"{path.resolve()}-wal")
-    if _write_version(path) != _LOGGED or wal.exists():
+    if _write_version(path) != _WITH_LOG or wal.exists():
         return ""
     return f"its writer was killed, and {wal.name}, which may contain the last 4 MB or all of it, is not next to it"
 
@@ -55,9 +55,10 @@ def foreign_log(path: Path) -> str:
         OSError: it could not be read.
     """
     wal = Path(f"{path.resolve()}-wal")
-    there = _holds(wal)
-    if there and _write_version(path) == _CLOSED and _holds(wal):  # checked again: a map may be closed meanwhile
-        return f"{wal} is not of this map, which was closed, but of one that was here before; {_WHAT_TO_DO}"
+    has_log = _is_not_empty(wal)
+    # Checked again: a map may be closed meanwhile.
+    if has_log and _write_version(path) == _WITHOUT_LOG and _is_not_empty(wal):
+        return f"{wal} is not of this map, which was closed, but of one that was here before; {_ADVICE}"
     return ""
 
 
@@ -67,7 +68,7 @@ def _write_version(path: Path) -> int:
         return int.from_bytes(file.read(19)[18:])
 
 
-def _holds(log: Path) -> bool:
+def _is_not_empty(log: Path) -> bool:
     try:
         return log.stat().st_size > 0
     except OSError:  # it does not exist, or the map cannot be accessed either, which is reported for the map
@@ -82,7 +83,7 @@ def move_map(source: Path, target: Path) -> None:
         Dpm2Error: the map is not complete in one file, since the disk was full, or does not exist; the existing map is
             kept.
     """
-    _check_whole(source, target)
+    _check_complete(source, target)
     with explaining(target):
         _remove_log(target.resolve())
         source.replace(target.resolve())
@@ -94,7 +95,7 @@ def name_map(source: Path, target: Path) -> None:
     Raises:
         UsageError: the file, or a log of SQLite for it, exists already. Dpm2Error: as `move_map`.
     """
-    _check_whole(source, target)
+    _check_complete(source, target)
     check_new(target)
     try:
         os.link(source, target.resolve())
@@ -110,17 +111,17 @@ def name_map(source: Path, target: Path) -> None:
 def check_new(path: Path) -> None:
     """Raises UsageError if a new map cannot be made there: there is a file already, or a log that SQLite kept next to
     an old one and would use for the new one."""
-    there, left = path.exists(), left_log(path)  # an inaccessible path is reported as an error of that path
-    if there or path.exists():  # checked again: another program makes the file of a new map before its log
+    exists, log = path.exists(), left_log(path)  # an inaccessible path is reported as an error of that path
+    if exists or path.exists():  # checked again: another program makes the file of a new map before its log
         raise already_there(path)
-    if left is not None:
-        raise UsageError(f"{left}: the last keyframes of a map that was moved or removed without them; {_WHAT_TO_DO}")
+    if log is not None:
+        raise UsageError(f"{log}: the last keyframes of a map that was moved or removed without them; {_ADVICE}")
 
 
 def left_log(path: Path) -> Path | None:
     """A log that SQLite kept next to a map file, if there is one."""
     logs = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-journal"))
-    return next(filter(_holds, logs), None)
+    return next(filter(_is_not_empty, logs), None)
 
 
 def already_there(path: Path) -> UsageError:
@@ -128,7 +129,7 @@ def already_there(path: Path) -> UsageError:
     return UsageError(f"{path}: there is a file already")
 
 
-def _check_whole(source: Path, target: Path) -> None:
+def _check_complete(source: Path, target: Path) -> None:
     wal = Path(f"{source}-wal")
     if wal.exists() and wal.stat().st_size:  # see MapStore.close; renamed without it, the map would be damaged
         raise Dpm2Error(f"{target}: not written: the map could not be made one file; is the disk full?")

@@ -72,10 +72,10 @@ class MapStore:
         self.read_only = read_only
         self.session = 0
         self._file = _identity(path)
-        self._newest = 0  # number of the last session that this program has written
-        self._opened = connection
+        self._last_session = 0  # number of the last session that this program has written
+        self._map_connection = connection
         self._connection = connection.sql
-        self._together = False
+        self._in_transaction = False
 
     @classmethod
     def create(cls, path: Path) -> MapStore:
@@ -97,7 +97,7 @@ class MapStore:
         with self._transaction() as sql:
             number = sql.execute("SELECT coalesce(max(session), 0) + 1 FROM sessions").fetchone()[0]
             sql.execute("INSERT INTO sessions VALUES (?,?,?,?,?)", (number, __version__, started, config, weights))
-        self.session = self._newest = int(number)
+        self.session = self._last_session = int(number)
         return self.session
 
     def add_sessions(self, sessions: Iterable[Session]) -> None:
@@ -105,7 +105,7 @@ class MapStore:
         with self._transaction() as sql:
             rows = [(s.number, s.program, s.started, s.config, s.weights) for s in sessions]
             sql.executemany("INSERT INTO sessions VALUES (?,?,?,?,?)", rows)
-        self._newest = max([self._newest, *(row[0] for row in rows)])
+        self._last_session = max([self._last_session, *(row[0] for row in rows)])
 
     def write(self, change: Change) -> None:
         """Write a change, whole or not at all.
@@ -114,7 +114,7 @@ class MapStore:
             Dpm2Error: it could not be written: a full disk, a read-only file, another writer.
         """
         with self._transaction() as sql:
-            self._check_alone(sql)
+            self._check_only_writer(sql)
             for node, keyframe, cloud, thumbnail in change.keyframes:
                 loan = change.loans.get(node)
                 _insert(sql, "keyframes", [keyframe_row(node, keyframe, self.session, loan)])
@@ -135,10 +135,10 @@ class MapStore:
             if change.georeference is not None:
                 _insert(sql, "georeference", [georeference_row(change.georeference)])
 
-    def _check_alone(self, sql: sqlite3.Connection) -> None:
+    def _check_only_writer(self, sql: sqlite3.Connection) -> None:
         """Raise if another program writes: both would give the same numbers to different keyframes."""
         newest = sql.execute("SELECT coalesce(max(session), 0) FROM sessions").fetchone()[0]
-        if self.session and newest > self._newest:
+        if self.session and newest > self._last_session:
             raise Dpm2Error(f"{self.path}: another program has begun to write to it")
 
     @property
@@ -164,11 +164,11 @@ class MapStore:
             Dpm2Error: it could not be written.
         """
         with self._transaction():
-            self._together = True
+            self._in_transaction = True
             try:
                 yield
             finally:
-                self._together = False
+                self._in_transaction = False
 
     def rows(self, table: str, columns: str = "", where: str = "") -> Iterator[tuple[Any, ...]]:
         """Rows of a table in their order, without checksums; `where`: an SQL condition.
@@ -195,8 +195,8 @@ class MapStore:
         Raises:
             Dpm2Error: it cannot be read, or is damaged.
         """
-        at = schema.CONTENT["payloads"].index(what)
-        return next((row[at] for row in self.rows("payloads", where=f"node = {node:d}")), None)
+        column = schema.CONTENT["payloads"].index(what)
+        return next((row[column] for row in self.rows("payloads", where=f"node = {node:d}")), None)
 
     @property
     def weights(self) -> list[str]:
@@ -214,7 +214,7 @@ class MapStore:
             with suppress(sqlite3.Error):  # with a reader, or a full disk, FILE-wal stays, and nothing is lost
                 self._connection.execute("PRAGMA busy_timeout = 200")
                 self._connection.execute("PRAGMA journal_mode = DELETE")
-        self._opened.close()
+        self._map_connection.close()
 
     def __enter__(self) -> MapStore:
         return self
@@ -259,7 +259,7 @@ class MapStore:
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with explained(self.path):
-            if self._together:
+            if self._in_transaction:
                 yield self._connection
                 return
             self._connection.execute("BEGIN IMMEDIATE")

@@ -25,9 +25,9 @@ FARTHEST = 1e7
 """m from the origin: beyond, float32 clouds are meters off. All poses of a map are nearer."""
 MAX_ID = 2**31 - 1
 """Largest id of a keyframe, and of any other count: the next one still fits into all formats."""
-_LONGEST_NAME = 255
-_DESCRIPTORS = struct.Struct("<IIB")  # number, channels, sum of the bits of the arrays that follow
-_AXES, _UP, _SCALE, _STEPS = 1, 2, 4, 8  # there are always steps
+_MAX_NAME_LENGTH = 255
+_DESCRIPTORS_HEADER = struct.Struct("<IIB")  # number, channels, sum of the bits of the arrays that follow
+_HAS_AXES, _HAS_UP, _HAS_SCALE, _HAS_STEPS = 1, 2, 4, 8  # there are always steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +92,9 @@ def why_no_pose(T: Array) -> str:
 def pack_descriptors(d: Descriptors) -> bytes:
     """xyz float32, features int8, steps float32; axes, up, and a scale other than 1, float32, if available."""
     scale = None if d.scale == 1 else np.array([d.scale])
-    others = {_AXES: d.axis, _UP: d.up, _SCALE: scale}
-    parts = _STEPS + sum(bit for bit, part in others.items() if part is not None)
-    head = _DESCRIPTORS.pack(len(d), d.features.shape[1], parts)
+    others = {_HAS_AXES: d.axis, _HAS_UP: d.up, _HAS_SCALE: scale}
+    parts = _HAS_STEPS + sum(bit for bit, part in others.items() if part is not None)
+    head = _DESCRIPTORS_HEADER.pack(len(d), d.features.shape[1], parts)
     rest = [np.ascontiguousarray(part, "<f4") for part in (d.step, *others.values()) if part is not None]
     arrays = np.ascontiguousarray(d.xyz, "<f4"), np.ascontiguousarray(d.features, "i1"), *rest
     return head + b"".join(array.tobytes() for array in arrays)
@@ -106,20 +106,25 @@ def unpack_descriptors(data: bytes) -> Descriptors:
     Raises:
         ValueError: the bytes are not descriptors.
     """
-    if len(data) < _DESCRIPTORS.size:
+    if len(data) < _DESCRIPTORS_HEADER.size:
         raise ValueError("no descriptors: too few bytes")
-    n, channels, parts = _DESCRIPTORS.unpack_from(data)
-    axes, tilted, scaled = (bool(parts & bit) for bit in (_AXES, _UP, _SCALE))
-    sizes = 12 * n, n * channels, 4 * n, 8 * n * axes, 12 * tilted, 4 * scaled
-    end = list(accumulate(sizes, initial=_DESCRIPTORS.size))
-    if len(data) != end[-1] or not n or not channels or not _STEPS <= parts <= _STEPS + _SCALE + _UP + _AXES:
+    n, channels, parts = _DESCRIPTORS_HEADER.unpack_from(data)
+    has_axes, has_up, has_scale = (bool(parts & bit) for bit in (_HAS_AXES, _HAS_UP, _HAS_SCALE))
+    sizes = 12 * n, n * channels, 4 * n, 8 * n * has_axes, 12 * has_up, 4 * has_scale
+    end = list(accumulate(sizes, initial=_DESCRIPTORS_HEADER.size))
+    if (
+        len(data) != end[-1]
+        or not n
+        or not channels
+        or not _HAS_STEPS <= parts <= _HAS_STEPS + _HAS_SCALE + _HAS_UP + _HAS_AXES
+    ):
         raise ValueError(f"no descriptors: {len(data)} bytes for {n} of {channels}")
     xyz = np.frombuffer(data, "<f4", 3 * n, end[0]).reshape(n, 3).copy()
     features = np.frombuffer(data, "i1", n * channels, end[1]).reshape(n, channels).copy()
     step = np.frombuffer(data, "<f4", n, end[2]).copy()
-    axis = np.frombuffer(data, "<f4", 2 * n, end[3]).reshape(n, 2).copy() if axes else None
-    up = np.frombuffer(data, "<f4", 3, end[4]).copy() if tilted else None
-    scale = float(np.frombuffer(data, "<f4", 1, end[5])[0]) if scaled else 1.0
+    axis = np.frombuffer(data, "<f4", 2 * n, end[3]).reshape(n, 2).copy() if has_axes else None
+    up = np.frombuffer(data, "<f4", 3, end[4]).copy() if has_up else None
+    scale = float(np.frombuffer(data, "<f4", 1, end[5])[0]) if has_scale else 1.0
     if not 1e-2 < scale < 1e2:  # False for NaN
         raise ValueError(f"no descriptors: a scale of {scale:g}")
     if not all(np.isfinite(part).all() for part in (xyz, step, axis, up) if part is not None):
@@ -137,8 +142,10 @@ def with_crc(*values: Any) -> tuple[Any, ...]:
 def keyframe_row(node: int, keyframe: Keyframe, session: int, loan: Loan | None) -> tuple[Any, ...]:
     """A row of table `keyframes`; `session`: the one that is being written."""
     k = keyframe
-    lent = (None, None) if loan is None else (int(loan.lender), array_bytes(loan.T_kf_lender))
-    return with_crc(node, k.id, k.robot, k.session or session, k.stamp, k.index, array_bytes(k.T_odom_kf), *lent)
+    loan_columns = (None, None) if loan is None else (int(loan.lender), array_bytes(loan.T_kf_lender))
+    return with_crc(
+        node, k.id, k.robot, k.session or session, k.stamp, k.index, array_bytes(k.T_odom_kf), *loan_columns
+    )
 
 
 def keyframe_of(row: tuple[Any, ...]) -> tuple[int, Keyframe, Loan | None]:
@@ -266,8 +273,8 @@ def _check_types(numbers: tuple[Any, ...], name: Any = "") -> None:
     """Raises ValueError unless they are integers and a name of limited length: SQLite columns accept any type."""
     if not all(isinstance(number, int) for number in numbers):
         raise ValueError("not a whole number where one is expected")
-    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
-        raise ValueError(f"no name, or one of more than {_LONGEST_NAME} characters")
+    if not isinstance(name, str) or len(name) > _MAX_NAME_LENGTH:
+        raise ValueError(f"no name, or one of more than {_MAX_NAME_LENGTH} characters")
 
 
 def _check_counts(*numbers: Any) -> None:

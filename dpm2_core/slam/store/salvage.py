@@ -21,8 +21,8 @@ from dpm2_core.slam.store.cloud_store import CloudStore, Loan
 from dpm2_core.slam.store.map_data import MapData, odometry_by_node, subset
 from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
-_SMALLEST = 20  # bytes of a row: limits the number of rows, so that a small file cannot have a row 2^62
-_HIDDEN = 30_000  # consecutive rows that one damaged page of a tree can hide
+_MIN_ROW_BYTES = 20  # limits the number of rows, so that a small file cannot have a row 2^62
+_MAX_HIDDEN_ROWS = 30_000  # consecutive rows that one damaged page of a tree can hide
 _BRIDGE_COVARIANCE = isotropic(0.05, 0.5)  # of an edge that bridges a lost keyframe
 
 
@@ -47,95 +47,99 @@ class Salvage:
 
     def __init__(self, sql: sqlite3.Connection, size: int, findings: Findings) -> None:
         """`size`: file size, bytes."""
-        self._sql, self._most, self._findings = sql, size // _SMALLEST, findings
-        self._last = {table: self._last_row(table) for table in schema.CONTENT}
+        self._sql, self._max_rows, self._findings = sql, size // _MIN_ROW_BYTES, findings
+        self._last_rows = {table: self._find_last_row(table) for table in schema.CONTENT}
 
     def run(self) -> MapData:
         """All good data, without gaps."""
-        keyframes, loans = self._keyframes()
-        poses = self._poses(keyframes)
+        keyframes, loans = self._read_keyframes()
+        poses = self._read_poses(keyframes)
         good = sorted(keyframes)
         last = max(good, default=-1) + 1
         moving: list[bytes | None] = [None] * last
-        for node, mask in self._rows("moving"):
-            with self._noted(f"keyframe {node}: its mask of moving points is lost"):
-                if node in keyframes and (cloud := self._payload(node)[0]) is not None:
+        for node, mask in self._read_rows("moving"):
+            with self._recording(f"keyframe {node}: its mask of moving points is lost"):
+                if node in keyframes and (cloud := self._read_payload(node)[0]) is not None:
                     unpack_mask(mask, len(unpack_cloud(cloud)))
                     moving[node] = mask
-        self._fixes(keyframes)
-        edges = self._edges(keyframes)
-        trail = self._trail(keyframes)
+        self._assign_fixes(keyframes)
+        edges = self._read_edges(keyframes)
+        trail = self._read_trail(keyframes)
         # A map with the old numbers and gaps; the good nodes are then taken from it.
-        nothing = pack_cloud(NO_POINTS)
+        empty_cloud = pack_cloud(NO_POINTS)
         filler = Keyframe(0, 0, 0, np.eye(4), NO_POINTS, session=1)
-        whole = MapData(
+        with_gaps = MapData(
             [keyframes.get(node, filler) for node in range(last)],
             np.array([poses.get(node, np.eye(4)) for node in range(last)]).reshape(-1, 4, 4),
             [],
             [],
-            self._sessions(keyframes),
-            CloudStore(lambda node: self._payload(node)[0] or (None if node in loans else nothing), moving, loans),
-            lambda node: self._payload(node)[2],
-            georeference=self._georeference(),
+            self._read_sessions(keyframes),
+            CloudStore(
+                lambda node: self._read_payload(node)[0] or (None if node in loans else empty_cloud), moving, loans
+            ),
+            lambda node: self._read_payload(node)[2],
+            georeference=self._read_georeference(),
         )
-        return subset(whole, good, edges, trail)
+        return subset(with_gaps, good, edges, trail)
 
-    def _keyframes(self) -> tuple[dict[int, Keyframe], dict[int, Loan]]:
+    def _read_keyframes(self) -> tuple[dict[int, Keyframe], dict[int, Loan]]:
         keyframes: dict[int, Keyframe] = {}
         loans: dict[int, Loan] = {}
-        for row in self._rows("keyframes"):
-            with self._noted(f"keyframe {row[0]}"):
+        for row in self._read_rows("keyframes"):
+            with self._recording(f"keyframe {row[0]}"):
                 node, keyframes[row[0]], loan = rows.keyframe_of(row)
                 if loan is not None:
                     loans[node] = loan
-        end = max(self._last[table] for table in ("keyframes", "payloads", "poses")) + 1
+        end = max(self._last_rows[table] for table in ("keyframes", "payloads", "poses")) + 1
         if missing := sorted(set(range(end)) - keyframes.keys()):
-            self._problem(f"keyframes lost: {_listed(missing)}")
+            self._report(f"keyframes lost: {_format_numbers(missing)}")
             self._findings.lost = len(missing)
         for node, loan in list(loans.items()):
             if loan.lender not in keyframes or loan.lender in loans:
-                self._problem(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
+                self._report(f"keyframe {node}: borrows the cloud of {loan.lender}, which is lost or has none")
                 del loans[node]
         for node in loans:
-            with self._noted(f"keyframe {node}: its own cloud is lost"):
-                if (payload := self._row("payloads", node)) is not None:
+            with self._recording(f"keyframe {node}: its own cloud is lost"):
+                if (payload := self._read_row("payloads", node)) is not None:
                     unpack_cloud(payload[1])
-        without = [node for node in keyframes if node not in loans and self._payload(node, complain=True)[0] is None]
-        self._findings.lost_clouds = len(without)
-        for node in keyframes.keys() - set(without) - loans.keys():
-            packed = self._payload(node)[1]
+        without_cloud = [
+            node for node in keyframes if node not in loans and self._read_payload(node, complain=True)[0] is None
+        ]
+        self._findings.lost_clouds = len(without_cloud)
+        for node in keyframes.keys() - set(without_cloud) - loans.keys():
+            packed = self._read_payload(node)[1]
             descriptors = None if packed is None else rows.unpack_descriptors(packed)
             keyframes[node] = replace(keyframes[node], descriptors=descriptors)
         return keyframes, loans
 
-    def _payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
+    def _read_payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
         """Packed cloud, descriptors and thumbnail of a node, if they are good."""
         try:
-            row = self._row("payloads", node)
+            row = self._read_row("payloads", node)
             if row is None:
                 raise ValueError("none there")
             unpack_cloud(row[1])
             if row[2] is not None:
                 rows.unpack_descriptors(row[2])
-            return row[1], row[2], self._thumbnail(node, row[3], complain)
+            return row[1], row[2], self._check_thumbnail(node, row[3], complain)
         except (ValueError, TypeError) as error:
             if complain:
-                self._problem(f"keyframe {node}: its payload is lost: {error}")
+                self._report(f"keyframe {node}: its payload is lost: {error}")
             return None, None, None
 
-    def _thumbnail(self, node: int, jpeg: bytes | None, complain: bool) -> bytes | None:
+    def _check_thumbnail(self, node: int, jpeg: bytes | None, complain: bool) -> bytes | None:
         try:
             if jpeg is not None:
                 image_of(jpeg)
         except ValueError as error:
             if complain:
-                self._problem(f"keyframe {node}: {error}")
+                self._report(f"keyframe {node}: {error}")
             return None
         return jpeg
 
-    def _poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
+    def _read_poses(self, keyframes: dict[int, Keyframe]) -> dict[int, Array]:
         """T_map_kf by node; a lost one is computed from the previous keyframe by odometry."""
-        stored = dict(self._rows("poses"))
+        stored = dict(self._read_rows("poses"))
         poses: dict[int, Array] = {}
         T_map_odom = np.eye(4)
         for node in sorted(keyframes):
@@ -144,83 +148,83 @@ class Salvage:
                     raise ValueError("lost")
                 T = rows.pose_of(stored[node])
             except ValueError as error:
-                self._problem(f"keyframe {node}: its optimized pose is {error}")
+                self._report(f"keyframe {node}: its optimized pose is {error}")
                 T = T_map_odom @ keyframes[node].T_odom_kf
             poses[node] = T
             T_map_odom = T @ se3.inverse(keyframes[node].T_odom_kf)
         return poses
 
-    def _fixes(self, keyframes: dict[int, Keyframe]) -> None:
+    def _assign_fixes(self, keyframes: dict[int, Keyframe]) -> None:
         """Assign the good fixes to their keyframes."""
-        for row in self._rows("fixes"):
-            with self._noted(f"keyframe {row[0]}: its fix is lost"):
+        for row in self._read_rows("fixes"):
+            with self._recording(f"keyframe {row[0]}: its fix is lost"):
                 node, fix = rows.fix_of(row)
                 keyframes[node] = replace(keyframes[node], fix=fix)
 
-    def _georeference(self) -> Georeference | None:
-        for row in self._rows("georeference"):
-            with self._noted("georeference"):
+    def _read_georeference(self) -> Georeference | None:
+        for row in self._read_rows("georeference"):
+            with self._recording("georeference"):
                 return rows.georeference_of(row)
         return None
 
-    def _edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
+    def _read_edges(self, keyframes: dict[int, Keyframe]) -> list[Edge]:
         """Edges between existing keyframes, and edges that bridge lost ones."""
         edges, known = [], []
-        for row in self._rows("edges"):
-            with self._noted(f"edge {row[0]}"):
+        for row in self._read_rows("edges"):
+            with self._recording(f"edge {row[0]}"):
                 edge = rows.edge_of(row)
                 known.append(edge)
                 rows.check_ends(edge, keyframes)
                 edges.append(edge)
-        return [*edges, *self._bridges(known, keyframes)]
+        return [*edges, *self._bridge_gaps(known, keyframes)]
 
-    def _bridges(self, known: list[Edge], keyframes: dict[int, Keyframe]) -> Iterator[Edge]:
+    def _bridge_gaps(self, known: list[Edge], keyframes: dict[int, Keyframe]) -> Iterator[Edge]:
         """Odometry edges over the gaps of lost keyframes and edges.
 
         `known`: edges, also from and to lost keyframes. A node without an odometry edge to it begins a drive; if edges
         are lost, too, only if its frame count restarts.
         """
-        chain, some_lost = odometry_by_node(known), len(known) <= self._last["edges"]
-        tied = {edge.to_node for edge in known if edge.kind == "odometry" and edge.from_node in keyframes}
+        chain, some_lost = odometry_by_node(known), len(known) <= self._last_rows["edges"]
+        connected = {edge.to_node for edge in known if edge.kind == "odometry" and edge.from_node in keyframes}
         newest: dict[tuple[str, int], int] = {}
         for node, b in sorted(keyframes.items()):
             drive = b.robot, b.session
-            before, origin = newest.get(drive), _before(node, chain, keyframes)
+            previous, origin = newest.get(drive), _predecessor(node, chain, keyframes)
             newest[drive] = node
-            if before is None or node in tied:
+            if previous is None or node in connected:
                 continue
-            a = keyframes[before]
-            if origin == before or (origin is None and some_lost and a.index < b.index):
+            a = keyframes[previous]
+            if origin == previous or (origin is None and some_lost and a.index < b.index):
                 T_a_b = se3.inverse(a.T_odom_kf) @ b.T_odom_kf
-                yield Edge("odometry", before, node, Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge"))
+                yield Edge("odometry", previous, node, Registration(T_a_b, _BRIDGE_COVARIANCE, method="bridge"))
 
-    def _trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
+    def _read_trail(self, keyframes: dict[int, Keyframe]) -> list[RemovedKeyframe]:
         trail = []
-        for row in self._rows("trail"):
+        for row in self._read_rows("trail"):
             with suppress(ValueError):
                 if (pruned := rows.removed_of(row)).node in keyframes:
                     trail.append(pruned)
                     continue
-            self._problem(f"trail {row[0]}: not a pose relative to an existing keyframe")
+            self._report(f"trail {row[0]}: not a pose relative to an existing keyframe")
         return trail
 
-    def _sessions(self, keyframes: dict[int, Keyframe]) -> list[Session]:
+    def _read_sessions(self, keyframes: dict[int, Keyframe]) -> list[Session]:
         try:
             return [rows.session_of(row) for row in self._sql.execute("SELECT * FROM sessions ORDER BY session")]
         except (sqlite3.DatabaseError, ValueError) as error:
-            self._problem(f"sessions: {error}")
+            self._report(f"sessions: {error}")
             return [Session(number, "", "", "", "") for number in sorted({k.session for k in keyframes.values()})]
 
-    def _rows(self, table: str) -> Iterator[tuple[Any, ...]]:
+    def _read_rows(self, table: str) -> Iterator[tuple[Any, ...]]:
         """The good rows of a table, each read by its number, so that a damaged page costs only its own rows."""
-        for number in range(self._last[table] + 1):
+        for number in range(self._last_rows[table] + 1):
             row = None
-            with self._noted(f"{table} {number}"):
-                row = self._row(table, number)
+            with self._recording(f"{table} {number}"):
+                row = self._read_row(table, number)
             if row is not None:
                 yield row
 
-    def _row(self, table: str, number: int) -> tuple[Any, ...] | None:
+    def _read_row(self, table: str, number: int) -> tuple[Any, ...] | None:
         query = f"SELECT {', '.join(schema.CONTENT[table])}, crc FROM {table} WHERE rowid = ?"
         try:
             row = self._sql.execute(query, (number,)).fetchone()
@@ -236,26 +240,26 @@ class Salvage:
             raise ValueError("its checksum is wrong")
         return tuple(row[:-1])
 
-    def _last_row(self, table: str) -> int:
+    def _find_last_row(self, table: str) -> int:
         """Number of the last row of a table, -1 without any; if its end is damaged, of the first lost row."""
         with suppress(sqlite3.DatabaseError):
             first = self._sql.execute(f"SELECT coalesce(min(rowid), 0) FROM {table}").fetchone()[0]
             if first < 0:
-                self._problem(f"{table}: rows before 0, from {first}")
+                self._report(f"{table}: rows before 0, from {first}")
         try:
             last = int(self._sql.execute(f"SELECT coalesce(max(rowid), -1) FROM {table}").fetchone()[0])
         except sqlite3.DatabaseError:
-            lost = self._last_readable(table) + 1
-            self._problem(f"{table}: rows from {lost} on cannot be read, and how many there are is not known")
+            lost = self._find_last_readable(table) + 1
+            self._report(f"{table}: rows from {lost} on cannot be read, and how many there are is not known")
             return lost
-        if last > self._most:
-            self._problem(f"{table}: row number {last} in a file of at most {self._most} rows")
-        return min(last, self._most)
+        if last > self._max_rows:
+            self._report(f"{table}: row number {last} in a file of at most {self._max_rows} rows")
+        return min(last, self._max_rows)
 
-    def _last_readable(self, table: str) -> int:
+    def _find_last_readable(self, table: str) -> int:
         """Searched from the first row upward, since the path to the last one leads through the damage."""
         last, number = -1, 0
-        while number <= min(last + _HIDDEN, self._most):
+        while number <= min(last + _MAX_HIDDEN_ROWS, self._max_rows):
             with suppress(sqlite3.DatabaseError):
                 if self._sql.execute(f"SELECT 1 FROM {table} WHERE rowid = ?", (number,)).fetchone():
                     last = number
@@ -263,22 +267,22 @@ class Salvage:
         return last
 
     @contextmanager
-    def _noted(self, what: str) -> Iterator[None]:
+    def _recording(self, what: str) -> Iterator[None]:
         """Record errors in this block as a problem and continue."""
         try:
             yield
         except (ValueError, TypeError, KeyError) as error:
-            self._problem(f"{what}: {error}")
+            self._report(f"{what}: {error}")
 
-    def _problem(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self._findings.problems.append(text)
 
 
-def _listed(numbers: list[int]) -> str:
+def _format_numbers(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
 
 
-def _before(node: int, chain: Mapping[int, Edge], there: Container[int]) -> int | None:
+def _predecessor(node: int, chain: Mapping[int, Edge], there: Container[int]) -> int | None:
     """The existing node from which odometry leads to another one, over lost ones; None if a drive begins there."""
     while node in chain:
         node = chain[node].from_node

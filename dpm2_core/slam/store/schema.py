@@ -139,8 +139,8 @@ def row_crc(*values: bytes | str | int | float | None) -> int:
 
 def create(connection: sqlite3.Connection) -> None:
     """Make an empty map in an empty database, whole or not at all."""
-    about = f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {VERSION};"
-    connection.executescript(f"BEGIN; {SCHEMA} {about} COMMIT;")
+    pragmas = f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {VERSION};"
+    connection.executescript(f"BEGIN; {SCHEMA} {pragmas} COMMIT;")
 
 
 def check(connection: sqlite3.Connection, path: Path) -> None:

@@ -31,7 +31,7 @@ class MapWriter:
         """`poses` (N, 4, 4) are those in the file."""
         self.problem = ""
         self._store, self._clouds = store, clouds
-        self._written = poses
+        self._written_poses = poses
         self._keyframes: list[tuple[int, Keyframe, bytes | None]] = []
         self._edges: list[Edge] = []
         self._moving: set[int] = set()
@@ -59,7 +59,7 @@ class MapWriter:
             while len(self._keyframes) > _BATCH:
                 self._write(self._keyframes[:_BATCH], poses, georeference)
             self._write(self._keyframes, poses, georeference)
-            self._rewrite(judged)
+            self._update_loops(judged)
             self.problem = "" if self._store.in_place else f"{self._store.path}: removed or moved since it was opened"
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
@@ -68,14 +68,14 @@ class MapWriter:
         self, keyframes: list[tuple[int, Keyframe, bytes | None]], poses: Array, georeference: Georeference | None
     ) -> None:
         """Write the first of the new keyframes, with all changes of them and of earlier ones."""
-        ends = max([len(self._written), *(node + 1 for node, *_ in keyframes)])
+        ends = max([len(self._written_poses), *(node + 1 for node, *_ in keyframes)])
         change, poses = Change(georeference=georeference), poses[:ends]
         for node, keyframe, thumbnail in keyframes:
             change.keyframes.append((node, keyframe, self._clouds.packed(node), thumbnail))
             if (loan := self._clouds.loan(node)) is not None:
                 change.loans[node] = loan
         change.edges = [edge for edge in self._edges if max(edge.from_node, edge.to_node) < ends]
-        change.poses = self._moved(poses)
+        change.poses = self._moved_poses(poses)
         masks = {node: self._clouds.moving(node) for node in self._moving if node < ends}
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
         if len(keyframes) == len(self._keyframes):  # else the keyframes that replace them are not in the file yet
@@ -88,27 +88,27 @@ class MapWriter:
         self._moving -= masks.keys()
         self._given_up -= set(change.given_up)
         written = poses.copy()
-        still = [node for node in range(min(len(self._written), len(written))) if node not in change.poses]
-        written[still] = self._written[still]  # small moves add up until they are written
-        self._written = written
+        unchanged = [node for node in range(min(len(self._written_poses), len(written))) if node not in change.poses]
+        written[unchanged] = self._written_poses[unchanged]  # small moves add up until they are written
+        self._written_poses = written
 
-    def _rewrite(self, judged: Sequence[Edge]) -> None:
+    def _update_loops(self, judged: Sequence[Edge]) -> None:
         """Update the verdicts of loops in the file."""
         # Identified by the measurement, too: the search may have rejected another loop of the same two keyframes.
-        now = {_key(loop): loop for loop in judged if loop.kind == "loop"}
-        rows = self._store.rows("edges", where="kind = 'loop'") if now else ()
+        judged_by_key = {_loop_key(loop): loop for loop in judged if loop.kind == "loop"}
+        rows = self._store.rows("edges", where="kind = 'loop'") if judged_by_key else ()
         # The last of equal keys: a loop that waited for a second one has two rows, rejected and later accepted.
-        file = {_key(edge): (int(row[0]), edge) for row in rows for edge in [edge_of(row)]}
-        known = [(number, loop, now[key]) for key, (number, loop) in file.items() if key in now]
+        stored = {_loop_key(edge): (int(row[0]), edge) for row in rows for edge in [edge_of(row)]}
+        known = [(number, loop, judged_by_key[key]) for key, (number, loop) in stored.items() if key in judged_by_key]
         if changed := {number: new for number, loop, new in known if new.ok != loop.ok}:
             self._store.write(Change(judged=changed))
 
-    def _moved(self, poses: Array) -> dict[int, Array]:
+    def _moved_poses(self, poses: Array) -> dict[int, Array]:
         """Poses that are not in the file, by node."""
-        known = min(len(self._written), len(poses))
-        moved = np.abs(poses[:known] - self._written[:known]).max((1, 2), initial=0.0) > STILL
+        known = min(len(self._written_poses), len(poses))
+        moved = np.abs(poses[:known] - self._written_poses[:known]).max((1, 2), initial=0.0) > STILL
         return {int(node): poses[node] for node in (*np.flatnonzero(moved), *range(known, len(poses)))}
 
 
-def _key(loop: Edge) -> tuple[int, int, bytes]:
+def _loop_key(loop: Edge) -> tuple[int, int, bytes]:
     return loop.from_node, loop.to_node, array_bytes(loop.T_from_to)
