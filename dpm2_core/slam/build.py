@@ -146,11 +146,11 @@ def make_tiled_localizer(s: SlamSettings, tiles: TiledMap) -> Localizer:
     """
     verifiers, network = _verifiers(s), _network(s)
 
-    def around(data: MapData) -> Relocalizer:
+    def make_relocalizer(data: MapData) -> Relocalizer:
         known = KnownMap(data.keyframes, data.clouds.item, data.poses, data.thumbnail)
         return Relocalizer(s.relocalise, s.visual, verifiers, network, known)
 
-    relocalizer = TiledRelocalizer(s.relocalise, tiles, around, PlaceRecognition(network).descriptors)
+    relocalizer = TiledRelocalizer(s.relocalise, tiles, make_relocalizer, PlaceRecognition(network).descriptors)
     return Localizer(relocalizer)
 
 
@@ -170,8 +170,8 @@ def make_loops(s: SlamSettings) -> LoopCloser:
         UsageError: the network has no weights.
     """
     described = s.loops.enabled and s.loops.descriptors
-    ways = ByScale(*((one.loops, make_verifier(one)) for one in (s, s.indoors())))
-    return LoopCloser(ways, _network(s) if described else None)
+    by_scene = ByScale(*((one.loops, make_verifier(one)) for one in (s, s.indoors())))
+    return LoopCloser(by_scene, _network(s) if described else None)
 
 
 def _network(s: SlamSettings) -> DeepPointMap2:

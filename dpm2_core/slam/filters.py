@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does 
     from dpm2_core.network.perception.dynamic_objects import DynamicObjectNet
     from dpm2_core.network.perception.gndnet import GroundNet
 
-_MOST = 0.7  # fraction of a scan that is removed as moving at most: the most likely points
+_MAX_REMOVED = 0.7  # fraction of a scan that is removed as moving at most: the most likely points
 FilterKind = Literal["none", "movers", "ground", "static"]
 
 
@@ -52,7 +52,7 @@ def without_dynamic_objects(net: DynamicObjectNet, points: Points) -> NDArray[np
         return np.zeros(0, bool)
     probability = net.probability(points)
     # If hardly anything else is left, the network is wrong or lacks information: part of a scan is still a scan.
-    bound = max(DYNAMIC, float(np.quantile(probability, 1 - _MOST)))
+    bound = max(DYNAMIC, float(np.quantile(probability, 1 - _MAX_REMOVED)))
     return np.asarray(probability <= bound)
 
 
@@ -107,10 +107,10 @@ def make_filter(settings: FilterSettings, threads: int) -> PointFilter | None:
     """
     if settings.kind == "none":
         return None
-    return partial(in_level_axes, _named(settings, filter_weights(settings), threads))
+    return partial(in_level_axes, _load_filter(settings, filter_weights(settings), threads))
 
 
-def _named(settings: FilterSettings, path: Path, threads: int) -> PointFilter:
+def _load_filter(settings: FilterSettings, path: Path, threads: int) -> PointFilter:
     """The filter with the weights of a file, for scans in level axes."""
     if settings.kind == "movers":
         from dpm2_core.network.perception import dynamic_objects

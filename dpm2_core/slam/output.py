@@ -25,11 +25,11 @@ class TrajectoryRecorder:
         self.index: list[int] = []
         self.breaks = 0  # of the odometry, see `OdometryResult`
         self._T_odom_lidar: list[Array] = []
-        self._keyframe: list[int] = []  # position of each keyframe among the frames
-        self._known = 0  # position of the last registered frame
-        self._begun: int | None = None  # of the first frame after it that was at least compared with a map
-        self._ended: list[int] = []  # the last frame before each break, the end of a known trajectory
-        self._began: list[int] = []  # the first frame after each break
+        self._keyframe_at: list[int] = []  # position of each keyframe among the frames
+        self._last_registered = 0  # its position
+        self._first_compared: int | None = None  # of the first frame after it that was at least compared with a map
+        self._last_before_break: list[int] = []  # the last frame before each break, the end of a known trajectory
+        self._first_after_break: list[int] = []  # the first frame after each break
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -37,20 +37,20 @@ class TrajectoryRecorder:
     @property
     def keyframes(self) -> int:
         """Number of frames that became keyframes."""
-        return len(self._keyframe)
+        return len(self._keyframe_at)
 
     def add(self, tracked: OdometryResult) -> None:
         """Add the result of the next frame."""
         position, registered = len(self), tracked.registration
-        if self._begun is None and (registered.ok or registered.method != "none"):
-            self._begun = position
-        if tracked.breaks > self.breaks and self._begun is not None:
-            self._ended.append(self._known)
-            self._began.append(self._begun)
+        if self._first_compared is None and (registered.ok or registered.method != "none"):
+            self._first_compared = position
+        if tracked.breaks > self.breaks and self._first_compared is not None:
+            self._last_before_break.append(self._last_registered)
+            self._first_after_break.append(self._first_compared)
         if registered.ok:
-            self._known, self._begun = position, None
+            self._last_registered, self._first_compared = position, None
         if tracked.keyframe is not None:
-            self._keyframe.append(position)
+            self._keyframe_at.append(position)
         self.breaks = tracked.breaks
         self.stamps.append(tracked.stamp)
         self.index.append(tracked.index)
@@ -59,15 +59,15 @@ class TrajectoryRecorder:
     @property
     def stretches(self) -> NDArray[np.intp]:
         """(N,) number of breaks before each frame; different numbers: related by loops only, if at all."""
-        return np.searchsorted(self._began, np.arange(len(self)), side="right")
+        return np.searchsorted(self._first_after_break, np.arange(len(self)), side="right")
 
     def poses(self, T_map_kf: Array) -> Array:
         """(N, 4, 4) T_map_lidar of all frames, given the (K, 4, 4) optimized poses of the keyframes."""
         T_odom_lidar = np.array(self._T_odom_lidar).reshape(-1, 4, 4)
-        if not self._keyframe:
+        if not self._keyframe_at:
             return T_odom_lidar
         at, keyframe = self._known_corrections()
-        corrections = T_map_kf @ se3.inverse(T_odom_lidar[self._keyframe])
+        corrections = T_map_kf @ se3.inverse(T_odom_lidar[self._keyframe_at])
         return corrected(T_odom_lidar, at, corrections[keyframe])
 
     def _known_corrections(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -76,8 +76,8 @@ class TrajectoryRecorder:
         Across a break the odometry is a guess: a loop may move the part after it by far more than the part before. So
         the frames at both sides are corrected like the nearest keyframe on their own side, if there is one.
         """
-        positions, known = np.array(self._keyframe, np.intp), {(at, kf) for kf, at in enumerate(self._keyframe)}
-        for first, last in zip([None, *self._began], [*self._ended, None], strict=True):
+        positions, known = np.array(self._keyframe_at, np.intp), {(at, kf) for kf, at in enumerate(self._keyframe_at)}
+        for first, last in zip([None, *self._first_after_break], [*self._last_before_break, None], strict=True):
             own = np.flatnonzero((positions >= (first or 0)) & (positions <= (len(self) if last is None else last)))
             if len(own) and first is not None:
                 known.add((first, int(own[0])))
@@ -120,9 +120,9 @@ def save_map(mapper: Mapper, directory: Path) -> None:
     """
     make_folder(directory)
     write_ply(directory / "map.ply", mapper.cloud())
-    ways: dict[str, list[int]] = {}
+    nodes_by_robot: dict[str, list[int]] = {}
     for node in np.flatnonzero(mapper.placed).tolist():
-        ways.setdefault(mapper.keyframes[node].robot, []).append(node)
-    nodes = [node for way in ways.values() for node in way]
+        nodes_by_robot.setdefault(mapper.keyframes[node].robot, []).append(node)
+    nodes = [node for own in nodes_by_robot.values() for node in own]
     write_tum(directory / "trajectory.tum", [mapper.keyframes[node].stamp for node in nodes], mapper.poses[nodes])
     mapper.graph.write_g2o(directory / "pose_graph.g2o")

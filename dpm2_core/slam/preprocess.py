@@ -103,8 +103,8 @@ class Preprocessor:
         if s.deskew and frame.time_offset is not None:
             points = deskew(points, frame.time_offset[used], motion, measured_turn(frame))
         if self._filter is not None:
-            left = self._filter(points)
-            points, used = points[left], used[left]
+            kept = self._filter(points)
+            points, used = points[kept], used[kept]
         return points, used
 
     def prepare(self, frame: Frame, motion: Array) -> Scan:
@@ -112,12 +112,12 @@ class Preprocessor:
         points, used = self.measured(frame, motion)
         first = voxel_first(points, self._settings.map_voxel)
         cloud = points[first]
-        few = voxel_first(cloud, self._settings.source_voxel)
-        scan = Scan(points, cloud, cloud[few, :3].astype(np.float64))
+        sparse = voxel_first(cloud, self._settings.source_voxel)
+        scan = Scan(points, cloud, cloud[sparse, :3].astype(np.float64))
         if frame.time_offset is None or not self._settings.deskew:
             return scan
-        which = used[first[few]]
-        seen, times = (part[which].astype(np.float64) for part in (frame.points[:, :3], frame.time_offset))
+        indices = used[first[sparse]]
+        seen, times = (part[indices].astype(np.float64) for part in (frame.points[:, :3], frame.time_offset))
         return replace(scan, seen=seen, times=times)
 
 

@@ -26,8 +26,8 @@ from dpm2_core.slam.store.map_store import MapStore
 
 MapMode = Literal["create", "resume", "extend", "localize"]
 """What to do with a map file: create it, continue an interrupted drive, add another drive, or only read it."""
-_COMPARED = 500  # points of a cloud
-_APART = 0.75
+_COMPARED_POINTS = 500  # points of a cloud
+_MAX_DISTANCE = 0.75
 """m, 75th percentile of the distances: for the same frame 0.01, or the de-skewing; for another frame at least 1.1."""
 _SAME_FRAME = isotropic(1e-4, 1e-3)  # rounding errors between two readings of the same frame
 
@@ -61,14 +61,14 @@ def open_session(path: Path | str, settings: SlamSettings, config: str, resume: 
             f"--map {path}: there is a file already; --resume goes on with its drive, --extend adds another"
         )
     # Without `resume` no file was there above; if another node has made one since, `create` rejects it.
-    there = resume and path.exists()
-    store = MapStore.open(path, read_only=False) if there else MapStore.create(path)
+    exists = resume and path.exists()
+    store = MapStore.open(path, read_only=False) if exists else MapStore.create(path)
     try:
         _check_weights(store, weights)
         store.begin_session(config, weights)
     except BaseException:
         store.close()
-        if not there:
+        if not exists:
             remove_map(path)
         raise
     return store
@@ -103,9 +103,9 @@ def check_for_localization(store: MapStore | TiledMap, settings: SlamSettings) -
 
 def _check_weights(store: MapStore | TiledMap, weights: str) -> None:
     """Reject descriptors of different weights: they cannot be compared; `weights` "": none are made."""
-    for before in store.weights if weights else ():
-        if before and before != weights:
-            raise UsageError(f"{store.path}: made with weights {before}, not with {weights}")
+    for used in store.weights if weights else ():
+        if used and used != weights:
+            raise UsageError(f"{store.path}: made with weights {used}, not with {weights}")
 
 
 def resume_at(mapper: Mapper, source: Source, start: int) -> int:
@@ -124,20 +124,20 @@ def resume_at(mapper: Mapper, source: Source, start: int) -> int:
     position = min(len(source) - 1, last.index - index_at(0))
     if position > 0 and index_at(position) != last.index:  # some scans are missing
         position = bisect_left(range(position), last.index, key=index_at)
-    seen = () if position < 0 else frames_in_order(source, position, position + 1, lambda number, stamp: None)
-    result = next(iter(seen), None)
-    if result is None or result.stamp != last.stamp:
+    frames = () if position < 0 else frames_in_order(source, position, position + 1, lambda number, stamp: None)
+    frame = next(iter(frames), None)
+    if frame is None or frame.stamp != last.stamp:
         raise UsageError(f"--resume: frame {last.index}, where the map ends, is not in {source.name}")
-    if not _shows(result, mapper.clouds[-1]):
+    if not _is_cloud_of(frame, mapper.clouds[-1]):
         raise UsageError(f"--resume: frame {last.index} of {source.name} is not the one with which the map ends")
     mapper.start_session(None, _SAME_FRAME)
     return position
 
 
-def _shows(frame: Frame, cloud: Points) -> bool:
+def _is_cloud_of(frame: Frame, cloud: Points) -> bool:
     """Whether a keyframe's cloud (M, 4) is of that frame. Stamps are not enough: all synthetic drives begin at 0."""
     points = frame.points[returned(frame.points)][:, :3]
     if not len(points) or not len(cloud):
         return True
-    apart, _ = cKDTree(points).query(cloud[:: -(-len(cloud) // _COMPARED), :3])
-    return bool(np.percentile(apart, 75) <= _APART)
+    distances, _ = cKDTree(points).query(cloud[:: -(-len(cloud) // _COMPARED_POINTS), :3])
+    return bool(np.percentile(distances, 75) <= _MAX_DISTANCE)

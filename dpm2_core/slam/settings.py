@@ -59,7 +59,7 @@ class SlamSettings(Settings):
     @classmethod
     def _with_preset(cls, given: Any) -> Any:
         """The changes of the preset, overridden by the given values."""
-        changes = _changes(given.get("preset")) if isinstance(given, Mapping) else {}
+        changes = _preset_changes(given.get("preset")) if isinstance(given, Mapping) else {}
         if not changes:
             return given
         values = {k: v.model_dump(exclude_unset=True) if isinstance(v, Settings) else v for k, v in given.items()}
@@ -81,11 +81,11 @@ class SlamSettings(Settings):
         """
         if self.preset != "auto":
             return self
-        room = merged(_changes("indoor"), self.model_dump(exclude_defaults=True))
-        part = room["preprocess"]
-        part["source_voxel"] = max(part["source_voxel"], part["map_voxel"])
-        if part["min_range"] >= part["max_range"]:
-            part["max_range"] = self.preprocess.max_range
+        room = merged(_preset_changes("indoor"), self.model_dump(exclude_defaults=True))
+        preprocess = room["preprocess"]
+        preprocess["source_voxel"] = max(preprocess["source_voxel"], preprocess["map_voxel"])
+        if preprocess["min_range"] >= preprocess["max_range"]:
+            preprocess["max_range"] = self.preprocess.max_range
         return SlamSettings.model_validate({**room, "preset": "indoor"})
 
     @property
@@ -98,7 +98,7 @@ class SlamSettings(Settings):
         return weights_id(self.neural.weights) if self.uses_descriptors else ""
 
 
-def _changes(preset: Any) -> dict[str, Any]:
+def _preset_changes(preset: Any) -> dict[str, Any]:
     """The changes of a preset; empty if there is no preset with that name."""
     named = preset in get_args(SlamSettings.model_fields["preset"].annotation)[1:]
     return read_yaml(Path(__file__).with_name("presets") / f"{preset}.yaml") if named else {}

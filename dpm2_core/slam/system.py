@@ -21,8 +21,8 @@ from dpm2_core.slam.loops.localizer import LocalizationResult, Localizer
 from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.odometry.odometry import Odometry
 
-_TIES = 100  # no more loops are found during a frame
-_LOST_ON_THE_WAY = 10_000_000_000  # ns after which a keyframe that has not reached the map is taken as lost
+_MAX_NEW_LOOPS = 100  # no more loops are found during a frame
+_KEYFRAME_TIMEOUT = 10_000_000_000  # ns after which a keyframe that has not reached the map is taken as lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +90,9 @@ class Slam:
         self._parts = SweepParts()
         self._last: OdometryResult | None = None  # of a whole sweep
         self._T_map_odom: Array | None = None  # of the map that grows, valid until the next keyframe
-        self._underway: int | None = None  # stamp of the keyframe that has not reached the map yet
+        self._pending_stamp: int | None = None  # stamp of the keyframe that has not reached the map yet
         # Pairs of odometry keyframe ids that loops connected since its last step; with a localizer there are none.
-        self._tied: deque[tuple[int, int]] = deque(maxlen=_TIES)
+        self._new_loops: deque[tuple[int, int]] = deque(maxlen=_MAX_NEW_LOOPS)
 
     @property
     def uses_images(self) -> bool:
@@ -118,26 +118,26 @@ class Slam:
         sweep = self._parts.join(frame)
         if sweep is None and self._last is not None:
             return self.odometry.between(self._last, frame)
-        self._last = self._registered(sweep or frame)
+        self._last = self._process_sweep(sweep or frame)
         return self._last
 
-    def _registered(self, frame: Frame) -> OdometryResult:
+    def _process_sweep(self, frame: Frame) -> OdometryResult:
         """Of a frame that shows a whole sweep."""
-        localizer, underway = self.localizer, self._underway
-        arriving = underway is not None and abs(frame.stamp - underway) < _LOST_ON_THE_WAY
-        if localizer is not None and not arriving and localizer.wants(frame.stamp):
+        localizer, pending_stamp = self.localizer, self._pending_stamp
+        is_pending = pending_stamp is not None and abs(frame.stamp - pending_stamp) < _KEYFRAME_TIMEOUT
+        if localizer is not None and not is_pending and localizer.wants(frame.stamp):
             self.odometry.request_keyframe()
         if localizer is not None and localizer.found is not None:
             self.odometry.cross_breaks(localizer.found)
-        while self._tied:
-            self.odometry.cross_breaks(*self._tied.popleft())
+        while self._new_loops:
+            self.odometry.cross_breaks(*self._new_loops.popleft())
         result = self.odometry.process(frame)
         if localizer is not None and result.state is State.LOST:
             localizer.odometry_lost(self.odometry.next_keyframe)
         if result.keyframe is None:
             return result
-        self._underway = frame.stamp
-        width = max(self._thumbnail_width, PLACE_WIDTH if self._asks_pictures(result) else 0)
+        self._pending_stamp = frame.stamp
+        width = max(self._thumbnail_width, PLACE_WIDTH if self._needs_image(result) else 0)
         image = next((image for image in frame.images if image.camera.name not in result.repeated), None)
         if image is None or not width:
             return result
@@ -149,7 +149,7 @@ class Slam:
         self.odometry.reset()
         self._parts, self._last = SweepParts(), None
 
-    def _asks_pictures(self, result: OdometryResult) -> bool:
+    def _needs_image(self, result: OdometryResult) -> bool:
         """Whether a keyframe is searched by its image, now or later, since its points do not determine its pose."""
         registration = result.registration
         return self._pictured is not None and (
@@ -165,26 +165,26 @@ class Slam:
             RejectedError: the keyframe is invalid; see `Mapper.add`.
         """
         self._T_map_odom = None
-        if keyframe.stamp == self._underway:
-            self._underway = None
+        if keyframe.stamp == self._pending_stamp:
+            self._pending_stamp = None
         if self.localizer is not None:
             return MapResult([], self.localizer.add(keyframe))
         loops = self.mapper.add(keyframe)
-        self._note_ties(keyframe, [loop for loop in loops if loop.ok])
+        self._note_loops(keyframe, [loop for loop in loops if loop.ok])
         return MapResult(loops)
 
-    def _note_ties(self, keyframe: Keyframe, loops: list[Edge]) -> None:
+    def _note_loops(self, keyframe: Keyframe, loops: list[Edge]) -> None:
         """Note the loops of the last keyframe that the graph keeps, by the odometry's ids: below 0 before its start."""
         offset = self.mapper.keyframes[-1].id - keyframe.id
         for loop in self.mapper.kept(loops):
             one, other = (self.mapper.keyframes[node] for node in (loop.from_node, loop.to_node))
             if one.robot == other.robot == keyframe.robot:
-                self._tied.append((other.id - offset, one.id - offset))
+                self._new_loops.append((other.id - offset, one.id - offset))
 
     def use(self, mapper: Mapper, localizer: Localizer | None) -> None:
         """Continue in another map."""
         self.mapper, self.localizer, self._T_map_odom = mapper, localizer, None
-        self._tied.clear()
+        self._new_loops.clear()
 
     def finish(self) -> None:
         """At the end of a drive: complete the map and its file."""
