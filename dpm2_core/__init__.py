@@ -83,16 +83,16 @@ _MODULES = {
     "slam.system": "Slam SlamResult",
 }
 """The public names by the module that defines them, as under TYPE_CHECKING above."""
-_PLACES = {name: module for module, names in _MODULES.items() for name in names.split()}
-__all__ = ["__version__", *_PLACES]
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = ["__version__", *_MODULE_OF]
 
 
 if not TYPE_CHECKING:  # with __getattr__, type checkers would accept any name of this module
 
     def __getattr__(name: str) -> object:
-        if name not in _PLACES:
+        if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+        value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
         globals()[name] = value  # next time it is found without this function
         return value
 

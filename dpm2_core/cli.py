@@ -79,8 +79,8 @@ GROUPS = {
 }
 """The commands as `dpm2 --help` groups them: function or Typer in `dpm2_core.commands`, MODULE:NAME, and the help."""
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
-_LAST = "This machine"
-_UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EPIPE)
+_LAST_GROUP = "This machine"
+_WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EPIPE)
 """Errors of a file that is already open, such as stdout; they name no file."""
 
 
@@ -106,19 +106,19 @@ def load_command(name: str) -> TyperCommand | TyperGroup:
     """Import a command of `COMMANDS`; add the option `--quiet` to it and its subcommands."""
     with importing():
         found = resolve_name(f"dpm2_core.commands.{COMMANDS[name][0]}")
-    command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _command(name, found)
+    command = typer.main.get_group(found) if isinstance(found, typer.Typer) else _to_command(name, found)
     for single in command.commands.values() if isinstance(command, TyperGroup) else (command,):
-        single.params.extend(_command("quiet", _quiet).params)
+        single.params.extend(_to_command("quiet", _quiet_option).params)
     return command
 
 
-def _command(name: str, function: Callable[..., Any]) -> TyperCommand:
+def _to_command(name: str, function: Callable[..., Any]) -> TyperCommand:
     single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     single.command(name)(function)
     return typer.main.get_command(single)  # type: ignore[return-value]
 
 
-def _quiet(
+def _quiet_option(
     quiet: Annotated[
         bool,
         typer.Option(
@@ -145,7 +145,7 @@ def _dpm2(context: typer.Context) -> None:
         typer.echo(context.get_help(), nl=False)
 
 
-@app.command(rich_help_panel=_LAST)
+@app.command(rich_help_panel=_LAST_GROUP)
 def version() -> None:
     """Print the version."""
     typer.echo(__version__)
@@ -156,13 +156,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     wait_passively()
     terminate_as_interrupt()
     try:
-        sys.exit(_status(arguments))
+        sys.exit(_exit_status(arguments))
     finally:
         if arguments is None:  # the process ends: Python need not search all imported objects for garbage once more
             gc.freeze()
 
 
-def _status(arguments: Sequence[str] | None) -> int:
+def _exit_status(arguments: Sequence[str] | None) -> int:
     args = None if arguments is None else list(arguments)
     try:
         code = exit_code(lambda: app(args=args, standalone_mode=False), "dpm2")
@@ -172,7 +172,7 @@ def _status(arguments: Sequence[str] | None) -> int:
     except typer.Abort:  # Ctrl-C that the command itself does not handle
         return 130
     except OSError as error:
-        if error.errno not in _UNWRITTEN:
+        if error.errno not in _WRITE_ERRORS:
             raise
         if error.errno != errno.EPIPE:  # on EPIPE the reader, such as `head`, has what it wanted
             print(f"dpm2: output could not be written: {error.strerror}", file=sys.stderr)

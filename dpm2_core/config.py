@@ -22,7 +22,7 @@ from dpm2_core.errors import UsageError, one_line
 T = TypeVar("T", bound="Settings")
 
 # PyYAML passes on the errors of int() and datetime(), and it is recursive.
-_NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
+_YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
 
 
 class _Loader(yaml.SafeLoader):
@@ -54,17 +54,17 @@ class Settings(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
+    def _reject_bool_as_number(cls, value: Any, info: ValidationInfo) -> Any:
         """Reject `true`, `yes` and `on` where a number is expected: pydantic accepts them as 1."""
         if isinstance(value, bool):
-            kinds = set(_kinds(cls.model_fields[info.field_name or ""].annotation))
+            kinds = set(_types_in(cls.model_fields[info.field_name or ""].annotation))
             if bool not in kinds and kinds & {int, float}:
                 raise ValueError("want a number")
         return value
 
     @field_validator("*", mode="before")
     @classmethod
-    def _over_the_default(cls, value: Any, info: ValidationInfo) -> Any:
+    def _merge_with_default(cls, value: Any, info: ValidationInfo) -> Any:
         """A part of which only some keys are given takes the others from the default of its field."""
         default = cls.model_fields[info.field_name or ""].default
         if isinstance(value, Mapping) and isinstance(default, Settings):
@@ -72,11 +72,11 @@ class Settings(BaseModel):
         return value
 
 
-def _kinds(annotation: Any) -> Iterator[Any]:
+def _types_in(annotation: Any) -> Iterator[Any]:
     """The types that an annotation allows, at any depth."""
     yield annotation
     for part in get_args(annotation):
-        yield from _kinds(part)
+        yield from _types_in(part)
 
 
 def load_settings(kind: type[T], path: Path | str | None = None, overrides: Sequence[str] = ()) -> T:
@@ -106,7 +106,7 @@ def settings_from(kind: type[T], tree: dict[str, Any], origin: dict[str, str] | 
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        raise UsageError("; ".join(_explain(kind, error, origin or {}, default))) from None
+        raise UsageError("; ".join(_messages(kind, error, origin or {}, default))) from None
 
 
 def dump_settings(settings: Settings) -> str:
@@ -134,7 +134,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         json.dumps(tree, default=str, skipkeys=True)  # rejects a mapping that contains itself through an alias
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
-    except _NOT_YAML as error:
+    except _YAML_ERRORS as error:
         raise UsageError(f"{path}: not valid YAML: {one_line(error)}") from None
     if tree is None:
         return {}
@@ -149,25 +149,25 @@ def read_settings(kind: type[Settings], path: Path) -> dict[str, Any]:
     Raises:
         UsageError: the file is missing or not a YAML mapping.
     """
-    return _said(kind, read_yaml(path))
+    return _without_implied(kind, read_yaml(path))
 
 
-def _said(kind: type[Settings], tree: dict[str, Any]) -> dict[str, Any]:
-    out = _without(tree, kind.implied(tree))
+def _without_implied(kind: type[Settings], tree: dict[str, Any]) -> dict[str, Any]:
+    out = _without_equal(tree, kind.implied(tree))
     for name, info in kind.model_fields.items():
         part = info.annotation
         if isinstance(part, type) and issubclass(part, Settings) and isinstance(out.get(name), dict):
-            out[name] = _said(part, out[name])
+            out[name] = _without_implied(part, out[name])
     return out
 
 
-def _without(tree: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def _without_equal(tree: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """A copy without the keys that have the same value in `values`, at any depth."""
     out: dict[str, Any] = {}
     for key, value in tree.items():
         other = values.get(key)
         if isinstance(value, dict) and isinstance(other, dict):
-            out[key] = _without(value, other)
+            out[key] = _without_equal(value, other)
         elif key not in values or value != other or isinstance(value, bool) != isinstance(other, bool):
             out[key] = value
     return out
@@ -186,7 +186,7 @@ def value_of(text: str) -> Any:
     """The value of a setting, read as YAML; invalid YAML and numbers like 04 (a KITTI sequence) are strings."""
     try:
         return text.strip() if re.fullmatch(r"\s*0\d+\s*", text) else yaml.safe_load(text)
-    except _NOT_YAML:
+    except _YAML_ERRORS:
         return text
 
 
@@ -204,12 +204,12 @@ def put(kind: type[Settings] | None, tree: dict[str, Any], path: Sequence[str], 
         put(part, branch, keys, more)
 
 
-def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:
+def _messages(kind: type[Settings], error: ValidationError, origin: dict[str, str], default: str) -> Iterator[str]:
     """One message per key that names where the key was set; the branches of a union become `this or that`."""
     messages: dict[str, list[str]] = {}
     for e in error.errors():
         unknown = e["type"] == "extra_forbidden"
-        parts, allowed = _field(kind, e["loc"][:-1] if unknown else e["loc"])
+        parts, allowed = _locate_field(kind, e["loc"][:-1] if unknown else e["loc"])
         key = ".".join([*parts, str(e["loc"][-1])] if unknown else parts)
         where = next((origin[name] for name in reversed(origin) if _related(name, key)), default)
         if unknown:
@@ -220,7 +220,7 @@ def _explain(kind: type[Settings], error: ValidationError, origin: dict[str, str
     yield from (f"{key}: {' or '.join(branches)}" for key, branches in messages.items())
 
 
-def _field(kind: type[Settings], location: tuple[str | int, ...]) -> tuple[list[str], type[Settings]]:
+def _locate_field(kind: type[Settings], location: tuple[str | int, ...]) -> tuple[list[str], type[Settings]]:
     """Names and indices of a pydantic error location without its union branches, and the type they lead to."""
     parts = []
     for part in location:

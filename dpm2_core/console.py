@@ -50,9 +50,9 @@ class Lines(Progress):
         super().update(task_id, **fields)
         task = self._tasks[task_id]
         if task.total and task.percentage // 10 > before:
-            left = task.time_remaining
-            when = f", {left:.0f} s left" if left else ""
-            self.console.print(f"{task.description}: {task.completed:.0f}/{task.total:.0f}{when}", soft_wrap=True)
+            remaining = task.time_remaining
+            suffix = f", {remaining:.0f} s left" if remaining else ""
+            self.console.print(f"{task.description}: {task.completed:.0f}/{task.total:.0f}{suffix}", soft_wrap=True)
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
         """As rich's."""

@@ -18,8 +18,8 @@ from urllib.parse import quote
 
 MAX_VALUE = 64 << 20
 """Bytes of one value or row: the largest cloud takes a quarter of it."""
-_EVERY = 100_000  # steps of SQLite's virtual machine between two calls of the handler
-_STEPS = 30_000_000  # per statement, plus one per byte of the file: a second or two
+_STEPS_PER_CALL = 100_000  # steps of SQLite's virtual machine between two calls of the handler
+_MAX_STEPS = 30_000_000  # per statement, plus one per byte of the file: a second or two
 
 _COMPUTED = re.compile(r"\b(AS|VIRTUAL|CHECK|WHERE)\b", re.IGNORECASE)
 
@@ -30,35 +30,35 @@ class Connection(sqlite3.Connection):
     def __init__(self, database: str | Path, *arguments: Any, size: int = 0, **options: Any) -> None:
         """As `sqlite3.connect`; `size`: file size, bytes."""
         super().__init__(database, *arguments, **options)
-        self._steps = _Steps((_STEPS + size) // _EVERY)
+        self._steps = _StepLimit((_MAX_STEPS + size) // _STEPS_PER_CALL)
         self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE)
         self.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         self.execute("PRAGMA trusted_schema = OFF")
         self.execute("PRAGMA cell_size_check = ON")
-        self.set_progress_handler(self._steps, _EVERY)
+        self.set_progress_handler(self._steps, _STEPS_PER_CALL)
 
     def execute(self, *arguments: Any) -> sqlite3.Cursor:
-        self._steps.taken = 0
+        self._steps.calls = 0
         return super().execute(*arguments)
 
     def executemany(self, *arguments: Any) -> sqlite3.Cursor:
-        self._steps.taken = 0
+        self._steps.calls = 0
         return super().executemany(*arguments)
 
     def executescript(self, *arguments: Any) -> sqlite3.Cursor:
-        self._steps.taken = 0
+        self._steps.calls = 0
         return super().executescript(*arguments)
 
 
-class _Steps:
-    """Counts its calls; SQLite stops at the first call beyond `most`."""
+class _StepLimit:
+    """Counts its calls; SQLite stops at the first call beyond `max_calls`."""
 
-    def __init__(self, most: int) -> None:
-        self.taken, self._most = 0, most
+    def __init__(self, max_calls: int) -> None:
+        self.calls, self._max_calls = 0, max_calls
 
     def __call__(self) -> bool:
-        self.taken += 1
-        return self.taken > self._most
+        self.calls += 1
+        return self.calls > self._max_calls
 
 
 def size_with_log(path: Path) -> int:
@@ -86,14 +86,14 @@ def check_schema(connection: sqlite3.Connection, tables: Mapping[str, str]) -> N
     Raises:
         sqlite3.DatabaseError: a table is missing, unexpected or different, or the schema cannot be read.
     """
-    left = dict(tables)
+    missing = dict(tables)
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
-        if kind != "table" or name not in left:
+        if kind != "table" or name not in missing:
             raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into it")
-        if not isinstance(sql, str) or _bare(sql) != _bare(left.pop(name)):
+        if not isinstance(sql, str) or _normalized(sql) != _normalized(missing.pop(name)):
             raise sqlite3.DatabaseError(f"malformed: table {name} has other columns")
-    if left:
-        raise sqlite3.DatabaseError(f"malformed: no table {', '.join(left)}")
+    if missing:
+        raise sqlite3.DatabaseError(f"malformed: no table {', '.join(missing)}")
 
 
 def check_plain(path: Path) -> None:
@@ -105,7 +105,7 @@ def check_plain(path: Path) -> None:
     connection = connect(path, "ro")
     try:
         for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master"):
-            if kind not in ("table", "index") or _COMPUTED.search(_bare(sql or "")):
+            if kind not in ("table", "index") or _COMPUTED.search(_normalized(sql or "")):
                 raise sqlite3.DatabaseError(f"malformed: {kind} {name} does not belong into it")
     finally:
         connection.close()
@@ -117,6 +117,6 @@ def statements(script: str) -> dict[str, str]:
     return {statement.split(None, 3)[2]: statement for statement in found}
 
 
-def _bare(sql: str) -> str:
+def _normalized(sql: str) -> str:
     """Without comments and needless spaces. The expected text has no quotes: each `--` in an equal one is a comment."""
     return re.sub(r" ?([(),]) ?", r"\1", re.sub(r"\s+", " ", re.sub(r"--[^\n]*", " ", sql))).strip()

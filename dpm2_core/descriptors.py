@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.errors import Dpm2Error
 
-_LEVEL = np.cos(np.radians(5))  # smaller tilts are those of the road
+_MIN_LEVEL_COSINE = np.cos(np.radians(5))  # smaller tilts are those of the road
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,9 @@ class Descriptors:
         """The same descriptors in another frame; T (4, 4) is T_new_old."""
         R = T[:3, :3].astype(np.float32)
         up = None if self.up is None or is_level(R @ self.up) else R @ self.up
-        turn = R if self.up is None else R @ self.R_level_set.T
-        turn = turn if up is None else levelling(up) @ turn
-        axis = _turned(self.axes, turn.astype(np.float32))
+        rotation = R if self.up is None else R @ self.R_level_set.T
+        rotation = rotation if up is None else levelling(up) @ rotation
+        axis = _rotated(self.axes, rotation.astype(np.float32))
         xyz = self.xyz @ R.T + T[:3, 3].astype(np.float32)
         return replace(self, xyz=xyz, axis=axis, up=up)
 
@@ -107,7 +107,7 @@ def quantized(values: NDArray[np.floating]) -> tuple[NDArray[np.int8], NDArray[n
 
 def is_level(up: NDArray[np.floating]) -> bool:
     """Whether a unit vector (3,) is so close to the z axis that its frame counts as level."""
-    return bool(up[2] >= _LEVEL)
+    return bool(up[2] >= _MIN_LEVEL_COSINE)
 
 
 def levelling(up: NDArray[np.floating] | None) -> NDArray[np.float32]:
@@ -126,11 +126,11 @@ def levelling(up: NDArray[np.floating] | None) -> NDArray[np.float32]:
     return np.array(R, np.float32)
 
 
-def _turned(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.float32]:
+def _rotated(axis: NDArray[np.float32], R: NDArray[np.float32]) -> NDArray[np.float32]:
     """Horizontal unit vectors (N, 2) rotated by the heading of R (3, 3)."""
-    turned = axis @ R[:2, :2].T
-    turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
-    return turned
+    rotated = axis @ R[:2, :2].T
+    rotated /= np.maximum(np.linalg.norm(rotated, axis=1, keepdims=True), 1e-6)
+    return rotated
 
 
 class LazyDescriptors:
@@ -174,6 +174,6 @@ def merge(sets: Sequence[Descriptors]) -> Descriptors:
     up = next((s.up for s in sets if s.up is not None), None)
     axes = [s.axes for s in sets]
     if up is not None:  # each set estimated its own
-        axes = [_turned(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
+        axes = [_rotated(axis, levelling(up) @ s.R_level_set.T) for axis, s in zip(axes, sets, strict=True)]
     xyz, features, step = (np.concatenate([getattr(s, name) for s in sets]) for name in ("xyz", "features", "step"))
     return Descriptors(xyz, features, step, np.concatenate(axes), up, sets[0].scale)

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 
-_OF_PATHS = (errno.EACCES, errno.ENAMETOOLONG)  # already the check whether such a file exists raises these
+_PATH_ERRORS = (errno.EACCES, errno.ENAMETOOLONG)  # already the check whether such a file exists raises these
 
 
 class Dpm2Error(Exception):
@@ -30,7 +30,7 @@ def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
         return work() or 0
     except Exception as error:
         code, text = getattr(error, "exit_code", None), str(error)
-        if isinstance(error, OSError) and error.errno in _OF_PATHS and isinstance(error.filename, (str, bytes)):
+        if isinstance(error, OSError) and error.errno in _PATH_ERRORS and isinstance(error.filename, (str, bytes)):
             code, text = Dpm2Error.exit_code, f"{os.fsdecode(error.filename)}: {error.strerror}"
         if code is None:
             raise

@@ -69,12 +69,12 @@ def part_beside(path: Path) -> Path:
     Those of killed processes are removed, with the files that SQLite keeps next to them.
     """
     own, path = os.getpid(), path.resolve()
-    for left in path.parent.glob(".*.part*"):
+    for leftover in path.parent.glob(".*.part*"):
         # a map under construction is written through a part of its own, whose name is then that of a part of a part
-        part = re.fullmatch(rf"\.+{re.escape(path.name)}(?:\.\d+\.part)?\.(\d+)\.part(-\w+)?", left.name)
-        if part and (int(part[1]) == own or not _alive(int(part[1]))):
+        part = re.fullmatch(rf"\.+{re.escape(path.name)}(?:\.\d+\.part)?\.(\d+)\.part(-\w+)?", leftover.name)
+        if part and (int(part[1]) == own or not _is_alive(int(part[1]))):
             with suppress(OSError):
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
     return path.with_name(f".{path.name}.{own}.part")
 
 
@@ -118,7 +118,7 @@ def new_folder(path: Path, replace: bool = False) -> Iterator[Path]:
         shutil.rmtree(replaced, ignore_errors=True)
 
 
-def _alive(pid: int) -> bool:
+def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except PermissionError:
@@ -140,14 +140,14 @@ def write_json(path: Path | str, content: object) -> None:
 
 def json_text(content: object, indent: int = 2) -> str:
     """Content as JSON: numbers that are not finite become null, since JSON has no NaN, and paths become text."""
-    return json.dumps(_known(content), indent=indent, allow_nan=False, default=str) + "\n"
+    return json.dumps(_finite_or_null(content), indent=indent, allow_nan=False, default=str) + "\n"
 
 
-def _known(content: object) -> object:
+def _finite_or_null(content: object) -> object:
     if isinstance(content, dict):
-        return {key: _known(value) for key, value in content.items()}
+        return {key: _finite_or_null(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
-        return [_known(value) for value in content]
+        return [_finite_or_null(value) for value in content]
     return None if isinstance(content, float) and not isfinite(content) else content
 
 

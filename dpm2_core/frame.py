@@ -21,8 +21,8 @@ def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
     if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2:
         return False
     R = T[:3, :3]
-    off = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
-    return bool(off < tolerance and np.linalg.det(R) > 0)
+    deviation = np.abs(R @ R.T - np.eye(3)).max() + np.abs(T[3] - [0, 0, 0, 1]).max()
+    return bool(deviation < tolerance and np.linalg.det(R) > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,7 @@ class Fix:
 
     def __post_init__(self) -> None:
         shapes = (self.geodetic.shape, self.covariance.shape, self.antenna.shape)
-        if shapes != ((3,), (3, 3), (3,)) or not _on_earth(self.geodetic):
+        if shapes != ((3,), (3, 3), (3,)) or not _is_on_earth(self.geodetic):
             raise ValueError(f"fix: latitude, longitude, altitude {self.geodetic.tolist()} are no place on Earth")
         if not np.abs(self.antenna).max() <= 1e3:
             raise ValueError(f"fix: its antenna is at {self.antenna.tolist()} m")
@@ -186,11 +186,11 @@ class Georeference:
 
     def __post_init__(self) -> None:
         """Raises ValueError if the origin is not a place on Earth."""
-        if not _on_earth(self.origin):
+        if not _is_on_earth(self.origin):
             raise ValueError(f"latitude, longitude, altitude {self.origin.tolist()} are no place on Earth")
 
 
-def _on_earth(geodetic: Array) -> bool:
+def _is_on_earth(geodetic: Array) -> bool:
     return bool((np.abs(geodetic) <= (90, 360, 1e5)).all())  # NaN compares false
 
 

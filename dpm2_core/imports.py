@@ -14,10 +14,10 @@ def importing() -> Iterator[None]:
 
     Imports make some hundred thousand objects that stay, hardly any garbage, and each collection searches all of them.
     """
-    before = gc.isenabled()
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if before:
+        if was_enabled:
             gc.enable()

@@ -31,13 +31,13 @@ def hang_up_as_terminated() -> None:
     """From now on a terminal that is closed, or whose connection breaks, acts like one SIGTERM; output written to it
     afterwards is lost. A process that ignores SIGHUP, or does not receive it (`command &`, then `exit`), continues."""
     terminals = [stream for stream in range(3) if os.isatty(stream)]  # after the hang-up isatty is False
-    _outlive_terminal()
+    _survive_terminal()
     if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
         return
 
     def hung_up(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # system and shell both send it: the second would end it at once
-        _lead_nowhere(*terminals)
+        _redirect_to_null(*terminals)
         signal.raise_signal(signal.SIGTERM)
 
     signal.signal(signal.SIGHUP, hung_up)
@@ -52,11 +52,11 @@ class _Terminal(io.FileIO):
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-        _lead_nowhere(self.fileno())
+        _redirect_to_null(self.fileno())
         return super().write(data)
 
 
-def _outlive_terminal() -> None:
+def _survive_terminal() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None or stream is not getattr(sys, f"__{name}__") or not stream.isatty():
@@ -66,14 +66,14 @@ def _outlive_terminal() -> None:
         setattr(sys, name, io.TextIOWrapper(binary, stream.encoding, stream.errors, line_buffering=True))
 
 
-def _lead_nowhere(*streams: int) -> None:
-    nowhere = os.open(os.devnull, os.O_RDWR)
+def _redirect_to_null(*streams: int) -> None:
+    null = os.open(os.devnull, os.O_RDWR)
     for stream in streams:
-        os.dup2(nowhere, stream)
-    os.close(nowhere)
+        os.dup2(null, stream)
+    os.close(null)
 
 
-_taken: list[int] = []  # Ctrl-C counts of the `interrupt_deferred` blocks that are active, the innermost last
+_interrupt_counts: list[int] = []  # of the `interrupt_deferred` blocks that are active, the innermost last
 
 
 @contextmanager
@@ -88,24 +88,24 @@ def interrupt_deferred() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    level = len(_taken)
-    _taken.append(0)
-    _replace(signal.default_int_handler, _note)
+    level = len(_interrupt_counts)
+    _interrupt_counts.append(0)
+    _replace_handler(signal.default_int_handler, _count_interrupt)
     try:
-        yield lambda: _taken[level] > 0
+        yield lambda: _interrupt_counts[level] > 0
     finally:
-        del _taken[level:]
-        if not _taken:
-            _replace(_note, signal.default_int_handler)
+        del _interrupt_counts[level:]
+        if not _interrupt_counts:
+            _replace_handler(_count_interrupt, signal.default_int_handler)
 
 
-def _note(number: int, frame: FrameType | None) -> None:
-    _taken[-1] += 1
-    if _taken[-1] > 1:
+def _count_interrupt(number: int, frame: FrameType | None) -> None:
+    _interrupt_counts[-1] += 1
+    if _interrupt_counts[-1] > 1:
         signal.default_int_handler(number, frame)
 
 
-def _replace(handler: _Handler, other: _Handler) -> None:
+def _replace_handler(handler: _Handler, other: _Handler) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is handler:
             signal.signal(number, other)

@@ -60,9 +60,10 @@ class OfflineRun:
         self._config = config or Config()
         self._resources = ExitStack()
         self._truth: Array | Trajectory | None = None
-        self._ran = False
+        self._has_run = False
         map_file = None if map_file is None else Path(map_file)
-        self._begun = None if map_file is None or map_file.exists() else map_file  # a new map file without a frame yet
+        # A new map file without a frame yet.
+        self._new_map = None if map_file is None or map_file.exists() else map_file
         store = None if map_file is None else open_map(map_file, self._config, map_mode)
         if store is not None:
             self._resources.push(store)
@@ -89,8 +90,8 @@ class OfflineRun:
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         self.close()
-        if error is not None and self._begun is not None:
-            remove_map(self._begun)  # else the corrected command would fail, since the map file exists
+        if error is not None and self._new_map is not None:
+            remove_map(self._new_map)  # else the corrected command would fail, since the map file exists
 
     def __len__(self) -> int:
         """Number of frames to be processed."""
@@ -113,9 +114,9 @@ class OfflineRun:
         Raises:
             Dpm2Error: none of the scans could be read. UsageError: this object was run before.
         """
-        if self._ran:
+        if self._has_run:
             raise UsageError(f"{self.source.name}: it was run already; a second run needs another OfflineRun")
-        self._ran = True
+        self._has_run = True
         result = Result(self.source, self._config, self.slam.mapper, self._truth, self._truth_name)
         began, problems = perf_counter(), list[str]()
         with interrupt_deferred() as interrupted:
@@ -123,7 +124,7 @@ class OfflineRun:
                 corrected = partial(note_corrected, self.source.notes)
                 for frame in prefetch(frames_in_order(self.source, self._start, self._stop, corrected)):
                     if frame.problem is None:
-                        self._begun = None
+                        self._new_map = None
                     else:
                         problems.append(frame.problem)
                     step = self.slam.process(frame)
@@ -160,6 +161,6 @@ def span_of(source: Source, frames: Span) -> tuple[int, int]:
     """
     start, stop = frames[0], len(source) if frames[1] is None else min(frames[1], len(source))
     if start >= stop:
-        asked = f"{frames[0]}:{'' if frames[1] is None else frames[1]}"
-        raise UsageError(f"--frames {asked}: {source.name} has {len(source)} frames")
+        requested = f"{frames[0]}:{'' if frames[1] is None else frames[1]}"
+        raise UsageError(f"--frames {requested}: {source.name} has {len(source)} frames")
     return start, stop

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from dpm2_core.console import lines
 
-_PROSE = 24
+_MIN_TEXT_WIDTH = 24
 """Characters per line that text needs to be read with ease."""
 
 
@@ -66,15 +66,15 @@ class FigureTable:
         yield Text(self.title, style="italic")
         columns = [*zip(self.headings, *self.rows, strict=True)]
         widths = [max(map(cell_len, column if self._header else column[1:]), default=0) for column in columns]
-        least = [*widths[: self._text], *(min(width, _PROSE) for width in widths[self._text :])]
-        if _total(least) <= options.max_width or not self.rows:
-            yield self._upright()
+        min_widths = [*widths[: self._text], *(min(width, _MIN_TEXT_WIDTH) for width in widths[self._text :])]
+        if _total_width(min_widths) <= options.max_width or not self.rows:
+            yield self._plain_table()
         else:
-            yield from self._turned(options.max_width)
+            yield from self._transposed_tables(options.max_width)
         if self.caption:
             yield Text(self.caption, style="dim italic")
 
-    def _upright(self) -> Table:
+    def _plain_table(self) -> Table:
         table = Table(box=SIMPLE, show_header=self._header)
         for number, heading in enumerate(self.headings):
             figure = self._names <= number < self._text
@@ -84,13 +84,13 @@ class FigureTable:
             table.add_row(*map(Text, row), end_section=number in self._sections)
         return table
 
-    def _turned(self, width: int) -> Iterator[Table]:
+    def _transposed_tables(self, width: int) -> Iterator[Table]:
         label = max(map(cell_len, self.headings))
         first = 0
         while first < len(self.rows):
             last = first + 1
             while last < len(self.rows) and last not in self._sections:
-                if _total([label, *(max(map(cell_len, row)) for row in self.rows[first : last + 1])]) > width:
+                if _total_width([label, *(max(map(cell_len, row)) for row in self.rows[first : last + 1])]) > width:
                     break
                 last += 1
             table = Table(box=SIMPLE, show_header=False)
@@ -104,7 +104,7 @@ class FigureTable:
             first = last
 
 
-class _Figures(Formatter):
+class _FigureFormatter(Formatter):
     def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         try:
             return super().get_field(field_name, args, kwargs)
@@ -118,7 +118,7 @@ class _Figures(Formatter):
 def cells_of(record: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
     """Figures of a nested record as text, by columns such as "{loops[accepted]} of {loops[tried]}" or "{ape_m:.3f}";
     "-" for a missing or null value."""
-    return [_Figures().vformat(column, (), record) for column in columns]
+    return [_FigureFormatter().vformat(column, (), record) for column in columns]
 
 
 def record_table(
@@ -131,8 +131,8 @@ def record_table(
             outermost keys.
     """
     table = FigureTable(title, names=names, figures=list(columns))
-    for first, below in record.items():
-        for path, row in _leaves(below, len(names) - 1):
+    for first, entries in record.items():
+        for path, row in _leaves(entries, len(names) - 1):
             table.add_row(first, *path, *cells_of(row, columns.values()))
         if sections:
             table.add_section()
@@ -144,10 +144,10 @@ def _leaves(record: Any, depth: int) -> Iterator[tuple[tuple[str, ...], Any]]:
     if not depth:
         yield (), record
         return
-    for key, below in record.items():
-        yield from (((key, *path), value) for path, value in _leaves(below, depth - 1))
+    for key, entry in record.items():
+        yield from (((key, *path), value) for path, value in _leaves(entry, depth - 1))
 
 
-def _total(widths: Sequence[int]) -> int:
+def _total_width(widths: Sequence[int]) -> int:
     """Width of a table with such columns: a blank on either side of each, and one between, before and after them."""
     return sum(widths) + 3 * len(widths) + 1
