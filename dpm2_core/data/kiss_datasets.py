@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.cloud_folder import name_times
+from dpm2_core.data.point_times import TimeUnit, time_offsets
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource, note_once
 from dpm2_core.errors import UsageError
@@ -21,13 +22,16 @@ from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Array, Frame
 
 _SWEEP_PERIOD = 0.1  # s, one revolution of the LiDAR
+_STAMPED_AT = {"kitti_raw": 0.5}
+"""Fraction of the sweep at the stamp, where it is not the start: KITTI stamps the moment the LiDAR faces forward."""
 _NATIVE_LOADERS = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
 
 
 class KissSource(IndexedSource):
     """A drive read by KISS-ICP's loader `input.dataset`. See `Source`; there are no images and no intensities.
 
-    Point times are taken as in KISS-ICP: fractions of the sweep, whose end is the stamp.
+    Point times are those of the files for HeLiPR and Boreas, in s from the stamp. The other loaders return fractions of
+    the sweep, whose start is the stamp, as Ouster's driver has it (`_STAMPED_AT` has the exception).
 
     Raises:
         UsageError: no such loader, it lacks a package, or it cannot read the folder.
@@ -54,12 +58,13 @@ class KissSource(IndexedSource):
         """See `IndexedSource`."""
         stamp = int(self.stamps[position])
         try:
-            xyz, times = self._call_loader(lambda: self._loader[position])
+            xyz, offset = self._call_loader(lambda: self._scan(position, stamp))
         except UsageError as error:
             return Frame(stamp, NO_POINTS, index=position, problem=str(error))
         points = np.zeros((len(xyz), 4), np.float32)
         points[:, :3] = np.asarray(xyz)[:, :3]
-        offset = self._offsets(np.asarray(times, np.float64).ravel(), len(points))
+        if offset is None:
+            note_once(self.notes, f"{self.path}: no time field: not de-skewed")
         return Frame(stamp, points, offset, index=position)
 
     def _call_loader(self, call: Any) -> Any:
@@ -98,9 +103,23 @@ class KissSource(IndexedSource):
         why = f"{self.path}: the loader has no times"
         return np.asarray(self._settings.steady_stamps(np.arange(self._count), why, self.notes))
 
-    def _offsets(self, times: Array, count: int) -> Any:
-        """(count,) s relative to the end of the sweep; None if the points have no times."""
-        if len(times) != count or not count or np.ptp(times) == 0:
-            note_once(self.notes, f"{self.path}: no time field: not de-skewed")
-            return None
-        return ((times - times.max()) / np.ptp(times) * _SWEEP_PERIOD).astype(np.float32)
+    def _scan(self, position: int, stamp: int) -> tuple[Any, Any]:
+        """Points (N, 3) in m, and their times (N,) in s from the stamp (ns); None if the points have no times."""
+        loader, kind = self._loader, self._settings.dataset
+        if kind == "helipr":  # the loader scales these to 0..1, so that neither unit nor origin is left
+            data = loader.get_data(position)
+            unit: TimeUnit = "s" if self._settings.sequence == "Velodyne" else "ns"
+            return loader.read_point_cloud(data), _offsets(data[:, loader.time_channel], stamp, unit)
+        xyz, fractions = loader[position]
+        if kind == "boreas":  # the loader guesses these from the azimuth
+            rows = np.fromfile(loader.scan_files[position], np.float32).reshape(-1, 6).astype(np.float64)
+            return xyz, _offsets(rows[:, 5], stamp, "s")
+        times = np.asarray(fractions, np.float64).ravel()
+        if len(times) != len(xyz) or not len(xyz) or np.ptp(times) == 0:
+            return xyz, None
+        return xyz, ((times - _STAMPED_AT.get(kind, 0.0)) * _SWEEP_PERIOD).astype(np.float32)
+
+
+def _offsets(times: Array, stamp: int, unit: TimeUnit) -> Any:
+    """(N,) s from the stamp (ns) of a scan file's times (N,); None if there are none."""
+    return time_offsets(times, np.ones(len(times), bool), stamp, unit)

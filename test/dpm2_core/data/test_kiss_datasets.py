@@ -36,13 +36,13 @@ def mulran(tmp_path: Path) -> Path:
 
 
 def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
-    """The point times end at the stamp, as in KISS-ICP's own de-skewing."""
+    """The times begin at the stamp, as Ouster's driver has it."""
     pytest.importorskip("kiss_icp")
     source = open_source(mulran, InputSettings(dataset="mulran"))
     assert isinstance(source, KissSource)
     first, second = source.frames()
     assert (len(source), len(first.points), first.points[0, 0], second.points[0, 0]) == (2, 65536, 10, 9)
-    assert (first.time_offset[0], first.time_offset[-1]) == (pytest.approx(-0.1), 0.0)
+    assert (first.time_offset[0], first.time_offset[-1]) == (0.0, pytest.approx(0.1 * 1023 / 1024))
     assert (first.stamp, second.stamp) == STAMPS
     np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
 
@@ -56,6 +56,49 @@ def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "kiss_icp.datasets", None)
     with pytest.raises(MissingPackageError, match=r"input.dataset=mulran needs the package .*dpm2_ros\[datasets\]"):
         open_source(mulran, InputSettings(dataset="mulran"))
+
+
+@pytest.mark.parametrize(
+    ("lidar", "fields", "unit"),
+    [
+        ("Ouster", "i:<f4 time:<u4 r:<u2 ring:<u2 a:<u2", 1e9),
+        ("Velodyne", "i:<f4 ring:<u2 time:<f4", 1),
+        ("Avia", "r:u1 tag:u1 line:u1 time:<u4", 1e9),
+        ("Aeva", "r:<f4 v:<f4 time:<i4 line:u1 i:<f4", 1e9),
+    ],
+)
+def test_times_of_helipr_count_from_the_stamp(tmp_path: Path, lidar: str, fields: str, unit: float) -> None:
+    """HeLiPR's toolbox adds the time of a point to the name of its file; a sweep need not begin at its stamp."""
+    pytest.importorskip("kiss_icp")
+    names = [tuple(field.split(":")) for field in ("x:<f4 y:<f4 z:<f4 " + fields).split()]
+    (tmp_path / "LiDAR" / lidar).mkdir(parents=True)
+    (tmp_path / "LiDAR_GT").mkdir()
+    scan = np.zeros(100, np.dtype(names))
+    scan["x"], scan["time"] = 5, np.linspace(0.01, 0.1, 100) * unit
+    scan.tofile(tmp_path / "LiDAR" / lidar / f"{STAMPS[0]}.bin")
+    (tmp_path / "LiDAR_GT" / f"global_{lidar}_gt.txt").write_text(f"{STAMPS[0]} 0 0 0 0 0 0 1\n" * 2)
+    (tmp_path / "LiDAR" / lidar / f"{STAMPS[1]}.bin").write_bytes(scan.tobytes())
+    first, _ = open_source(tmp_path, InputSettings(dataset="helipr", sequence=lidar)).frames()
+    np.testing.assert_allclose(first.time_offset, np.linspace(0.01, 0.1, 100)[: len(first.points)], atol=1e-6)
+
+
+def test_times_of_boreas_are_those_of_its_files(tmp_path: Path) -> None:
+    """They count from the stamp, which is the middle of the sweep; the sweep may begin at any azimuth."""
+    pytest.importorskip("kiss_icp")
+    (tmp_path / "lidar").mkdir()
+    (tmp_path / "applanix").mkdir()
+    rows = ["GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up,roll,pitch,heading,angvel_z,angvel_y,angvel_x"]
+    azimuth = np.linspace(1.0, 1.0 - 2 * np.pi, 100)
+    for n, stamp in enumerate(STAMPS):
+        scan = np.zeros((100, 6), np.float32)
+        scan[:, 0], scan[:, 1], scan[:, 5] = np.cos(azimuth), np.sin(azimuth), np.linspace(-0.05, 0.05, 100)
+        scan.tofile(tmp_path / "lidar" / f"{stamp // 1000}.bin")
+        rows.append(f"{stamp // 1000},{n}" + 11 * ",0")
+    (tmp_path / "applanix" / "lidar_poses.csv").write_text("\n".join(rows) + "\n")
+    source = open_source(tmp_path, InputSettings(dataset="boreas"))
+    for frame, stamp in zip(source.frames(), STAMPS, strict=True):
+        assert frame.stamp == stamp
+        np.testing.assert_allclose(frame.time_offset, np.linspace(-0.05, 0.05, 100), atol=1e-6)
 
 
 def test_velodyne_of_helipr(tmp_path: Path) -> None:
