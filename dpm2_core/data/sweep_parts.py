@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 
-from dpm2_core.frame import Frame, Image, Inertial
+from dpm2_core.frame import Frame, Image
 
 _MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
@@ -38,7 +37,8 @@ class SweepParts:
         while the sweep is incomplete.
 
         The first part of a drive is returned as it is, because only the second shows that they are parts. It is in the
-        first sweep as well.
+        first sweep as well. A sweep has only the IMU samples of its last part: the samples of a frame must be used
+        also if None is returned.
         """
         if frame.problem is not None:
             return frame
@@ -86,14 +86,12 @@ def _joined(parts: Sequence[Frame]) -> Frame:
     """One frame at the stamp of the last part."""
     stamp = parts[-1].stamp
     timed = [part.later((stamp - part.stamp) * 1e-9) for part in parts]
-    samples = [part.imu for part in parts if part.imu is not None]
     return replace(
         parts[-1],
         points=np.concatenate([part.points for part in parts]),
         time_offset=np.concatenate([part.time_offset for part in timed if part.time_offset is not None]),
         images=_nearest([image for part in timed for image in part.images]),
         guess=parts[len(parts) // 2].guess,  # of the middle of the sweep
-        imu=reduce(Inertial.then, samples) if samples else None,
         fix=next((part.fix for part in reversed(parts) if part.fix is not None), None),
         dropped=sum(part.dropped for part in parts),
         stepped=any(part.stepped for part in parts),

@@ -89,7 +89,7 @@ class InertialMotion:
         """Add a new frame's samples; returns the frame with the recent samples, without their bias, or with none."""
         if self.turns:  # the last frame was not registered
             self._doubt.add(_UNREGISTERED_CHI2)
-        self._append_samples(frame)
+        self.add(frame.imu)
         self.turning, self._measured_turning, self.turns = None, None, False
         if self._last_stamp is None:
             self.problem = "" if len(self._samples) else "no samples"
@@ -195,9 +195,9 @@ class InertialMotion:
                 f"check its orientation and sign"
             )
 
-    def _append_samples(self, frame: Frame) -> None:
-        """Append the samples of a frame that the previous one does not have; start anew if time has gone back."""
-        old, new = self._samples, frame.imu
+    def add(self, new: Inertial | None) -> None:
+        """Append samples that are later than the previous ones; start anew if time has gone back."""
+        old = self._samples
         if new is None or not len(new):
             return
         later = new.stamps > old.stamps.max(initial=new.stamps[0] - 1)
@@ -212,6 +212,10 @@ class InertialMotion:
         """`turning` for the frame at `stamp`, since the stamp `before`."""
         s, parts = self._samples, np.append((np.arange(_PARTS) + 0.5) / _PARTS, 1.0)
         return turned((s.stamps - before) * 1e-9, s.rates - self._bias, parts * (stamp - before) * 1e-9)
+
+    def turning_after(self, before: int, stamp: int) -> Array | None:
+        """`turning` from the stamp `before` to `stamp`, ns; None if it is not known or not credible."""
+        return self._integrate_rates(stamp, before) if self._doubt.is_credible and stamp > before else None
 
     def denied(self, scans: Array, seconds: float) -> bool:
         """Whether scans with a rotation (3, 3) in the `seconds` since the last registered frame contradict the IMU's.

@@ -302,16 +302,22 @@ class MotionState:
 
     def between(self, last: OdometryResult, frame: Frame) -> OdometryResult:
         """The pose of a frame that is a part of a sweep, predicted from `last`, the result of the last sweep."""
-        dt = max((frame.stamp - last.stamp) * 1e-9, 0.0)
-        T = last.T_odom_lidar @ se3.exp(dt * last.twist)
+        dt, turns = max((frame.stamp - last.stamp) * 1e-9, 0.0), None
+        if self.inertial is not None:
+            self.inertial.add(frame.imu)
+            turns = self.inertial.turning_after(last.stamp, frame.stamp)
+        T, covariance = predicted(last.T_odom_lidar, self.ahead, dt, turns), self.unknown(dt)
+        if not last.registration.ok:  # after a pause, `unknown` lacks the motion during it
+            covariance = max(covariance, last.covariance, key=np.trace)
         return replace(
             last,
             stamp=frame.stamp,
             index=frame.index,
             T_odom_lidar=T,
-            covariance=self.unknown(dt),
+            covariance=covariance,
             registration=replace(last.registration, T_target_source=T, method=BETWEEN, ok=False),
             keyframe=None,
             seconds={},
             comparison=None,
+            repeated=frozenset(),
         )

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from dpm2_core.data.sweep_parts import SweepParts
-from dpm2_core.estimates import BETWEEN, State
+from dpm2_core.estimates import BETWEEN, OdometryResult, Registration, State
 from dpm2_core.frame import NO_POINTS, Camera, Frame, Image, Inertial
+from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
+from dpm2_core.slam.odometry.motion_state import MotionState
+from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
+from test.helpers import rooms
 from test.helpers.drives import make_drive, off
 
 PERIOD = 10_000_000  # ns from one part to the next
@@ -90,8 +94,8 @@ def test_a_part_without_a_return_is_waited_through_and_an_unreadable_one_is_hand
 
 
 def test_a_sweep_has_what_the_other_sensors_measured_during_it() -> None:
-    """All IMU samples, the nearest image of each camera, with its time relative to the new stamp, and the number of
-    dropped frames."""
+    """The nearest image of each camera timed from the new stamp, and what was dropped. The samples of an IMU are those
+    of the last part: the odometry has those before already."""
     camera = Camera(np.array([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]]), np.eye(4), (8, 8))
     frames = []
     for i in range(10):
@@ -102,7 +106,7 @@ def test_a_sweep_has_what_the_other_sensors_measured_during_it() -> None:
     sweep = joined(frames)[-1]
     assert sweep is not None
     assert sweep.imu is not None
-    assert sweep.imu.stamps.tolist() == [i * PERIOD for i in range(10)]
+    assert sweep.imu.stamps.tolist() == [9 * PERIOD]
     assert [image.pixels[0, 0, 0] for image in sweep.images] == [7]
     assert sweep.images[0].time_offset == pytest.approx(-0.018)
     assert (sweep.dropped, sweep.stepped) == (1, True)
@@ -134,3 +138,40 @@ def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
     assert tracked[-1].state is State.TRACKING
     # error of the sweeps: whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
     assert off(tracked[9::10], poses).max() < 0.06
+
+
+@pytest.mark.parametrize(("imu", "most"), [(True, 0.3), (False, 1.0)])
+def test_the_poses_between_two_sweeps_follow_a_fast_rotation(imu: bool, most: float) -> None:
+    """Of a robot that swings at up to 100 deg/s. The samples of an IMU were not used, and the rotation was taken to be
+    that of the middle of the last sweep: 1.1 deg off in the middle of the next one, without an IMU 1.2 deg."""
+    frames, poses = rooms.turning(40)
+    slam, middle = make_slam(SlamSettings()), []
+    for frame in frames:
+        assert frame.time_offset is not None
+        assert frame.imu is not None
+        seconds = (frame.imu.stamps - frame.stamp) * 1e-9
+        for k in range(10):
+            start, end = 0.01 * k - 0.05, 0.01 * k - 0.04
+            inside = (frame.time_offset >= start) & (frame.time_offset < end)
+            samples = frame.imu[((seconds > start) | (k == 0)) & ((seconds <= end) | (k == 9))]
+            cloud = replace(frame, points=frame.points[inside], time_offset=frame.time_offset[inside])
+            tracked = slam.process(replace(cloud, imu=samples if imu else None).later(start)).odometry
+            assert tracked.stamp != frame.stamp or k == 5
+            if k == 5:
+                middle.append(tracked.T_odom_lidar)
+    T = np.array(middle)[15:]
+    steps, true = se3.inverse(T[:-1]) @ T[1:], se3.inverse(poses[15:-1]) @ poses[16:]
+    off = [se3.apart(one, other)[1] for one, other in zip(steps, true, strict=True)]
+    assert max(off) < most
+
+
+def test_after_a_pause_a_predicted_pose_is_no_more_certain_than_the_sweep_before_it() -> None:
+    """That sweep was not confirmed in the map before the pause: its covariance is in meters, and was taken to be that
+    of a motion for 10 ms, 0.002 m."""
+    motion, far = MotionState(OdometrySettings()), 9.0 * np.eye(6)
+    motion.of_velocity = 1e-4 * np.eye(3)
+    rejected = Registration(np.eye(4), far, ok=False)
+    last = OdometryResult(0, 0, np.eye(4), far, np.zeros(6), State.DEGRADED, rejected)
+    for ok in (True, False):
+        found = motion.between(replace(last, registration=replace(rejected, ok=ok)), part(1))
+        assert found.covariance[3, 3] == (pytest.approx(0.0, abs=1e-4) if ok else 9.0)
