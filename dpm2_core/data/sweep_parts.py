@@ -9,15 +9,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 
 from dpm2_core.frame import Frame, Image
 
-_MAX_PART_SPAN = 0.025
+_PART = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
 """
-_MAX_SPAN = 1.5  # of the period: a cloud that spans more overlaps the one before, as clouds do that arrive in a burst
+_STILL_PART = 0.03  # s: then parts may follow each other a little later, as halves of a sweep of 0.05 s do
+# Of the period, which the parts of a sweep fill. A cloud that spans more overlaps the one before, as clouds do that
+# arrive in a burst; a cloud that spans less is a whole one, as of a flash LiDAR.
+_FILLED = 0.3, 1.5
 SWEEP = 0.1
 """s that a joined cloud spans."""
 
@@ -29,8 +33,11 @@ class SweepParts:
     """
 
     def __init__(self) -> None:
+        self._stamp: int | None = None  # of the last cloud
+        self._before: Frame | None = None  # the last cloud, if it may be a part, while none has been recognized
         self._parts = deque[Frame]()
-        self._has_parts = False  # whether clouds have been recognized as parts
+        self._joins = False  # whether clouds have been recognized as parts
+        self._follows = False  # whether a part of this sweep followed another one as soon as parts do
 
     def join(self, frame: Frame) -> Frame | None:
         """The sweep that this frame completes, with its stamp and index; the frame itself unless it is a part; None
@@ -40,37 +47,58 @@ class SweepParts:
         first sweep as well. A sweep has only the IMU samples of its last part: the samples of a frame must be used
         also if None is returned.
         """
+        step = float("inf") if self._stamp is None else (frame.stamp - self._stamp) * 1e-9
+        self._stamp, period = frame.stamp, step / (1 + frame.dropped)
+        if period > SWEEP:  # a pause, or whole clouds
+            self._end()
+        if self._joins:
+            self._follows |= period < _STILL_PART
+        elif not self._begins(frame, period):
+            return frame
         if frame.problem is not None:
             return frame
-        if not len(frame.points) and self._has_parts:  # a part may look at the sky
-            return None
-        start, end = _time_range(frame)
-        if not 0 < end - start < _MAX_PART_SPAN:
-            self._parts.clear()
-            self._has_parts = False
+        if step <= 0 or (frame.time_offset is None and len(frame.points)):
+            self._end()
             return frame
-        step = (frame.stamp - self._parts[-1].stamp) * 1e-9 if self._parts else 0.0
-        self._has_parts |= 0 < step < _MAX_PART_SPAN and end - start < _MAX_SPAN * step
-        if step < 0:
-            self._parts.clear()
         self._parts.append(_copied(frame))
-        while self._span(end) > 2 * SWEEP:  # the parts before a pause
+        start, end = _times(frame)
+        while len(self._parts) > 1 and self._spanned(end) > 2 * SWEEP:  # parts were dropped in between
             self._parts.popleft()
-        if not self._has_parts:
-            return frame
-        if self._span(end) < SWEEP - (end - start) / 2:
+        if self._spanned(end) < SWEEP - (end - start) / 2:
             return None
-        sweep = _joined(list(self._parts))
+        sweep = frame if len(self._parts) == 1 else _joined(list(self._parts), frame)
         self._parts.clear()
+        if not self._follows:  # whole clouds, of which two followed each other too soon once
+            self._end()
+        self._follows = False
         return sweep
 
-    def _span(self, end: float) -> float:
+    def _begins(self, frame: Frame, period: float) -> bool:
+        """Whether a frame and the one before, a `period` (s) earlier, are the first parts that are recognized."""
+        start, end = _times(frame)
+        before, self._before = self._before, None
+        if frame.problem is not None or not 0 < end - start < _PART:
+            return False
+        filled = _FILLED[0] * period < end - start < _FILLED[1] * period
+        self._joins = before is not None and period < _PART and filled
+        if before is not None and self._joins:
+            self._parts.append(replace(before, fix=None, dropped=0, stepped=False))
+        else:
+            self._before = _copied(frame)
+        return self._joins
+
+    def _end(self) -> None:
+        """Join no more clouds until parts are recognized again."""
+        self._parts.clear()
+        self._joins, self._follows = False, False
+
+    def _spanned(self, end: float) -> float:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
-        return (last.stamp - first.stamp) * 1e-9 + end - _time_range(first)[0]
+        return (last.stamp - first.stamp) * 1e-9 + end - _times(first)[0]
 
 
-def _time_range(frame: Frame) -> tuple[float, float]:
+def _times(frame: Frame) -> tuple[float, float]:
     """The first and the last time of its points, s after its stamp; zeros without times."""
     offset = frame.time_offset
     return (0.0, 0.0) if offset is None or not len(offset) else (float(offset.min()), float(offset.max()))
@@ -82,16 +110,18 @@ def _copied(frame: Frame) -> Frame:
     return replace(frame, points=frame.points.copy(), time_offset=None if offset is None else offset.copy())
 
 
-def _joined(parts: Sequence[Frame]) -> Frame:
+def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
     """One frame at the stamp of the last part."""
-    stamp = parts[-1].stamp
-    timed = [part.later((stamp - part.stamp) * 1e-9) for part in parts]
+    timed = [part.later((last.stamp - part.stamp) * 1e-9) for part in parts]
+    offsets = [part.time_offset for part in timed if part.time_offset is not None]
+    start, end = min(times[0] for times in map(_times, timed)), max(times[1] for times in map(_times, timed))
+    guesses = [(abs(sum(_times(part)) - start - end), part.guess) for part in timed if part.guess is not None]
     return replace(
-        parts[-1],
+        last,
         points=np.concatenate([part.points for part in parts]),
-        time_offset=np.concatenate([part.time_offset for part in timed if part.time_offset is not None]),
+        time_offset=np.concatenate(offsets) if offsets else None,
         images=_nearest([image for part in timed for image in part.images]),
-        guess=parts[len(parts) // 2].guess,  # of the middle of the sweep
+        guess=min(guesses, key=itemgetter(0))[1] if guesses else None,  # nearest to the middle of the sweep
         fix=next((part.fix for part in reversed(parts) if part.fix is not None), None),
         dropped=sum(part.dropped for part in parts),
         stepped=any(part.stepped for part in parts),

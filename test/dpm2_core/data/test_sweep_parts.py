@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds that are parts of a sweep are joined to whole sweeps; other clouds are not."""
+"""Clouds that are parts of a sweep are joined to whole sweeps, and only those."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ import pytest
 
 from dpm2_core.data.sweep_parts import SweepParts
 from dpm2_core.estimates import BETWEEN, OdometryResult, Registration, State
-from dpm2_core.frame import NO_POINTS, Camera, Frame, Image, Inertial
+from dpm2_core.frame import NO_POINTS, Camera, Frame, Guess, Image, Inertial
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.odometry.motion_state import MotionState
@@ -22,7 +22,7 @@ PERIOD = 10_000_000  # ns from one part to the next
 
 
 def part(i: int, *, span: float = 0.01, period: int = PERIOD, points: int = 50) -> Frame:
-    """A part in which each point has x = i and y = its time, s after the first part's stamp."""
+    """A part of which each point has x = i and y = its time, s after the first part's stamp."""
     offset = np.linspace(0, span, points, dtype=np.float32)
     data = np.zeros((points, 4), np.float32)
     data[:, 0], data[:, 1] = i, i * period * 1e-9 + offset
@@ -30,7 +30,7 @@ def part(i: int, *, span: float = 0.01, period: int = PERIOD, points: int = 50) 
 
 
 def numbers(sweep: Frame | None) -> list[int]:
-    """Numbers of the parts in a sweep."""
+    """Which parts it consists of."""
     return [] if sweep is None else np.unique(sweep.points[:, 0]).tolist()
 
 
@@ -40,8 +40,7 @@ def joined(frames: Sequence[Frame]) -> list[Frame | None]:
 
 
 def test_ten_parts_make_a_sweep_at_the_stamp_of_the_last() -> None:
-    """The first part is passed on at once, because nothing shows yet that it is a part. It is in the first sweep,
-    too."""
+    """The first part is handed on at once, as nothing tells yet that it is one, and is in the first sweep too."""
     first, *between, sweep = joined([part(i) for i in range(10)])
     assert numbers(first) == [0]
     assert between == [None] * 8
@@ -64,13 +63,57 @@ def test_each_part_is_in_one_sweep() -> None:
     [
         [part(i, span=0.1, period=100_000_000) for i in range(8)],  # a spinning LiDAR
         [part(i, span=0.001, period=100_000_000) for i in range(8)],  # a flash LiDAR
-        [part(i, span=0.1, period=2_000_000) for i in range(8)],  # whole sweeps, stamped on arrival at once
+        [part(i, span=0.003, period=16_700_000) for i in range(8)],  # a fast one: parts would fill the period
+        [part(i, span=0.1, period=2_000_000) for i in range(8)],  # whole sweeps that arrived together, stamped then
         [replace(part(i), time_offset=None) for i in range(8)],  # nothing shows whether these are parts
     ],
-    ids=["spinning", "flash", "burst", "untimed"],
+    ids=["spinning", "flash", "fast flash", "burst", "untimed"],
 )
 def test_whole_clouds_are_handed_on_as_they_are(frames: list[Frame]) -> None:
     assert all(out is frame for out, frame in zip(joined(frames), frames, strict=True))
+
+
+@pytest.mark.parametrize("period", [0.033, 0.05, 0.1, 0.3])
+def test_whole_clouds_of_which_two_once_followed_each_other_too_soon_are_joined_once(period: float) -> None:
+    """All later ones were joined in twos, 0.1 s apart: a stamp by arrival, or a delay, is enough."""
+    stamps = [0.0, 0.01, *(0.01 + period * np.arange(1, 12))]
+    out = joined([replace(part(i, span=0.008), stamp=round(stamp * 1e9)) for i, stamp in enumerate(stamps)])
+    joints = [sweep for sweep in out if sweep is not None and len(numbers(sweep)) > 1]
+    assert len(joints) <= 1
+    first = max((sweep.index for sweep in joints), default=1)
+    assert all(numbers(sweep) == [i] for i, sweep in enumerate(out[first + 1 :], first + 1))
+
+
+def test_halves_that_span_as_long_as_a_part_may_are_all_joined() -> None:
+    """Of a LiDAR that turns 20 times per second: a half that spanned 0.1 ms more discarded the halves before it."""
+    spans = [0.0249, 0.0251, 0.0249, 0.0249, 0.0251, 0.0249, 0.0251, 0.0251, 0.0251, 0.0249, 0.0251, 0.0249]
+    stamps = np.cumsum([0.0, *spans[:-1]])
+    halves = [part(i, span=span, points=9) for i, span in enumerate(spans)]
+    out = joined([replace(half, stamp=round(at * 1e9)) for half, at in zip(halves, stamps, strict=True)])
+    assert [numbers(sweep) for sweep in out] == [[0], [1], [2], [], [], [2, 3, 4, 5], [], [], [], [6, 7, 8, 9], [], []]
+
+
+def test_a_node_that_is_too_slow_for_each_part_still_joins_them() -> None:
+    """It drops three of four: those that are left follow each other after 40 ms, and alone each takes it longer."""
+    out = joined([replace(part(i), dropped=3 if i else 0) for i in range(0, 60, 4)])
+    assert [len(numbers(sweep)) for sweep in out[1:]] == [0, 0, 4] + [0, 0, 0, 4] * 2 + [0, 0, 0]
+
+
+def test_a_stamp_that_repeats_or_goes_back_ends_the_joining() -> None:
+    """No sweep was ever complete where the stamps stood still, and all clouds stayed in memory."""
+    for stamps in ([3] * 50, [3, 2]):
+        *before, back = [part(0), part(1), part(2), *(replace(part(i), index=i) for i in stamps)]
+        out = joined([*before, back])
+        assert out[-1] is not None
+        assert numbers(out[-1]) == numbers(back)
+
+
+def test_a_second_lidar_that_sends_whole_sweeps_discards_no_part() -> None:
+    """Its cloud is in one of ten frames, which then spans a sweep."""
+    both = [part(i, span=0.1 if i % 10 == 5 else 0.01) for i in range(40)]
+    sweeps = [sweep for sweep in joined(both)[1:] if sweep is not None]
+    assert [sweep.index for sweep in sweeps] == [5, 15, 25, 35]
+    assert [number for sweep in sweeps for number in numbers(sweep)] == list(range(36))
 
 
 def test_what_a_pause_interrupts_is_not_joined_across_it() -> None:
@@ -78,19 +121,49 @@ def test_what_a_pause_interrupts_is_not_joined_across_it() -> None:
     assert numbers(sweep) == list(range(200, 210))
 
 
+def test_what_a_pause_of_the_node_interrupts_is_not_joined_across_it() -> None:
+    """It has dropped all parts in between, and those that follow are parts as before."""
+    after = [replace(part(i), dropped=194 if i == 200 else 0) for i in range(200, 210)]
+    out = joined([*(part(i) for i in range(5)), *after])
+    assert out[5:-1] == [None] * 9
+    assert numbers(out[-1]) == list(range(200, 210))
+
+
 def test_lost_parts_leave_a_hole() -> None:
-    """A node that is too slow drops clouds: the sweep ends where it would have ended otherwise."""
+    """A node that is too slow drops clouds: the sweep ends where it would have ended."""
     *_, sweep = joined([part(i) for i in (0, 1, 2, 6, 9)])
     assert numbers(sweep) == [0, 1, 2, 6, 9]
 
 
 def test_a_part_without_a_return_is_waited_through_and_an_unreadable_one_is_handed_on() -> None:
-    empty = replace(part(4), points=NO_POINTS, time_offset=None)
+    """A part that looks at the sky has no point, or few, which then have the same time."""
+    camera = Camera(np.array([[10.0, 0, 4], [0, 10, 4], [0, 0, 1]]), np.eye(4), (8, 8))
+    image = Image(np.zeros((8, 8, 3), np.uint8), camera)
+    empty = replace(part(4), points=NO_POINTS, time_offset=None, images=(image,), dropped=2)
     bad = replace(part(5), points=NO_POINTS, time_offset=None, problem="cut off")
-    out = joined([*(part(i) for i in range(4)), empty, bad, *(part(i) for i in range(6, 10))])
+    out = joined([*(part(i) for i in range(4)), empty, bad, part(6), part(7, points=1), part(8), part(9)])
     assert out[4] is None
     assert out[5] is bad
     assert numbers(out[9]) == [0, 1, 2, 3, 6, 7, 8, 9]
+    assert out[9] is not None
+    assert (len(out[9].images), out[9].dropped) == (1, 2)
+
+
+def test_sweeps_without_a_return_are_joined_too() -> None:
+    sky = [replace(part(i), points=NO_POINTS, time_offset=None) for i in range(10, 40)]
+    out = joined([*(part(i) for i in range(10)), *sky, *(part(i) for i in range(40, 61))])
+    assert [sweep.index for sweep in out[10:40] if sweep is not None] == [20, 31]
+    assert all(sweep is None or len(numbers(sweep)) > 7 for sweep in out[43:])
+
+
+def test_of_another_odometry_the_pose_nearest_to_the_middle_is_used() -> None:
+    """Parts are lost and have no pose: that of the middle one in number was used, or none."""
+    T = [se3.make(np.eye(3), [float(i), 0, 0]) for i in range(10)]
+    kept = [replace(part(i), guess=None if i == 5 else Guess(T[i])) for i in (0, 1, 2, 3, 5, 6, 9)]
+    *_, sweep = joined(kept)
+    assert sweep is not None
+    assert sweep.guess is not None
+    assert sweep.guess.T_other_lidar[0, 3] == 3.0
 
 
 def test_a_sweep_has_what_the_other_sensors_measured_during_it() -> None:
@@ -121,8 +194,7 @@ def test_the_arrays_of_a_part_may_be_used_again() -> None:
 
 
 def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
-    """Each sweep of a simulated drive is sent in ten parts. Each part has a pose; those between two sweeps are
-    predicted."""
+    """Each sweep of a simulated drive sent in ten parts: a pose for each part, those between two sweeps predicted."""
     frames, poses = make_drive("city", 20, deskewed=False)
     slam, tracked = make_slam(SlamSettings()), []
     for frame in frames:
@@ -136,7 +208,7 @@ def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
     assert [t.registration.method == BETWEEN for t in tracked[10:]] == ([True] * 9 + [False]) * 19
     assert not any(t.failed for t in tracked)
     assert tracked[-1].state is State.TRACKING
-    # error of the sweeps: whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
+    # of sweeps; those of whole clouds are 0.018 m off, and the parts' stamps are later by nine tenths of a sweep
     assert off(tracked[9::10], poses).max() < 0.06
 
 
@@ -169,7 +241,7 @@ def test_after_a_pause_a_predicted_pose_is_no_more_certain_than_the_sweep_before
     """That sweep was not confirmed in the map before the pause: its covariance is in meters, and was taken to be that
     of a motion for 10 ms, 0.002 m."""
     motion, far = MotionState(OdometrySettings()), 9.0 * np.eye(6)
-    motion.of_velocity = 1e-4 * np.eye(3)
+    motion.velocity_covariance = 1e-4 * np.eye(3)
     rejected = Registration(np.eye(4), far, ok=False)
     last = OdometryResult(0, 0, np.eye(4), far, np.zeros(6), State.DEGRADED, rejected)
     for ok in (True, False):
