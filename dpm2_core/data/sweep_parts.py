@@ -75,10 +75,10 @@ class SweepParts:
 
     def _begins(self, frame: Frame, period: float) -> bool:
         """Whether a frame and the one before, a `period` (s) earlier, are the first parts that are recognized."""
-        start, end = _times(frame)
         before, self._before = self._before, None
-        if frame.problem is not None or not 0 < end - start < _PART:
+        if not may_be_part(frame):
             return False
+        start, end = _times(frame)
         filled = _FILLED[0] * period < end - start < _FILLED[1] * period
         self._joins = before is not None and period < _PART and filled
         if before is not None and self._joins:
@@ -96,6 +96,12 @@ class SweepParts:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
         return (last.stamp - first.stamp) * 1e-9 + end - _times(first)[0]
+
+
+def may_be_part(frame: Frame) -> bool:
+    """Whether a frame spans no more than a part; only the next one shows whether it is one."""
+    start, end = _times(frame)
+    return frame.problem is None and 0 < end - start < _PART
 
 
 def _times(frame: Frame) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from dpm2_core.config import dump_settings
 from dpm2_core.data.messages import returned
 from dpm2_core.data.source import Source, frame_at
+from dpm2_core.data.sweep_parts import may_be_part
 from dpm2_core.data.time_order import frames_in_order
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import isotropic
@@ -29,6 +30,8 @@ MapMode = Literal["create", "resume", "extend", "localize"]
 _COMPARED_POINTS = 500  # points of a cloud
 _MAX_DISTANCE = 0.75
 """m, 75th percentile of the distances: for the same frame 0.01, or the de-skewing; for another frame at least 1.1."""
+_MAX_DISTANCE_OF_PART = 0.3  # m, the same for a part of a sweep: 0.09, and at least 0.4
+_MAX_ANGLE = 0.02  # rad: a part of a sweep has points as close to the direction of its points in the cloud
 _SAME_FRAME = isotropic(1e-4, 1e-3)  # rounding errors between two readings of the same frame
 
 
@@ -139,5 +142,16 @@ def _is_cloud_of(frame: Frame, cloud: Points) -> bool:
     points = frame.points[returned(frame.points)][:, :3]
     if not len(points) or not len(cloud):
         return True
+    max_distance = _MAX_DISTANCE
+    if may_be_part(frame):  # the cloud is of a whole sweep
+        angles, _ = cKDTree(_directions(points)).query(_directions(cloud[:, :3]))
+        cloud, max_distance = cloud[angles < _MAX_ANGLE], _MAX_DISTANCE_OF_PART
+        if not len(cloud):
+            return False
     distances, _ = cKDTree(points).query(cloud[:: -(-len(cloud) // _COMPARED_POINTS), :3])
-    return bool(np.percentile(distances, 75) <= _MAX_DISTANCE)
+    return bool(np.percentile(distances, 75) <= max_distance)
+
+
+def _directions(points: Points) -> Points:
+    """(N, 3) unit vectors."""
+    return points / np.linalg.norm(points, axis=1, keepdims=True)

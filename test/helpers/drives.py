@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +62,19 @@ def make_drive(preset: PresetName, frames: int, *, deskewed: bool = True, start:
         scan = lidar.scan(world, T, start + 0.1 * i, rng, twist=twist)
         out.append(Frame(i * 10**8, scan.points, None if deskewed else scan.time_offset, index=i))
     return out, se3.inverse(poses[0]) @ poses
+
+
+def in_parts(frames: Iterable[Frame], count: int = 10) -> list[Frame]:
+    """Each sweep sent in so many parts, as by a driver that publishes each packet: stamped at their start."""
+    parts = list[Frame]()
+    for frame in frames:
+        assert frame.time_offset is not None
+        edges = np.linspace(frame.time_offset.min(), frame.time_offset.max() + 1e-6, count + 1)
+        for start, end in pairwise(edges):
+            inside = (frame.time_offset >= start) & (frame.time_offset < end)
+            cloud = replace(frame, points=frame.points[inside], time_offset=frame.time_offset[inside])
+            parts.append(replace(cloud.later(start), index=len(parts)))
+    return parts
 
 
 def track(frames: Iterable[Frame], **settings: object) -> list[OdometryResult]:

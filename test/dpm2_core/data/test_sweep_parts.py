@@ -16,7 +16,7 @@ from dpm2_core.slam.odometry.motion_state import MotionState
 from dpm2_core.slam.odometry.settings import OdometrySettings
 from dpm2_core.slam.settings import SlamSettings
 from test.helpers import rooms
-from test.helpers.drives import make_drive, off
+from test.helpers.drives import in_parts, make_drive, off
 
 PERIOD = 10_000_000  # ns from one part to the next
 
@@ -196,14 +196,8 @@ def test_the_arrays_of_a_part_may_be_used_again() -> None:
 def test_a_drive_of_parts_is_as_accurate_as_one_of_sweeps() -> None:
     """Each sweep of a simulated drive sent in ten parts: a pose for each part, those between two sweeps predicted."""
     frames, poses = make_drive("city", 20, deskewed=False)
-    slam, tracked = make_slam(SlamSettings()), []
-    for frame in frames:
-        assert frame.time_offset is not None
-        edges = np.linspace(frame.time_offset.min(), frame.time_offset.max() + 1e-6, 11)
-        for k in range(10):
-            inside = (frame.time_offset >= edges[k]) & (frame.time_offset < edges[k + 1])
-            cloud = replace(frame, points=frame.points[inside], time_offset=frame.time_offset[inside])
-            tracked.append(slam.process(replace(cloud.later(edges[k]), index=len(tracked))).odometry)
+    slam = make_slam(SlamSettings())
+    tracked = [slam.process(frame).odometry for frame in in_parts(frames)]
     assert [t.index for t in tracked] == list(range(200))
     assert [t.registration.method == BETWEEN for t in tracked[10:]] == ([True] * 9 + [False]) * 19
     assert not any(t.failed for t in tracked)
