@@ -35,6 +35,6 @@ def test_a_run_goes_on_where_its_map_ends(parts: list[Frame], tmp_path: Path) ->
         assert len(result) == scans
         assert result.methods[BETWEEN] >= 0.8 * scans
         assert result.methods["failed"] == 0
-    turned = [replace(frame, points=frame.points * np.float32([-1, 1, 1, 1])) for frame in parts]
+    mirrored = [replace(frame, points=frame.points * np.float32([1, -1, 1, 1])) for frame in parts]
     with pytest.raises(UsageError, match="not the one with which the map ends"):
-        OfflineRun(InMemory(turned), CONFIG, map_file=tmp_path / "map", map_mode="resume")
+        OfflineRun(InMemory(mirrored), CONFIG, map_file=tmp_path / "map", map_mode="resume")
