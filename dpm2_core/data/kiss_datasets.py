@@ -85,10 +85,12 @@ class KissSource(IndexedSource):
         if poses is None:
             return None
         poses = np.asarray(poses, np.float64)
-        if poses.shape == (self._count, 4, 4) and np.isfinite(poses).all():
-            return poses
-        self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
-        return None
+        if poses.shape != (self._count, 4, 4):
+            self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
+            return None
+        known = np.isfinite(poses.sum((1, 2)))
+        self._note_unposed(self.path, known)
+        return np.where(known[:, None, None], poses, np.nan) if known.any() else None
 
     def _read_stamps(self) -> Array:
         """(len,) ns: the loader's times, else the scans' names if they are times, else at constant `input.period`."""

@@ -140,6 +140,24 @@ def test_nclt(tmp_path: Path) -> None:
     assert source.notes == [f"{drive}: no time field: not de-skewed"]
 
 
+def test_truth_that_is_unknown_in_part(tmp_path: Path) -> None:
+    """NCLT's files have rows of nan, such as at the start."""
+    pytest.importorskip("kiss_icp")
+    drive = tmp_path / "2012-01-08"
+    (drive / "velodyne_sync").mkdir(parents=True)
+    (tmp_path / "ground_truth").mkdir()
+    rows = []
+    for n in range(-1, 4):
+        stamp = (STAMPS[0] + n * 10**8) // 1000
+        np.full((50, 4), 20200, "<i2").tofile(drive / "velodyne_sync" / f"{stamp}.bin")
+        rows.append(f"{stamp},{'nan,nan,nan,nan,nan,nan' if n < 1 else f'{n},0,0,0,0,0'}\n")
+    (tmp_path / "ground_truth" / "groundtruth_2012-01-08.csv").write_text("".join(rows))
+    source = open_source(drive, InputSettings(dataset="nclt"))
+    assert np.isnan(source.poses[0]).all()
+    assert source.poses[1:, 0, 3].tolist() == [1, 2]
+    assert source.notes == [f"{drive}: 1 of 3 frames have no pose"]
+
+
 def test_what_a_loader_lacks_is_said_with_the_error_that_follows(tmp_path: Path) -> None:
     """The loader of Newer College prints that a package is missing, and fails only at the first scan."""
     pytest.importorskip("kiss_icp")
