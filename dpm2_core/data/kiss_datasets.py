@@ -12,18 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.point_times import TimeUnit, time_offsets
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource, note_once
+from dpm2_core.data.trajectory import interpolate
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
 from dpm2_core.frame import NO_POINTS, Array, Frame
+from dpm2_core.geometry import se3
 
 _SWEEP_PERIOD = 0.1  # s, one revolution of the LiDAR
 _STAMPED_AT = {"kitti_raw": 0.5}
 """Fraction of the sweep at the stamp, where it is not the start: KITTI stamps the moment the LiDAR faces forward."""
+_T_BASE_OUSTER = se3.make(
+    Rotation.from_euler("xyz", (0.0001, 0.0003, 179.6654), degrees=True).as_matrix(), np.array([1.7042, -0.021, 1.8047])
+)
+"""Pose of MulRan's LiDAR on its car, from the data set's calib_base2ouster.txt."""
 _NATIVE_LOADERS = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
 
 
@@ -51,7 +59,8 @@ class KissSource(IndexedSource):
         super().__init__(self.path.resolve().stem, int(self._call_loader(lambda: len(self._loader))))
         if not self._count:
             raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
-        self.stamps, self.poses = self._read_stamps(), self._poses()
+        self.stamps = self._read_stamps()
+        self.poses = self._poses()
         self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
 
     def frame(self, position: int) -> Frame:
@@ -81,10 +90,14 @@ class KissSource(IndexedSource):
         return result
 
     def _poses(self) -> Array | None:
-        poses = getattr(self._loader, "gt_poses", None)
-        if poses is None:
+        found: Any
+        if self._loadertings.dataset == "mulran":
+            found = _mulran_poses(Path(self._loader.sequence_dir) / "global_pose.csv", self.stamps)
+        else:
+            found = getattr(self._loader, "gt_poses", None)
+        if found is None:
             return None
-        poses = np.asarray(poses, np.float64)
+        poses = np.asarray(found, np.float64)
         if poses.shape != (self._count, 4, 4):
             self.notes.append(f"{self.path}: no ground truth: {poses.shape} poses for {self._count} scans")
             return None
@@ -120,6 +133,18 @@ class KissSource(IndexedSource):
         if len(times) != len(xyz) or not len(xyz) or np.ptp(times) == 0:
             return xyz, None
         return xyz, ((times - _STAMPED_AT.get(kind, 0.0)) * _SWEEP_PERIOD).astype(np.float32)
+
+
+def _mulran_poses(path: Path, stamps: NDArray[np.int64]) -> Array:
+    """(N, 4, 4) poses of the LiDAR at stamps (N,) ns, relative to the first one, from those of the car; NaN outside.
+
+    The loader has its transform between car and LiDAR the wrong way round, which puts the LiDAR below the road and
+    rotates it by 0.67 degrees. It also takes the nearest pose of the file, however far away in time.
+    """
+    rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    poses = interpolate(rows[:, 0].astype(np.int64), se3.from_rows(rows[:, 1:]) @ _T_BASE_OUSTER, stamps)
+    known = np.isfinite(poses).all((1, 2))
+    return se3.inverse(poses[np.argmax(known)]) @ poses
 
 
 def _offsets(times: Array, stamp: int, unit: TimeUnit) -> Any:

@@ -6,15 +6,18 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpm2_core.data.kiss_datasets import KissSource
 from dpm2_core.data.open import open_source
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import MissingPackageError
+from dpm2_core.geometry import se3
 
 STAMPS = (1_700_000_000_000_000_000, 1_700_000_000_300_000_000)
 """Stamps, ns, of two scans; two scans between them were lost."""
@@ -45,6 +48,28 @@ def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
     assert (first.time_offset[0], first.time_offset[-1]) == (0.0, pytest.approx(0.1 * 1023 / 1024))
     assert (first.stamp, second.stamp) == STAMPS
     np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
+
+
+def test_the_truth_of_mulran_is_of_the_lidar(mulran: Path) -> None:
+    """Its file has poses of the car, by the millisecond; the LiDAR on the roof faces backwards, and not quite."""
+    pytest.importorskip("kiss_icp")
+    turn = Rotation.from_euler("xyz", [0.0001, 0.0003, 179.6654], degrees=True).as_matrix()
+    T_base_lidar = se3.make(turn, np.array([1.7042, -0.021, 1.8047]))
+    UTM = se3.make(Rotation.from_euler("z", 1.0).as_matrix(), np.array([332000.0, 4026000.0, 21.0]))
+
+    def T_world_base(seconds: float) -> Any:
+        return UTM @ se3.exp([0.02 * seconds, 0.3 * seconds, 0.5 * seconds, 15 * seconds, 0, 0])
+
+    times = np.arange(-0.005, 0.29, 0.01)
+    rows = [",".join(map(str, [STAMPS[0] + round(t * 1e9), *T_world_base(t)[:3].ravel()])) for t in times]
+    (mulran / "global_pose.csv").write_text("\n".join(rows) + "\n")
+    (mulran / "Ouster" / f"{STAMPS[1]}.bin").rename(mulran / "Ouster" / f"{STAMPS[0] + 10**8}.bin")
+    (mulran / "Ouster" / f"{STAMPS[1]}.bin").write_bytes(b"")
+    source = open_source(mulran, InputSettings(dataset="mulran"))
+    T = se3.inverse(T_base_lidar) @ se3.inverse(T_world_base(0)) @ T_world_base(0.1) @ T_base_lidar
+    np.testing.assert_allclose(source.poses[:2], [np.eye(4), T], atol=1e-5)
+    assert np.isnan(source.poses[2]).all()  # the file ends before
+    assert source.notes == [f"{mulran}: 1 of 3 frames have no pose"]
 
 
 def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
