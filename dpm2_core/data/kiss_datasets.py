@@ -76,22 +76,22 @@ class KissSource(IndexedSource):
             note_once(self.notes, f"{self.path}: no time field: not de-skewed")
         return Frame(stamp, points, offset, index=position)
 
-    def _call_loader(self, call: Any) -> Any:
+    def _call_loader(self, what: Any) -> Any:
         """Result of a call of the loader, which prints, exits and asserts if something is missing."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-                result = call()
+                answer = what()
         except (Exception, SystemExit) as error:
-            output = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
-            message = " ".join(output.split()[-30:]) or type(error).__name__
-            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {message}") from None
+            said = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
+            words = " ".join(said.split()[-30:]) or type(error).__name__
+            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
         self._printed = self._printed or printed.getvalue()
-        return result
+        return answer
 
     def _poses(self) -> Array | None:
         found: Any
-        if self._loadertings.dataset == "mulran":
+        if self._settings.dataset == "mulran":
             found = _mulran_poses(Path(self._loader.sequence_dir) / "global_pose.csv", self.stamps)
         else:
             found = getattr(self._loader, "gt_poses", None)
@@ -105,13 +105,13 @@ class KissSource(IndexedSource):
         self._note_unposed(self.path, known)
         return np.where(known[:, None, None], poses, np.nan) if known.any() else None
 
-    def _read_stamps(self) -> Array:
+    def _read_stamps(self) -> NDArray[np.int64]:
         """(len,) ns: the loader's times, else the scans' names if they are times, else at constant `input.period`."""
-        read_times = getattr(self._loader, "get_frames_timestamps", None)
-        if read_times is not None:
-            times = np.asarray(self._call_loader(read_times), np.float64).ravel()
-            if len(times) == self._count and np.isfinite(times).all():
-                return np.asarray(np.round(times * 1e9), np.int64)
+        known = getattr(self._loader, "get_frames_timestamps", None)
+        if known is not None:
+            found = np.asarray(self._call_loader(known), np.float64).ravel()
+            if len(found) == self._count and np.isfinite(found).all():
+                return np.asarray(np.round(found * 1e9), np.int64)
         names = [Path(str(file)) for file in getattr(self._loader, "scan_files", ())]
         if len(names) == self._count and (named := name_times(names)):
             return np.asarray(named, np.int64)
@@ -125,6 +125,9 @@ class KissSource(IndexedSource):
             data = loader.get_data(position)
             unit: TimeUnit = "s" if self._settings.sequence == "Velodyne" else "ns"
             return loader.read_point_cloud(data), _offsets(data[:, loader.time_channel], stamp, unit)
+        if kind == "nclt":  # the loader reads these numbers as signed ones: 327.68 m off beyond 63.84 m
+            raw = np.fromfile(Path(loader.scans_dir) / loader.scan_files[position], "<u2").reshape(-1, 4)
+            return (raw[:, :3] * 0.005 - 100) * (1, -1, -1), None
         xyz, fractions = loader[position]
         if kind == "boreas":  # the loader guesses these from the azimuth
             rows = np.fromfile(loader.scan_files[position], np.float32).reshape(-1, 6).astype(np.float64)

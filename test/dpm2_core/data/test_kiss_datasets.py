@@ -165,6 +165,21 @@ def test_nclt(tmp_path: Path) -> None:
     assert source.notes == [f"{drive}: no time field: not de-skewed"]
 
 
+def test_far_points_of_nclt(tmp_path: Path) -> None:
+    """Its numbers are unsigned: 0.005 m each, from -100 m; y to the right and z down."""
+    pytest.importorskip("kiss_icp")
+    drive = tmp_path / "2012-01-08"
+    (drive / "velodyne_sync").mkdir(parents=True)
+    (tmp_path / "ground_truth").mkdir()
+    stamp = STAMPS[0] // 1000
+    near, far = (20200, 19800, 20400, 0), (35000, 5000, 34000, 0)
+    np.array([near, far], "<u2").tofile(drive / "velodyne_sync" / f"{stamp}.bin")
+    rows = [f"{stamp + late},0,0,0,0,0,0\n" for late in (-1, 1)]
+    (tmp_path / "ground_truth" / "groundtruth_2012-01-08.csv").write_text("".join(rows))
+    (frame,) = open_source(drive, InputSettings(dataset="nclt")).frames()
+    np.testing.assert_allclose(frame.points[:, :3], [[1, 1, -2], [75, 75, -70]], atol=1e-4)
+
+
 def test_truth_that_is_unknown_in_part(tmp_path: Path) -> None:
     """NCLT's files have rows of nan, such as at the start."""
     pytest.importorskip("kiss_icp")
