@@ -96,7 +96,7 @@ class OdometryChain:
         known = (self._segment[nodes] == self._segment[node]) & (uncertainty <= _SLACK + _DRIFT * meters)
         return np.where(known, meters, np.inf)
 
-    def of_one_drive(self, a: int, b: int) -> bool:
+    def in_same_segment(self, a: int, b: int) -> bool:
         """Whether two nodes are in one segment, though the odometry between them may be unknown."""
         return bool(self._segment[a] == self._segment[b])
 
@@ -196,7 +196,7 @@ class Consistency:
     def _motion_between(self, a: int, b: int) -> tuple[float, Array]:
         """Meters and T_a_b (4, 4) from one node to another: by odometry; for two drives through the map if both are in
         one part of it, else inf."""
-        if self._path.of_one_drive(a, b):
+        if self._path.in_same_segment(a, b):
             return self._path.between(a, b), self._path.T(a, b)
         T = self._T_in_map(a, b)
         return float(np.linalg.norm(T[:3, 3])) if self._parts[a] == self._parts[b] else np.inf, T

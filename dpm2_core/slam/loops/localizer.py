@@ -12,7 +12,7 @@ from dpm2_core.estimates import Keyframe, Registration, State, isotropic
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.loops.consistency import UNCERTAIN
-from dpm2_core.slam.loops.relocalization import FindsPlaces, nowhere
+from dpm2_core.slam.loops.relocalization import PlaceFinder, nowhere
 from dpm2_core.slam.loops.verification import looks_elsewhere
 
 LOST = isotropic(1.0, 100.0)
@@ -52,7 +52,7 @@ class Localizer:
         found: id of the last keyframe that was localized in the map; None before the first.
     """
 
-    def __init__(self, relocalizer: FindsPlaces) -> None:
+    def __init__(self, relocalizer: PlaceFinder) -> None:
         self._relocalizer = relocalizer
         self._hint: Array | None = None
         self.restart()

@@ -51,7 +51,7 @@ class RelocalizationSettings(Settings):
     """With a hint, keyframes farther from it than this are not candidates, m."""
 
 
-class FindsPlaces(Protocol):
+class PlaceFinder(Protocol):
     """Interface that a `Localizer` uses: see `Relocalizer`."""
 
     def find(self, keyframe: Keyframe, hint: Array | None = None) -> Registration:

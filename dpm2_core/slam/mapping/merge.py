@@ -16,7 +16,7 @@ from dpm2_core.slam.loops.closure import LoopCloser
 from dpm2_core.slam.mapping.parts import frame_of, parts_of, placed
 from dpm2_core.slam.mapping.restore import judged, restore
 from dpm2_core.slam.store.cloud_store import CloudStore, Loan
-from dpm2_core.slam.store.map_data import MapData, numbered_behind
+from dpm2_core.slam.store.map_data import MapData, renumbered_after
 
 _GIVEN_COVARIANCE = isotropic(0.05, 1.0)  # of a transform given by hand: any loop is more accurate
 FindLoops = Callable[[MapData, MapData], list[Edge]]
@@ -33,7 +33,7 @@ def merge_maps(a: MapData, b: MapData, T_a_b: Array, loops: Sequence[Edge] = ())
         T_a_b: (4, 4). loops: as returned by `FindLoops`.
     """
     n = len(a)
-    b = numbered_behind(b, n, max((session.number for session in a.sessions), default=0))
+    b = renumbered_after(b, n, max((session.number for session in a.sessions), default=0))
     moving = [*(a.clouds.moving(i) for i in range(n)), *(b.clouds.moving(i) for i in range(len(b)))]
     loans = {i: loan for i in range(n) if (loan := a.clouds.loan(i))}
     loans |= {n + i: Loan(n + loan.lender, loan.T_kf_lender) for i in range(len(b)) if (loan := b.clouds.loan(i))}

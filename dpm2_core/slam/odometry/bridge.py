@@ -60,8 +60,8 @@ class Bridge:
         agreed: whether most scans of the stretch agree on its pose, and only motion is missing to confirm it.
         tries: scans that were registered to the map before the pause, without those after which `agreed` was true: a
             robot that has halted shows no motion.
-        held: whether the scans were delayed in transport: the pause may have been as short as a period.
-        endless: time has gone back: the pause may be as short, or the stretch is another drive, from anywhere.
+        delayed: whether the scans were delayed in transport: the pause may have been as short as a period.
+        went_back: time has gone back: the pause may be as short, or the stretch is another drive, from anywhere.
     """
 
     def __init__(self, registration: ScanRegistration, motion: MotionState, left: float) -> None:
@@ -70,7 +70,7 @@ class Bridge:
         self.twist, self._twist_before = motion.twist, motion.known_twist
         self._speed = float(np.linalg.norm(self._twist_before[3:]))
         self.tries, self.agreed = 0, False
-        self.held = self._stepped = self.endless = False
+        self.delayed = self._stepped = self.went_back = False
         self._T, self._velocity_covariance, self._left = motion.T_registered, motion.velocity_covariance, left
         self._settings = motion.settings
         self._crossings: list[_Crossing] = []
@@ -92,7 +92,7 @@ class Bridge:
         """
         self._seconds = seconds = now - self._left
         self._stepped |= stepped
-        self.held = self._stepped or self.endless
+        self.delayed = self._stepped or self.went_back
         self._crossings.clear()
         self._twist_after: Array | None = None
         self._turning = None if imu is None else imu.turning
@@ -106,7 +106,7 @@ class Bridge:
         else:
             acceleration, velocity_covariance = self._settings.steadiness, self._velocity_covariance
             rotation_covariance = None if imu is None else imu.covariance(seconds)
-            pause = np.inf if self.endless else seconds
+            pause = np.inf if self.went_back else seconds
             self._begin_covariance = covariance(
                 self._speed, pause, acceleration, velocity_covariance, of_turn=rotation_covariance
             )
@@ -170,7 +170,7 @@ class Bridge:
         ends = list(self._begins)
         ends += [between(self._T, before + rate, after + rate, seconds, self._turning) for rate in rates]
         distance = seconds * float(np.linalg.norm(before[3:] + after[3:])) / 2
-        fractions = [f for f in _FRACTIONS if self.held or (1 - f) * distance <= _MAX_BRAKING * seconds**2 / 4]
+        fractions = [f for f in _FRACTIONS if self.delayed or (1 - f) * distance <= _MAX_BRAKING * seconds**2 / 4]
         ends += [between(self._T, f * before, f * after, seconds, self._turning) for f in fractions]
         poses = np.repeat(ends, len(offsets), 0)
         poses[:, :3, 3] += np.concatenate([offsets @ T[:3, :3].T for T in ends])
@@ -208,14 +208,14 @@ class Bridge:
         before, after = self.twist[3:], T_before_begin[:3, :3] @ self._twist_after[3:]
         displacement, mean = T_before_begin[:3, 3], (before + after) / 2
         seconds = self._seconds
-        if self.held:  # use the time that fits best
+        if self.delayed:  # use the time that fits best
             seconds = float(np.clip(displacement @ mean / (mean @ mean + 1e-9), 0.0, seconds))
         deviation = float(np.linalg.norm(displacement - seconds * mean))
         if deviation > _DISTANCE_MARGIN + self._settings.steadiness * self._seconds**2 / 4:
             return f"after a pause: {deviation:.0f} m from the prediction by the motion before and after"
         speeds, limit = np.linalg.norm([before, after], axis=1), self._settings.steadiness
         if (
-            not self.held
+            not self.delayed
             and speeds.min() > _MIN_DRIVING
             and before @ after > 0
             and speeds.sum() < limit * self._seconds

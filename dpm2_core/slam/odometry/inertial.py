@@ -217,7 +217,7 @@ class InertialMotion:
         """`turning` from the stamp `before` to `stamp`, ns; None if it is not known or not credible."""
         return self._integrate_rates(stamp, before) if self._doubt.is_credible and stamp > before else None
 
-    def denied(self, scans: Array, seconds: float) -> bool:
+    def contradicted_by(self, scans: Array, seconds: float) -> bool:
         """Whether scans with a rotation (3, 3) in the `seconds` since the last registered frame contradict the IMU's.
 
         The scans of a drive's first map are de-skewed by the IMU before any scan has confirmed it.

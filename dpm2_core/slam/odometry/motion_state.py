@@ -16,7 +16,7 @@ from dpm2_core.slam.odometry.inertial import InertialMotion, Reckoned
 from dpm2_core.slam.odometry.open_way import OpenWay
 from dpm2_core.slam.odometry.other import OtherMotion, Step
 from dpm2_core.slam.odometry.settings import OdometrySettings
-from dpm2_core.slam.registration.swept import Beginning, Swept, begun_steadily
+from dpm2_core.slam.registration.swept import SweepPrior, Swept, begun_steadily
 
 _GYROSCOPE_SIGMA = np.radians(0.4)
 """Standard deviation of a measured rotation next to the points, rad; points that determine the heading outweigh it. At
@@ -42,7 +42,7 @@ class MotionState:
         sweep: the motion during the sweep of the last registered frame, if its points have shown it.
         change: (6,) change of the twist from one registered frame to the next.
         velocity_covariance: (3, 3) of the twist's velocity, m/s.
-        left_open: covariance (3, 3), m, of the last step in directions that the scene does not constrain; else zero.
+        open_covariance: (3, 3), m, of the last step in directions that the scene does not constrain; else zero.
         T_registered, seconds: the last registered pose (4, 4), and the time from it to the last frame.
         inertial: the IMU, once a frame had samples. reckoned: the motion to the current frame by the IMU, if it is
             known. other: another odometry, once a frame had a guess.
@@ -55,7 +55,7 @@ class MotionState:
         self.twist: Array | None = None
         self.sweep: Swept | None = None
         self.change = np.zeros(6)
-        self.velocity_covariance, self.left_open = ANY_VELOCITY, np.zeros((3, 3))
+        self.velocity_covariance, self.open_covariance = ANY_VELOCITY, np.zeros((3, 3))
         self.T_registered, self.seconds = np.eye(4), 0.0
         self.inertial: InertialMotion | None = None
         self.reckoned: Reckoned | None = None
@@ -134,15 +134,15 @@ class MotionState:
 
     def predicted(self, twist: Array, dt: float) -> Array:
         """Pose (4, 4) of a frame, `dt` s after the previous one, by the IMU's dead reckoning if available."""
-        return self.steadily(twist, dt) if self.reckoned is None else self.T_registered @ self.reckoned.T
+        return self.at_constant_velocity(twist, dt) if self.reckoned is None else self.T_registered @ self.reckoned.T
 
-    def steadily(self, twist: Array, dt: float) -> Array:
+    def at_constant_velocity(self, twist: Array, dt: float) -> Array:
         """Pose (4, 4) at a constant velocity; if an IMU measured the rotation, from the last registered frame on."""
         if self.turning is None:
             return predicted(self.T, twist, dt)
         return predicted(self.T_registered, twist, self.seconds + dt, self.turning)
 
-    def of_prediction(self, seconds: float) -> Array:
+    def prediction_covariance(self, seconds: float) -> Array:
         """Covariance (6, 6) [rad, m] of a pose that is predicted from one registered `seconds` before."""
         result = spread(self.settings.steadiness * seconds * seconds, seconds, self.velocity_covariance)
         if (rotation_covariance := self._rotation_covariance(seconds)) is not None:
@@ -151,12 +151,12 @@ class MotionState:
 
     def information(self, seconds: float) -> Array:
         """Information (6, 6) of a pose that is predicted from one registered `seconds` before."""
-        covariance = self.of_prediction(seconds)
+        covariance = self.prediction_covariance(seconds)
         if self.turn is not None:
             covariance[:3, :3] += _GYROSCOPE_SIGMA**2 * np.eye(3)
         return np.linalg.inv(covariance).astype(np.float64)
 
-    def beginning(self, T: Array, seconds: float, half: float) -> Beginning:
+    def sweep_prior(self, T: Array, seconds: float, half: float) -> SweepPrior:
         """Prior for the sweep of a frame at T (4, 4), `seconds` after the last registered one.
 
         The sweep began `half` s before.
@@ -208,9 +208,9 @@ class MotionState:
         self.register(registration, stamp, moved, by_imu)
         self.sweep = swept
         self._open_seconds = self._open_seconds + seconds if registration.worst_sigma >= OPEN else 0.0
-        self.left_open = np.zeros((3, 3))
+        self.open_covariance = np.zeros((3, 3))
         if moved and self._open_seconds:
-            total, self.left_open = self._open_covariances(registration.of_scene[3:, 3:], seconds)
+            total, self.open_covariance = self._open_covariances(registration.of_scene[3:, 3:], seconds)
             self.covariance[3:, 3:] += total
 
     def _open_covariances(self, of_scene: Array, seconds: float) -> tuple[Array, Array]:
@@ -253,9 +253,9 @@ class MotionState:
     def _update_motion(self, registration: Registration, seconds: float, led: bool, swept: Swept | None) -> None:
         """Update the motion from the last registered frame to the one `seconds` later."""
         step = self.other.step if led and self.other is not None else None
-        of_prediction = self.of_prediction(seconds) if step is None else step.covariance
-        of_scene = turned_open(registration.of_scene[3:, 3:], of_prediction[3:, 3:])
-        of_motion = combined(of_scene, of_prediction[3:, 3:])
+        prediction_covariance = self.prediction_covariance(seconds) if step is None else step.covariance
+        of_scene = turned_open(registration.of_scene[3:, 3:], prediction_covariance[3:, 3:])
+        of_motion = combined(of_scene, prediction_covariance[3:, 3:])
         self.velocity_covariance = of_motion / seconds**2
         # Not from the predicted pose of the previous frame: its error would count as motion in one period.
         T_step = se3.inverse(self.T_registered) @ registration.T_target_source
@@ -265,13 +265,13 @@ class MotionState:
         if self.other is not None:
             self.other.compare(T_step, registration.of_scene, seconds, led)
 
-    def opens(self, enclosed: bool, now: float) -> bool:
+    def leaves_enclosure(self, enclosed: bool, now: float) -> bool:
         """Whether a registered frame, at `now` s, is the first outside of an enclosure that may have moved (a lift)."""
         since = self._enclosed_since
         self._enclosed_since = None if not enclosed else now if since is None else since
         return not enclosed and since is not None and now - since >= _MIN_RIDE
 
-    def carry(self) -> None:
+    def add_ride_uncertainty(self) -> None:
         """Add the unknown motion with an enclosure, such as a lift, to the covariance."""
         R = self.T[:3, :3]
         added = np.zeros((6, 6))

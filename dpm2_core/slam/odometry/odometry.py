@@ -146,7 +146,7 @@ class Odometry:
         if self._bridge is not None and registration.ok:
             registration = self._cross_pause(self._bridge, scan, registration)
             T = registration.T_target_source
-        elif registration.ok and motion.opens(enclosed, self._clock.now):
+        elif registration.ok and motion.leaves_enclosure(enclosed, self._clock.now):
             registration = self._leave_enclosure(scan, registration)
         if motion.inertial is not None:
             T = motion.inertial.T_level_odom @ T
@@ -183,7 +183,7 @@ class Odometry:
         motion, imu = self._motion, self._motion.inertial
         if self._first is not None and imu is not None and match.result.ok:
             T_first_this = se3.inverse(motion.T) @ match.result.T_target_source
-            if imu.denied(T_first_this[:3, :3], motion.seconds + dt):
+            if imu.contradicted_by(T_first_this[:3, :3], motion.seconds + dt):
                 self._first, frame = replace(self._first, imu=None), replace(frame, imu=None)
         match = self._straighten(frame, match, twist, dt)
         known = motion.twist is not None and match.result.method not in ("none", "first")
@@ -204,7 +204,7 @@ class Odometry:
             motion.other = OtherMotion(self._settings.steadiness)
         if motion.other is not None:
             known = None if motion.twist is None else twist
-            motion.other.look(frame.guess, known, seconds, motion.of_prediction(seconds))
+            motion.other.look(frame.guess, known, seconds, motion.prediction_covariance(seconds))
         return frame, twist
 
     def _discard_first(self, dt: float) -> None:
@@ -241,7 +241,7 @@ class Odometry:
         if self._bridge is None:
             imu, reckoned, step = motion.inertial, motion.reckoned, None if motion.other is None else motion.other.step
             self._bridge = Bridge(self._registration, motion, self._clock.now - motion.seconds - dt)
-        self._bridge.endless |= self._clock.went_back
+        self._bridge.went_back |= self._clock.went_back
         self._clock.went_back = False
         self._registration, self._first = self._registration.fresh(), None
         T_other = None if step is None else motion.T_registered @ step.T
@@ -268,7 +268,7 @@ class Odometry:
 
     def _leave_enclosure(self, scan: Scan, registration: Registration) -> Registration:
         """The LiDAR leaves what enclosed it: a break, and a new map of what is seen outside."""
-        self._motion.carry()
+        self._motion.add_ride_uncertainty()
         self._record_break(loops=False)
         self._keyframes.request()
         self._registration = self._registration.fresh()
@@ -287,14 +287,14 @@ class Odometry:
         match = self._matcher.match(frame, scan, T_predicted, dt)
         usual = self._clock.usual or self._sweep.span
         if (burst := dt < _BURST_RATIO * usual) and self._bridge is not None:
-            self._bridge.held = True
+            self._bridge.delayed = True
         if motion.twist is None:
             return match, usual if burst else dt
         usual, result = usual or NOMINAL, match.result
         if DOUBTED[0] * usual <= dt <= DOUBTED[1] * usual or result.method == "none":
             return match, dt
-        T_usual = motion.steadily(motion.ahead, usual)
-        if dt < usual or not Prediction([T_predicted]).convinced(result):
+        T_usual = motion.at_constant_velocity(motion.ahead, usual)
+        if dt < usual or not Prediction([T_predicted]).fits_well(result):
             other = self._matcher.match(frame, scan, T_usual, usual)
             if fits_better(other.result, result):
                 match, result = other, other.result
@@ -336,7 +336,7 @@ class Odometry:
         if self._bridge is None:
             self._failures = 0
         motion.advance(result, dt, self._clock.stamp, match.led, match.swept)
-        self._keyframes.leave_open(motion.left_open)
+        self._keyframes.leave_open(motion.open_covariance)
         self._registration.update(match.scan, motion.T)
 
     def _state(self, registration: Registration, enclosed: bool) -> State:

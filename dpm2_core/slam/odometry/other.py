@@ -79,7 +79,7 @@ class _Motion:
         )
 
     @property
-    def is_judged(self) -> bool:
+    def is_long_enough(self) -> bool:
         meters = max(se3.magnitude(T)[0] for T in (self.T_other, self.T_scans))
         return meters >= _MIN_JUDGED[0] or self.seconds >= _MIN_JUDGED[1]
 
@@ -107,12 +107,12 @@ class OtherMotion:
         self._compared: _Motion | None = None  # motion since the last judgement
         self._doubt = Doubt(_NEWEST_WEIGHT, least=1.0)
 
-    def look(self, guess: Guess | None, twist: Array | None, seconds: float, of_prediction: Array) -> None:
+    def look(self, guess: Guess | None, twist: Array | None, seconds: float, prediction_covariance: Array) -> None:
         """Process the guess of a new frame, `seconds` after the last registered one.
 
         Args:
             twist: (6,) [rad/s, m/s] predicted for it; None if unknown.
-            of_prediction: covariance (6, 6) of the pose predicted by it.
+            prediction_covariance: (6, 6) of the pose predicted by it.
         """
         self._guess, self.step, self._raw_step, self.comparison, self._uncertain = guess, None, None, None, False
         if guess is None or self._registered_guess is None:
@@ -125,12 +125,12 @@ class OtherMotion:
         unregistered, unsteady = self._previous_guess is not self._registered_guess, self._is_unsteady(guess, seconds)
         if twist is not None:
             T_predicted = predicted(np.eye(4), twist, seconds)
-            impossible = se3.squared_sigmas(T_predicted, T, covariance + of_prediction) > _MAX_CHI2
+            impossible = se3.squared_sigmas(T_predicted, T, covariance + prediction_covariance) > _MAX_CHI2
             repeated = np.array_equal(self._registered_guess.T_other_lidar, guess.T_other_lidar)
             self._jumped = impossible or (unregistered and unsteady) or (self._jumped and (unregistered or repeated))
             if self._jumped or not self._doubt.is_credible:
                 return
-            self._uncertain = bool(np.trace(increase[3:, 3:]) > np.trace(of_prediction[3:, 3:]))
+            self._uncertain = bool(np.trace(increase[3:, 3:]) > np.trace(prediction_covariance[3:, 3:]))
             if self._uncertain:
                 return
         self.step = Step(T, covariance)
@@ -158,7 +158,7 @@ class OtherMotion:
             return
         step = _Motion(self._raw_step, T_scans, of_scene, seconds)
         motion = self._compared = step if self._compared is None else self._compared.and_then(step)
-        if motion.is_judged:
+        if motion.is_long_enough:
             covariance = motion.scans_covariance + _step_covariance(motion.T_other) + MAP_NOISE
             self._doubt.add(se3.squared_sigmas(motion.T_other, motion.T_scans, covariance))
             self._compared = None

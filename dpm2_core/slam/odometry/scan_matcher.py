@@ -87,12 +87,12 @@ class ScanMatcher:
             return match
         seconds, T_predicted = motion.seconds + dt, motion.predicted(twist, dt)
         turn = measured_turn(frame)
-        beginning = without_imu = motion.beginning(match.result.T_target_source, seconds, half)
+        sweep_prior = without_imu = motion.sweep_prior(match.result.T_target_source, seconds, half)
         if turn is not None and (measured := curve.fitted(turn, half)) is not None:
-            beginning = without_imu.turning(measured)
-        swept = self.registration.swept(match.scan, match.result, beginning)
+            sweep_prior = without_imu.turning(measured)
+        swept = self.registration.swept(match.scan, match.result, sweep_prior)
         if swept is None:
-            if beginning is not without_imu:  # find out whether the points or the IMU contradict it
+            if sweep_prior is not without_imu:  # find out whether the points or the IMU contradict it
                 swept = self.registration.swept(match.scan, match.result, without_imu)
             has_times = match.result.ok and len(match.scan.times) > 0
             match = match._replace(contradicted=has_times and swept is None)
@@ -139,7 +139,7 @@ class ScanMatcher:
         result = self.registration.register(scan, Prediction([T_predicted], widen, motion.information(seconds)))
         result = motion.gated(result, T_predicted, dt)
         # A wrong rotation leads to a wrong pose where the scan gets stuck: only that few of its points fit shows it.
-        if motion.turn is not None and not Prediction([T_predicted]).convinced(result):
+        if motion.turn is not None and not Prediction([T_predicted]).fits_well(result):
             without_imu = self._match_without_imu(frame, motion.twist, dt)
             if fits_better(without_imu.result, result):
                 scan, result = without_imu.scan, without_imu.result
@@ -169,19 +169,19 @@ class ScanMatcher:
         result = motion.gated(self.registration.register(scan, prediction), T, dt)
         # From a wrong step the scan gets stuck near the wrong pose: only the small part of fitting points shows that.
         agrees = result.ok and motion.other.agrees(motion.T_registered, result)
-        return (result if agrees else None), agrees and prediction.convinced(result)
+        return (result if agrees else None), agrees and prediction.fits_well(result)
 
     def _register_from_rest(self, scan: Scan, T: Array, dt: float) -> Registration:
         """While the velocity is unknown: the best of many starts; after a pause first with the motion before it."""
         if self.bridge is not None and self.bridge.twist is not None:
             expected = self.bridge.expected(T, dt)
             result = self.registration.register(scan, expected)
-            if expected.convinced(result):
+            if expected.fits_well(result):
                 return result
         for starts in starts_from_rest(T, self.settings.turns):
             prediction = Prediction(starts, widen=2.0)
             result = self.registration.register(scan, prediction)
-            if prediction.convinced(result):
+            if prediction.fits_well(result):
                 break
         return result
 

@@ -17,7 +17,7 @@ from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.icp import GeometricScanRegistration
 from dpm2_core.slam.registration.neural import NeuralScanRegistration
 from dpm2_core.slam.registration.protocol import CHI2_95, Prediction, agree, near
-from dpm2_core.slam.registration.swept import Beginning, Swept
+from dpm2_core.slam.registration.swept import SweepPrior, Swept
 
 _START_INFORMATION = np.diag(np.repeat([np.radians(2), 0.5], 3) ** -2.0)
 """Information of a network pose with a standard deviation of 2 degrees and 0.5 m: enough to initialize ICP."""
@@ -71,13 +71,13 @@ class FusedScanRegistration:
         points = None if self._always else self._geometric.located(scan, prediction)
         if points is not None:
             doubted = self._geometric.doubted(scan, prediction, points)
-            if _is_reliable(doubted, prediction) and not prediction.strays(doubted):
+            if _is_reliable(doubted, prediction) and not prediction.is_stray(doubted):
                 return doubted
         # Compare with the result before the doubt: with the doubt's large covariance everything agrees.
         return self._geometric.doubted(scan, prediction, self._combine_with_network(scan, prediction, points))
 
-    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
-        return self._geometric.swept(scan, result, beginning)
+    def swept(self, scan: Scan, result: Registration, sweep_prior: SweepPrior) -> Swept | None:
+        return self._geometric.swept(scan, result, sweep_prior)
 
     def _combine_with_network(self, scan: Scan, prediction: Prediction, points: Registration | None) -> Registration:
         """Combine with the network's registration; `points` is None if they are not registered yet (`always`)."""
@@ -127,7 +127,7 @@ class FusedScanRegistration:
                 # Where points fit anywhere, they fit best at a pose without motion.
                 return self._fall_back_on_network(scan, neural, prediction)
             return _contradicting_network(points, neural, prediction)
-        if prediction.strays(points):  # the motion has changed and the points are stuck at the predicted pose
+        if prediction.is_stray(points):  # the motion has changed and the points are stuck at the predicted pose
             from_network = self._register_from_network_pose(scan, neural)
             points = from_network if from_network.ok and agree(from_network, neural) else points
         if not self._always and _is_reliable(points, prediction):
@@ -200,13 +200,13 @@ def _is_reliable(points: Registration, prediction: Prediction) -> bool:
     Much of a scan after a large motion matches nothing in a young map of few beams. Both the network and the likelihood
     of the points then prefer the pose where the map was made, since the beams hit the same pattern there.
     """
-    fits = prediction.convinced(points) or prediction.expects(points.T_target_source)
+    fits = prediction.fits_well(points) or prediction.expects(points.T_target_source)
     return points.ok and fits and points.worst_sigma <= _CONSTRAINED_SIGMA
 
 
 def _contradicting_network(points: Registration, neural: Registration, prediction: Prediction) -> Registration:
     """The points' result, which contradicts the network; with a doubt unless the points fit well by themselves."""
-    if prediction.convinced(points):
+    if prediction.fits_well(points):
         return points.because(_difference_text(points, neural))
     return _covering_both(points, neural)
 

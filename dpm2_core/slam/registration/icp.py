@@ -23,7 +23,7 @@ from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.local_map import LocalMap
 from dpm2_core.slam.registration.point_to_plane import linearize
 from dpm2_core.slam.registration.protocol import Prediction, fits_better, near
-from dpm2_core.slam.registration.swept import Beginning, Swept, register_sweep
+from dpm2_core.slam.registration.swept import SweepPrior, Swept, register_sweep
 
 
 class GeometricSettings(Settings):
@@ -129,13 +129,13 @@ class GeometricRegistration:
         result = Registration(T, _covariance(H), ratio, rmse, "geometric", ok, reason)
         return with_calibration(result, target.from_nearest_scan(T))
 
-    def swept(self, scan: Scan, target: LocalMap, T: Array, beginning: Beginning) -> Swept | None:
+    def swept(self, scan: Scan, target: LocalMap, T: Array, sweep_prior: SweepPrior) -> Swept | None:
         """Pose and motion of the sweep of a scan that was registered at T (4, 4) as a rigid scan; None if its points
         have no times."""
         if not len(scan.times) or len(target) < self.settings.min_points:
             return None
         gate = 2 * self.settings.final_gate  # the ends of the sweep are farther from the map than its middle
-        return register_sweep(scan, lambda points, T: self._match(points, target, T, gate), T, beginning, CORRELATED)
+        return register_sweep(scan, lambda points, T: self._match(points, target, T, gate), T, sweep_prior, CORRELATED)
 
     def likeliest(self, source: Array, target: LocalMap, found: Sequence[Registration]) -> Registration:
         """The best of several results, with a covariance that covers the farthest that is nearly as likely."""
@@ -216,8 +216,8 @@ class GeometricScanRegistration:
     def register(self, scan: Scan, prediction: Prediction) -> Registration:
         return self.doubted(scan, prediction, self.located(scan, prediction))
 
-    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
-        return self._registration.swept(scan, self._local_map, result.T_target_source, beginning)
+    def swept(self, scan: Scan, result: Registration, sweep_prior: SweepPrior) -> Swept | None:
+        return self._registration.swept(scan, self._local_map, result.T_target_source, sweep_prior)
 
     def located(self, scan: Scan, prediction: Prediction) -> Registration:
         """As `register`, without the check for points that move together."""
@@ -228,7 +228,7 @@ class GeometricScanRegistration:
         found = [self._registration.register(scan.source, self._local_map, T, p.widen, p.information) for T in starts]
         if len(found) > 1:
             return self._registration.likeliest(scan.source, self._local_map, found)
-        if p.known and (not p.convinced(found[0]) or p.strays(found[0])):
+        if p.known and (not p.fits_well(found[0]) or p.is_stray(found[0])):
             return self._register_after_jolt(scan.source, p, found[0])
         return found[0]
 

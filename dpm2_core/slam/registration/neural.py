@@ -21,7 +21,7 @@ from dpm2_core.slam.preprocess import Preprocessor, Scan
 from dpm2_core.slam.registration.descriptor_map import DescriptorMap
 from dpm2_core.slam.registration.protocol import Prediction, agree
 from dpm2_core.slam.registration.spacing import Spacing
-from dpm2_core.slam.registration.swept import Beginning, Swept
+from dpm2_core.slam.registration.swept import SweepPrior, Swept
 
 if TYPE_CHECKING:  # torch takes seconds to import, and the geometric SLAM does without
     from dpm2_core.network.model import DeepPointMap2
@@ -117,7 +117,7 @@ class NeuralScanRegistration:
                 return result.rejected("contradicts the motion so far")
         return result
 
-    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+    def swept(self, scan: Scan, result: Registration, sweep_prior: SweepPrior) -> Swept | None:
         return None
 
     def _register_near(self, scan: Scan, T_near: Array, frames: int) -> Registration:

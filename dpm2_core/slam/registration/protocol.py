@@ -13,7 +13,7 @@ from dpm2_core.estimates import Registration, isotropic
 from dpm2_core.frame import Array, Frame
 from dpm2_core.geometry import se3
 from dpm2_core.slam.preprocess import Scan
-from dpm2_core.slam.registration.swept import Beginning, Swept
+from dpm2_core.slam.registration.swept import SweepPrior, Swept
 
 _NEAR_LIMITS = (0.3, 2.0)  # m and degrees from the prediction; hard braking makes 0.1 m in 0.1 s
 _EXACT_DISTANCE = 0.1  # m
@@ -82,7 +82,7 @@ class Prediction:
         xi = se3.way(self.starts[0], T_odom_lidar)
         return bool(xi @ self.information @ xi <= 1.0 and np.linalg.norm(xi[3:]) <= _EXACT_DISTANCE)
 
-    def convinced(self, points: Registration) -> bool:
+    def fits_well(self, points: Registration) -> bool:
         """Whether a point registration fits well enough to be accepted, if it leaves no direction unconstrained.
 
         With an unknown motion more points must fit: of 54 poses between the two values 3 were wrong, of 1,047 above 4
@@ -90,7 +90,7 @@ class Prediction:
         """
         return points.ok and points.confidence >= (0.7 if self.known else 0.75)
 
-    def strays(self, points: Registration) -> bool:
+    def is_stray(self, points: Registration) -> bool:
         """Whether a point registration is away from the predicted pose, and not nearly all of its points fit.
 
         After a jolt the points may be matched to the wrong walls: after a rotation of 10 degrees between scans 77 %
@@ -130,7 +130,7 @@ class ScanRegistration(Protocol):
         """Find the pose of a scan; needs a map."""
         ...
 
-    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
+    def swept(self, scan: Scan, result: Registration, sweep_prior: SweepPrior) -> Swept | None:
         """The motion during the sweep of a registered scan; None: the scan does not show it."""
         ...
 

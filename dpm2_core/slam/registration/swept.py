@@ -37,7 +37,7 @@ Matched = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
-class Beginning:
+class SweepPrior:
     """Prior of a sweep before it is registered.
 
     Attributes:
@@ -53,7 +53,7 @@ class Beginning:
     expected: Array
     deviation: Array
 
-    def turning(self, measured: Array) -> Beginning:
+    def turning(self, measured: Array) -> SweepPrior:
         """The same with the rotation during the sweep measured by an IMU, its derivatives (ORDER, 3)."""
         expected, deviation = self.expected.copy(), self.deviation.copy()
         expected[:, :3] = measured
@@ -84,7 +84,7 @@ class Swept:
         motion = self.motion + (gain @ difference)[6:].reshape(ORDER, 6)
         return replace(self, T=T, motion=motion, covariance=self.covariance - gain @ self.covariance[:6])
 
-    def next(self, seconds: float, half: float, steadiness: float) -> Beginning:
+    def next(self, seconds: float, half: float, steadiness: float) -> SweepPrior:
         """The prior of a sweep whose middle is `seconds` later."""
         pause = max(seconds - self.half - half, 0.0)
         J_end = _state_jacobian(self.half)
@@ -94,7 +94,7 @@ class Swept:
         added_variance = np.repeat([steadiness * pause * pause / 2, steadiness * pause], 6) ** 2
         twist = _twist(J_end, self.motion)
         T = self.T @ curve.poses(self.half, self.motion) @ se3.exp(pause * twist)
-        return Beginning(
+        return SweepPrior(
             T,
             twist,
             J_next @ self.covariance @ J_next.T + np.diag(added_variance) + JOINT,
@@ -103,17 +103,17 @@ class Swept:
         )
 
 
-def begun_steadily(T_before: Array, twist: Array, seconds: float, half: float, steadiness: float) -> Beginning:
+def begun_steadily(T_before: Array, twist: Array, seconds: float, half: float, steadiness: float) -> SweepPrior:
     """The prior of a sweep whose middle is `seconds` after the pose T_before (4, 4), if only the twist (6,) between the
     two is known."""
     sigma = steadiness * seconds / 2
     covariance = np.diag(np.repeat([sigma * half, sigma], 6) ** 2)
-    return Beginning(
+    return SweepPrior(
         T_before @ se3.exp((seconds - half) * twist), twist, covariance, half, *_steady_prior(half, steadiness)
     )
 
 
-def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning, shared: float) -> Swept | None:
+def register_sweep(scan: Scan, matched: Matched, T: Array, sweep_prior: SweepPrior, shared: float) -> Swept | None:
     """Pose and motion of a sweep by least squares, starting from a pose T (4, 4) and a constant motion. None if they
     contradict the prior: the times of the points are wrong, or they are matched to the wrong walls.
 
@@ -121,16 +121,16 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
         scan: with times relative to the middle of the sweep. matched: matches points with the map.
         shared: number of points that count as one, since the points of a plane are not independent.
     """
-    motion = np.concatenate([beginning.twist[None], np.zeros((ORDER - 1, 6))])
-    information = np.linalg.inv(beginning.covariance)
-    expected = np.concatenate([np.zeros(6), beginning.expected.ravel()])
-    motion_information = np.concatenate([np.zeros(6), beginning.deviation.ravel() ** -2])
-    J_start = _state_jacobian(-beginning.half)
+    motion = np.concatenate([sweep_prior.twist[None], np.zeros((ORDER - 1, 6))])
+    information = np.linalg.inv(sweep_prior.covariance)
+    expected = np.concatenate([np.zeros(6), sweep_prior.expected.ravel()])
+    motion_information = np.concatenate([np.zeros(6), sweep_prior.deviation.ravel() ** -2])
+    J_start = _state_jacobian(-sweep_prior.half)
     for _ in range(_ITERATIONS):
         points = curve.moved(scan.seen, scan.times, partial(curve.poses, motion=motion))
         H, gradient = _normal_equations(points, scan.times, T, matched(points, T), shared)
-        T_start = T @ curve.poses(-beginning.half, motion)
-        difference = np.concatenate([se3.way(beginning.T, T_start), _twist(J_start, motion) - beginning.twist])
+        T_start = T @ curve.poses(-sweep_prior.half, motion)
+        difference = np.concatenate([se3.way(sweep_prior.T, T_start), _twist(J_start, motion) - sweep_prior.twist])
         H += J_start.T @ information @ J_start + np.diag(motion_information + 1e-9)
         gradient += J_start.T @ information @ difference + motion_information * (
             np.concatenate([np.zeros(6), motion.ravel()]) - expected
@@ -138,13 +138,13 @@ def register_sweep(scan: Scan, matched: Matched, T: Array, beginning: Beginning,
         step = np.linalg.solve(H, -gradient)
         T, change = T @ se3.exp(step[:6]), step[6:].reshape(ORDER, 6)
         motion = motion + change
-        moved = np.abs([step[:6], beginning.half * change[0]]).reshape(4, 3).max(1)
+        moved = np.abs([step[:6], sweep_prior.half * change[0]]).reshape(4, 3).max(1)
         if max(moved[0], moved[2]) < _STEP_LIMITS[0] and max(moved[1], moved[3]) < _STEP_LIMITS[1]:
             break
     if difference @ information @ difference > _CHI2:
         return None
     T = se3.orthonormalized(T)  # removes accumulated rounding errors
-    return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), beginning.half)
+    return Swept(T, motion, np.asarray(np.linalg.inv(H), np.float64), sweep_prior.half)
 
 
 def _normal_equations(
@@ -158,7 +158,7 @@ def _normal_equations(
 
 
 def _steady_prior(half: float, steadiness: float) -> tuple[Array, Array]:
-    """`expected` and `deviation` of a `Beginning`: an acceleration with this standard deviation (m/s2 and rad/s2),
+    """`expected` and `deviation` of a `SweepPrior`: an acceleration with this standard deviation (m/s2 and rad/s2),
     which may reverse in half a sweep."""
     deviation = [np.inf, *(steadiness * (2 / half) ** k for k in range(ORDER - 1))]
     return np.zeros((ORDER, 6)), np.repeat(np.array(deviation)[:, None], 6, 1)

@@ -18,7 +18,7 @@ from dpm2_core.geometry.deskew import placed
 from dpm2_core.slam.preprocess import Scan
 from dpm2_core.slam.registration.intensity import IntensitySearch
 from dpm2_core.slam.registration.protocol import Prediction, ScanRegistration, agree
-from dpm2_core.slam.registration.swept import Beginning, Swept
+from dpm2_core.slam.registration.swept import SweepPrior, Swept
 from dpm2_core.slam.registration.texture import Reference, VisualSettings, along, reference, textured
 
 _BASELINE = 3.0  # m: distance after which the reference image is replaced
@@ -61,8 +61,8 @@ class VisualScanRegistration:
         self._fully_constrained = result.ok and result.worst_sigma <= self._open_sigma
         return result
 
-    def swept(self, scan: Scan, result: Registration, beginning: Beginning) -> Swept | None:
-        return self._registration.swept(scan, result, beginning)
+    def swept(self, scan: Scan, result: Registration, sweep_prior: SweepPrior) -> Swept | None:
+        return self._registration.swept(scan, result, sweep_prior)
 
     def update(self, scan: Scan, T_odom_lidar: Array) -> bool:
         if scan.images and self._needs_reference(T_odom_lidar):

@@ -198,7 +198,7 @@ def append_map(store: MapStore, data: MapData) -> None:
         Dpm2Error: it could not be written.
     """
     first = store.size
-    data = numbered_behind(data, first, max((row[0] for row in store.rows("sessions", "session")), default=0))
+    data = renumbered_after(data, first, max((row[0] for row in store.rows("sessions", "session")), default=0))
     store.add_sessions(data.sessions)
     ending: dict[int, list[Edge]] = {}
     for edge in data.edges:
@@ -218,7 +218,7 @@ def append_map(store: MapStore, data: MapData) -> None:
     store.write(Change(trail=data.trail, georeference=None if first else data.georeference))
 
 
-def numbered_behind(data: MapData, nodes: int, sessions: int) -> MapData:
+def renumbered_after(data: MapData, nodes: int, sessions: int) -> MapData:
     """A map with edges, trail and sessions renumbered, to follow this number of nodes and sessions of another map."""
     return replace(
         data,
