@@ -39,7 +39,7 @@ def export_map(
     """
     if tiles is not None:
         if format or voxel is not None or resolution is not None:
-            raise UsageError("--tiles: squares of the map as it is; --format, --voxel and --resolution do not apply")
+            raise UsageError("--tiles: writes map files, to which --format, --voxel and --resolution do not apply")
         with MapStore.open(path) as store:
             count = write_tiles(_tied(_loaded(store), out), out, tiles)
         note(f"{out} written: {count} tiles")
@@ -54,7 +54,7 @@ def export_map(
     if kind == "occupancy" and out.suffix not in (".yaml", ".pgm"):
         out = out.with_name(f"{out.name}.yaml")
     if out.exists() and out.samefile(path):
-        raise UsageError(f"{out}: is the map itself")
+        raise UsageError(f"{out}: is the input map; choose another file")
     with MapStore.open(path) as store:
         write(_loaded(store), out, spacing.get(requested) or _SPACING[requested])
     note(f"{out} written")
@@ -69,7 +69,7 @@ def _loaded(store: MapStore) -> MapData:
     say_what_is_missing(store)
     data = load_map(store, descriptors=False)
     if not len(data):
-        raise UsageError(f"{store.path}: no keyframe in it yet")
+        raise UsageError(f"{store.path}: the map has no keyframes")
     return data
 
 
@@ -88,7 +88,7 @@ def _say_without(out: Path, drives: Iterable[Way], written: Iterable[Way], reaso
             count[way.robot, way.session] += len(way.poses)
     for (robot, session), missing in sorted((whole - left).items()):
         name = f"session {session} of {robot}" if robot else f"session {session}"
-        note(f"{out}: without {missing} of the {whole[robot, session]} keyframes of {name}: {reason}")
+        note(f"{out}: {missing} of the {whole[robot, session]} keyframes of {name} are left out: {reason}")
 
 
 def _cloud(data: MapData, out: Path, voxel: float) -> Points:
@@ -99,7 +99,9 @@ def _cloud(data: MapData, out: Path, voxel: float) -> Points:
 def _export_geojson(data: MapData, out: Path) -> None:
     placed, features = placed_on_earth(data), []
     if np.isnan(placed.poses).all():
-        raise UsageError(f"{out}: the map has no georeference; {unplaced(data) or 'see input.gnss_topic'}")
+        raise UsageError(
+            f"{out}: the map has no georeference: {unplaced(data) or 'no GNSS fixes; see input.gnss_topic'}"
+        )
     drives = ways(placed)
     known = [replace(way, poses=way.poses[np.isfinite(way.poses).all(axis=(1, 2))]) for way in drives]
     reason = "neither their own fixes nor those of keyframes connected by loops give their position"

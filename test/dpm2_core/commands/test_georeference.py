@@ -186,7 +186,7 @@ def test_a_drive_that_nothing_ties_to_the_map_is_written_where_its_own_fixes_are
 def test_a_drive_that_nothing_places_is_left_out_and_named(tmp_path: Path) -> None:
     save_as(two_drives(fixes=False), tmp_path / "map")
     done = succeeded("map", "export", tmp_path / "map", tmp_path / "a.geojson")
-    assert "without 40 of the 40 keyframes of session 2" in done.stderr
+    assert "40 of the 40 keyframes of session 2 are left out" in done.stderr
     assert set(lines_of(tmp_path / "a.geojson")) == {1}
 
 
@@ -241,7 +241,7 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
     shown = " ".join(dpm2("map", "info", tmp_path / "map").stdout.split())
     assert "georeference - (40 fixes are of keyframes that no loop connects to the first)" in shown
     done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.geojson")
-    assert "without 40 of the 40 keyframes of session 1: neither their own fixes" in done.stderr
+    assert "40 of the 40 keyframes of session 1 are left out: neither their own fixes" in done.stderr
     lines = lines_of(tmp_path / "a.geojson")
     assert set(lines) == {2}
     np.testing.assert_allclose(lines[2], data.poses[40:, :3, 3] + FAR, atol=0.01)  # the file has mm
@@ -256,7 +256,7 @@ def test_fixes_of_a_drive_that_is_not_tied_to_the_first_place_that_drive_alone(t
 
 def test_a_map_without_one_says_so(map_file: Path, tmp_path: Path) -> None:
     error = refused("map", "export", map_file, tmp_path / "a.geojson")
-    assert error.strip().endswith("the map has no georeference; see input.gnss_topic")
+    assert error.strip().endswith("the map has no georeference: no GNSS fixes; see input.gnss_topic")
     assert not (tmp_path / "a.geojson").exists()
     assert "georeference" in dpm2("map", "info", map_file).stdout
 
