@@ -203,10 +203,10 @@ def test_a_drive_of_which_all_is_pruned_is_written_and_where_nothing_places_it_n
     lines = lines_of(tmp_path / "a.geojson")
     assert sorted(lines) == [1, 3]
     np.testing.assert_allclose(lines[3], (data.poses[:20] @ beside)[:, :3, 3], atol=0.01)  # the file has mm
-    assert "without 10 of the 10 keyframes of session 4" in done.stderr
+    assert "10 of the 10 keyframes of session 4 are left out" in done.stderr
     done = dpm2("map", "export", tmp_path / "map", tmp_path / "a.tum")
     assert len(read_trajectory(tmp_path / "a.tum")) == 60
-    assert "without 10 of the 10 keyframes of session 4" in done.stderr
+    assert "10 of the 10 keyframes of session 4 are left out" in done.stderr
 
 
 def test_only_fixes_that_are_in_the_graph_count_as_used(tmp_path: Path) -> None:

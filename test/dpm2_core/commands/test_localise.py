@@ -138,10 +138,10 @@ def test_another_drive_extends_the_map_as_a_session_tied_by_loops(recording: Pat
     [
         (["--localise", "/nowhere.dpm2map"], "/nowhere.dpm2map: no such map file"),
         (["--localise", "MAP", "--hint", "1,2"], "--hint 1,2: want x,y,yaw"),
-        (["--localise", "MAP", "--hint", "1,2,nan"], "not finite"),
-        (["--localise", "MAP", "--map", "MAP"], "cannot be combined with --map"),
+        (["--localise", "MAP", "--hint", "1,2,nan"], "want finite numbers"),
+        (["--localise", "MAP", "--map", "MAP"], "omit --map and --gt"),
         (["--hint", "1,2,3"], "only with --localise"),
-        (["--map", "MAP", "--resume", "--extend"], "they cannot be combined"),
+        (["--map", "MAP", "--resume", "--extend"], "give only one of them"),
         (["--map", "/nowhere.dpm2map", "--extend"], "--extend: /nowhere.dpm2map: no such map file"),
         (["--localise", "NONE"], "no keyframe has descriptors"),
         (["--localise", "OTHER"], "made with weights other 0123"),

@@ -297,7 +297,9 @@ def test_what_nothing_ties_to_the_first_keyframe_is_left_out_and_named(tmp_path:
     for name in ("a.ply", "a.pcd", "a.html", "a.pgm", "a.tum"):
         for path in ("apart", "alone"):
             done = succeeded("map", "export", tmp_path / path, tmp_path / f"{path}.{name}")
-            assert (f"12 of the 12 keyframes of {drive} are left out: no loop connects" in done.stderr) == (path == "apart")
+            assert (f"12 of the 12 keyframes of {drive} are left out: no loop connects" in done.stderr) == (
+                path == "apart"
+            )
         if name != "a.html":  # the page has a title
             assert (tmp_path / f"apart.{name}").read_bytes() == (tmp_path / f"alone.{name}").read_bytes()
     assert len(read_trajectory(tmp_path / "apart.a.tum").keys) == 12
