@@ -151,7 +151,7 @@ class Cluster:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = [node.get("CPU", 0) for node in nodes]
         if max(cpus, default=0) < 1:
-            raise UsageError(f"--ray {self._address}: no node of that cluster has a processor to work with")
+            raise UsageError(f"--ray {self._address}: no node of this cluster offers a processor")
         return {"CPU": max(cpus), "memory": max(node.get("memory", 0) for node in nodes), "window": 4 * sum(cpus)}
 
     def _submit(self, ray: Any, part: Part, out: Path, limits: Mapping[str, float]) -> Any:
@@ -203,7 +203,7 @@ def _check_address(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), _CONNECT_TIMEOUT).close()
     except (OSError, OverflowError) as error:
-        raise ConnectionError(f"nobody answers there: {error}") from None
+        raise ConnectionError(f"no answer from this address: {error}") from None
 
 
 class _ProgressBoard:
@@ -236,7 +236,7 @@ def _attempt(part: Part, out: Path, board: Any, version: str) -> Outcome:
 
     try:
         if version != __version__:
-            raise Dpm2Error(f"{socket.gethostname()} has dpm2 {__version__}, the caller {version}")
+            raise Dpm2Error(f"{socket.gethostname()} has dpm2 {__version__}, but the fleet was started with {version}")
         return Outcome(part.name, "done", do_part(part, out, advance))
     except Dpm2Error as error:
         return Outcome(part.name, "failed", reason=str(error))
@@ -252,7 +252,7 @@ def _outcome(ray: Any, name: str, reference: Any) -> Outcome:
     except ray.exceptions.OutOfMemoryError:
         return Outcome(name, "failed", reason="its worker was killed: the machine ran out of memory")
     except ray.exceptions.RayTaskError as error:
-        return Outcome(name, "failed", reason=f"not sent back: {error.cause}")
+        return Outcome(name, "failed", reason=f"the result could not be sent back: {error.cause}")
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return Outcome(name, "failed", reason=f"{ATTEMPTS} workers died while processing it: {lines[0]}")

@@ -64,7 +64,9 @@ def read_drives(given: Sequence[Path]) -> list[ManifestDrive]:
     duplicates = [name for name, count in Counter(drive.name for drive in resolved).items() if count > 1]
     if duplicates:
         paths = " and ".join(drive.path for drive in resolved if drive.name == duplicates[0])
-        raise UsageError(f"{paths}: both would be called {duplicates[0]}; a list (docs/fleet.md) can give them names")
+        raise UsageError(
+            f"{paths}: both would have the name {duplicates[0]}; a list (docs/fleet.md) can give them names"
+        )
     return resolved
 
 
@@ -72,7 +74,7 @@ def _resolved(drive: ManifestDrive, root: Path) -> ManifestDrive:
     path = (root / drive.path).resolve()
     name = drive.name or (path.stem if path.is_file() else path.name)
     if not name or name.startswith(".") or "/" in name:
-        raise UsageError(f"{drive.path}: {name!r} is no name for a folder")
+        raise UsageError(f"{drive.path}: {name!r} cannot be the name of a folder")
     gt = str((root / drive.gt).resolve()) if drive.gt else ""
     return drive.model_copy(update={"path": str(path), "name": name, "gt": gt})
 

@@ -94,7 +94,9 @@ def begin_or_resume(
 def check_one_process(command: str) -> None:
     """Raise UsageError under torchrun, for a command whose processes would all do the same work in the same folder."""
     if _processes() > 1:
-        raise UsageError(f"dpm2 {command}: works in one process; torchrun is for dpm2 train image, phase1 and phase2")
+        raise UsageError(
+            f"dpm2 {command}: start it without torchrun, which works only with dpm2 train image, phase1 and phase2"
+        )
 
 
 def is_first_process() -> bool:

@@ -39,7 +39,7 @@ def folder_lock(folder: Path, shared: bool = False) -> Iterator[None]:
         fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        raise UsageError(f"{folder}: another training is writing here; choose another --out") from None
+        raise UsageError(f"{folder}: another training writes to this folder; choose another --out") from None
     except OSError:  # no locks, as on some network shares
         pass
     try:
@@ -80,11 +80,11 @@ def load_checkpoint(path: Path, module: nn.Module, ema: nn.Module, optimiser: to
     except OSError as error:
         raise UsageError(f"{path}: no checkpoint: {error.strerror}") from None
     if not is_whole:
-        raise UsageError(f"{path}: damaged, or not a checkpoint; remove it to begin anew, without --resume")
+        raise UsageError(f"{path}: damaged, or not a checkpoint; remove it and start again without --resume")
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)  # executes nothing
     except Exception:  # torch's message is about its own settings, such as how to execute code in the file
-        raise UsageError(f"{path}: not a checkpoint of this program") from None
+        raise UsageError(f"{path}: not a checkpoint of dpm2") from None
     try:
         module.load_state_dict(state["module"])
         ema.load_state_dict(state["ema"])

@@ -133,7 +133,7 @@ class Mixture:
             factors = [settings.emphasis.get(drive.preset, 1.0) for drive in found]
             chances += [weight * factor * len(drive) / frames for drive, factor in zip(found, factors, strict=True)]
         if not sum(chances) > 0:
-            raise UsageError("data.packed: want packed drives; `dpm2 train data` and `dpm2 train pack` make some")
+            raise UsageError("data.packed: no packed drives; make some with `dpm2 train data` or `dpm2 train pack`")
         self.drives: Sequence[PackedDrive] = drives
         self.chances = np.array(chances) / sum(chances)
 
@@ -154,7 +154,9 @@ class GroupDataset(Dataset[Batch]):
         self.settings, self.network, self.draw, self.seed = settings, network, draw, seed
         self.drives = Mixture(settings)
         if settings.images and not any(drive.has_images for drive in self.drives.drives):
-            raise UsageError("data.images: no packed drive of data.packed has images; data.images=false learns without")
+            raise UsageError(
+                "data.images: no drive of data.packed has images; set data.images=false to train without them"
+            )
         for drive in self.drives.drives:
             check_fits(drive, network, settings.images)
 

@@ -109,7 +109,7 @@ def prepare(
     for folder in (out / DRIVES, out / HELD_OUT):
         if leftover := sorted({path.name for path in folder.glob("*/")} - set(names)):
             raise UsageError(
-                f"{folder / leftover[0]}: of a drive that is not asked for; remove it, or choose another folder"
+                f"{folder / leftover[0]}: is of a drive that was not given; remove it, or choose another folder"
             )
     for name, source in zip(names, sources, strict=True):
         requested = {**common, "scans": len(source)}
@@ -120,7 +120,9 @@ def prepare(
         notes += [f"{name}: {text}" for text in referenced.notes]
         followed = int(known(referenced.poses).sum())
         if followed < 2 * settings.frames:
-            raise UsageError(f"{source.name}: the SLAM followed {followed} of {len(source)} scans; nothing to learn")
+            raise UsageError(
+                f"{source.name}: the SLAM has poses for only {followed} of {len(source)} scans; too few to train on"
+            )
         cut = round(len(source) * (1 - settings.held_out))
         packing = _text_progress(advance, f"{name}: packing")
         if _is_measurable(referenced.poses[cut:]):

@@ -197,7 +197,7 @@ def pack(
         UsageError: the source has no poses, or some of its frames lack an image that others have.
     """
     if source.poses is None:
-        raise UsageError(f"{source.name}: no ground truth poses, training needs them")
+        raise UsageError(f"{source.name}: no ground truth poses, which the training needs")
     chosen = frames or range(len(source))
     with packed_writer(folder) as writer:
         previous: tuple[Frame, Array] | None = None  # packed once the next pose is known, for its motion

@@ -100,7 +100,9 @@ class ImageDataset:
                 drive = self._drives.choose(noise)
                 a, b = (drive[i] for i in draw_group(drive.poses, noise, 2, settings.radius))
                 if not (a.images and b.images):
-                    raise UsageError(f"{drive.folder}: a drive without images; pack it with them or leave it out")
+                    raise UsageError(
+                        f"{drive.folder}: has no images; pack it with images or remove it from data.packed"
+                    )
                 seen = a.cloud[shown(a.cloud, a.images[0].camera)]
                 if len(seen) < points:
                     continue
@@ -109,7 +111,7 @@ class ImageDataset:
                 images += [[augment_image(s.images[0], np.eye(4), settings.augment, noise)] for s in (a, b)]
             views = collate_views(images, self._network.image)
             if views is None or len(images) < 2 * settings.groups:
-                raise UsageError(f"data.packed: hardly any image shows {points} points; lower `points`")
+                raise UsageError(f"data.packed: hardly any image shows {points} points; set a lower `points`")
             yield ImagePairs(views, torch.from_numpy(np.stack(drawn)))
 
 
@@ -130,7 +132,7 @@ class ImageTraining(nn.Module):
         self.temperature, self.shift = network.decoder.temperature, shift
         encoder = self.model.encoder
         if encoder.image is None or encoder.fusion is None or encoder.fusion.pixel is None:
-            raise UsageError(f"preset {network.preset}: has no image features of its own to train (fusion.pixel)")
+            raise UsageError(f"preset {network.preset}: has no features of single image pixels to train (fusion.pixel)")
         self.image, self.head = encoder.image, encoder.fusion.pixel
         self.requires_grad_(False)
         for part in (self.image, self.head):

@@ -184,7 +184,7 @@ class Trainer(Generic[M]):
             checkpoint = self.out / CHECKPOINT
             start = load_checkpoint(checkpoint, module, ema, optimizer) if checkpoint.exists() else 0
             if start > self.settings.steps:
-                raise UsageError(f"{self.out}: has {start} steps, optimiser.steps wants {self.settings.steps}")
+                raise UsageError(f"{self.out}: has {start} steps already, but optimiser.steps is {self.settings.steps}")
             steps = range(start, self.settings.steps if until is None else min(until, self.settings.steps))
             batches = self.batches(start, rank)
             wrapped = DistributedDataParallel(module, find_unused_parameters=True) if world > 1 else module
@@ -210,7 +210,7 @@ class Trainer(Generic[M]):
             if log is not None:
                 log.close()
                 if steps and skipped == len(steps):
-                    raise Dpm2Error(f"none of {len(steps)} steps had a finite gradient: nothing was learned")
+                    raise Dpm2Error(f"none of {len(steps)} steps had a finite gradient: the weights did not change")
                 self.save(ema)
 
     def _step(

@@ -98,7 +98,7 @@ def test_weights_to_start_from_have_a_name_as_everywhere(tmp_path: Path) -> None
     """Trainings accept the names of weights that come with dpm2, as other commands do; previously, they required the
     path."""
     done = dpm2("train", "phase1", "--out", tmp_path / "a", "--set", "start=small")
-    assert "data.packed: want packed drives" in done.stderr  # the weights were found
+    assert "data.packed: no packed drives" in done.stderr  # the weights were found
     (content,) = [
         key for key in json.loads((tmp_path / "a" / "begun.json").read_text()) if key.startswith("content of")
     ]

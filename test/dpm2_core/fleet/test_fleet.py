@@ -111,7 +111,7 @@ def test_without_ray_or_without_its_cluster_one_line_says_so(tmp_path: Path, mon
     ray = pytest.importorskip("ray", reason="no ray: pip install 'dpm2_ros[fleet]'")
     if ray.is_initialized():
         pytest.skip("this process is connected to a cluster, which is then used")
-    with pytest.raises(UsageError, match=r"^--ray 127\.0\.0\.1:9: nobody answers there"):
+    with pytest.raises(UsageError, match=r"^--ray 127\.0\.0\.1:9: no answer from this address"):
         Cluster("127.0.0.1:9").start()
 
     def slow(*arguments: object, **more: object) -> None:
@@ -256,8 +256,8 @@ def test_drives_of_a_manifest_have_names_and_settings_of_their_own(tmp_path: Pat
 @pytest.mark.parametrize(("text", "words"), [
     ("drives: []", "drives"),
     ("drives: [{path: a, speed: 3}]", "speed"),
-    ("drives: [{path: a}, {path: b/a}]", "both would be called a"),
-    ("drives: [{path: a, name: ../b}]", "no name for a folder"),
+    ("drives: [{path: a}, {path: b/a}]", "both would have the name a"),
+    ("drives: [{path: a, name: ../b}]", "cannot be the name of a folder"),
     ("drives: [{path: a, frames: x}]", "want a:b"),
 ])  # fmt: skip
 def test_a_bad_manifest_is_an_error_of_use(text: str, words: str, tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_processes_that_would_all_do_the_same_are_refused(
     places = {"DATA": str(tmp_path), "OUT": str(tmp_path / "out")}
     done = dpm2(*(places.get(word, word) for word in command))
     assert done.returncode == 2
-    assert "works in one process; torchrun is for dpm2 train image, phase1 and phase2" in done.stderr
+    assert "start it without torchrun, which works only with dpm2 train image, phase1 and phase2" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

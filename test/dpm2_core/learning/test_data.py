@@ -55,7 +55,7 @@ def test_an_unfinished_drive_is_not_opened(packed: Path, samples: list[Sample], 
 
 @pytest.mark.parametrize("weight", [0, None])
 def test_without_a_drive_of_some_weight_there_is_nothing_to_learn(packed: Path, weight: float | None) -> None:
-    with pytest.raises(UsageError, match=r"data\.packed: want packed drives"):
+    with pytest.raises(UsageError, match=r"data\.packed: no packed drives"):
         Mixture(DataSettings(packed={} if weight is None else {str(packed): weight}))
 
 
@@ -64,7 +64,7 @@ def test_images_that_no_drive_has_are_not_learned_from(samples: list[Sample], tm
     weights stated that they use images."""
     write_packed(tmp_path / "one", [sample._replace(images=()) for sample in samples], {})
     settings = DataSettings(packed={str(tmp_path): 1.0}, images=True)
-    with pytest.raises(UsageError, match=r"data\.images: no packed drive"):
+    with pytest.raises(UsageError, match=r"data\.images: no drive of data\.packed has images"):
         GroupDataset(settings, tiny(), settings.draw, 0)
 
 

@@ -209,7 +209,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
     other = settings.model_copy(update={"held_out": 0.4})  # with another part held out, it continued without a message
     with pytest.raises(UsageError, match=f"{data}.*: made with held_out {settings.held_out}, not 0.4; remove it"):
         prepare([open_source(recording)], other, network, SlamSettings(threads=1), data)
-    with pytest.raises(UsageError, match=r"00_\w+: of a drive that is not asked for; remove it"):
+    with pytest.raises(UsageError, match=r"00_\w+: is of a drive that was not given; remove it"):
         prepare([], settings, network, SlamSettings(threads=1), data)  # that drive was used for training, too
     whole = finetune(settings, tmp_path / "whole", data=data)
     stopped(lambda: finetune(settings, tmp_path / "parts", data=data), monkeypatch)
@@ -246,7 +246,7 @@ def test_a_drive_that_cannot_be_followed_is_an_error_of_use(
     network = load_model(Path(settings.weights)).settings
     source = open_source(recording)
     blind = SlamSettings(threads=1, preprocess={"min_range": 79.0, "max_range": 80.0})  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="nothing to learn"):
+    with pytest.raises(UsageError, match="too few to train on"):
         prepare([source], settings, network, blind, tmp_path / "data")
 
 
@@ -295,8 +295,8 @@ def test_other_drives_in_the_rehearsal_are_not_gone_on_with(
     shutil.copy(recording / "sequences" / "00" / "velodyne" / "000000.bin", short)
     asked = ["finetune", tmp_path / "short", "--out", tmp_path / "o", "--set", f"weights={settings.weights}"]
     asked += ["--set", f"rehearsal={packed}"]
-    assert "nothing to learn" in dpm2(*asked).stderr  # after the request has been recorded
+    assert "too few to train on" in dpm2(*asked).stderr  # after the request has been recorded
     (tmp_path / "o" / "checkpoint.pt").touch()
-    assert "nothing to learn" in dpm2(*asked, "--resume").stderr
+    assert "too few to train on" in dpm2(*asked, "--resume").stderr
     write_packed(packed / "another", samples[:2], {"source": "boxes"})
     assert "began with content of rehearsal" in dpm2(*asked, "--resume").stderr

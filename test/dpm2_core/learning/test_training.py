@@ -131,7 +131,7 @@ def test_a_training_of_fewer_steps_is_not_gone_on_with(settings: RegistrationTra
     four."""
     train_registration(settings, tmp_path / "out")
     fewer = settings.model_copy(update={"optimiser": settings.optimiser.model_copy(update={"steps": 2})})
-    with pytest.raises(UsageError, match=r"has 4 steps, optimiser\.steps wants 2"):
+    with pytest.raises(UsageError, match=r"has 4 steps already, but optimiser\.steps is 2"):
         train_registration(fewer, tmp_path / "out")
 
 
@@ -178,11 +178,11 @@ def test_a_folder_has_one_training_at_a_time(tmp_path: Path) -> None:
     before = kept.read_text()
 
     def batches(start: int, rank: int) -> Iterator[tuple[torch.Tensor]]:
-        with pytest.raises(UsageError, match=f"{tmp_path}: another training is writing here"):
+        with pytest.raises(UsageError, match=f"{tmp_path}: another training writes to this folder"):
             begin_or_resume(tmp_path, False, steps)
-        with pytest.raises(UsageError, match="another training is writing here"):
+        with pytest.raises(UsageError, match="another training writes to this folder"):
             begin_training(tmp_path, steps)
-        with pytest.raises(UsageError, match="another training is writing here"):
+        with pytest.raises(UsageError, match="another training writes to this folder"):
             trainer(line(), tmp_path, steps=3).run()
         yield from repeat((torch.ones(8, 2),))
 
@@ -289,7 +289,7 @@ def test_a_damaged_checkpoint_is_one_line_of_its_own(damage: str, tmp_path: Path
         contents = {"empty": b"", "text": b"hello", "zeros": bytes(len(whole)), "half": whole[:middle]}
         path.write_bytes(contents.get(damage, flipped))
     said = {"folder": "no checkpoint: Is a directory", "none": "no checkpoint: No such file or directory"}
-    want = said.get(damage, "damaged, or not a checkpoint; remove it to begin anew, without --resume")
+    want = said.get(damage, "damaged, or not a checkpoint; remove it and start again without --resume")
     with pytest.raises(UsageError, match=f"^{path}: {want}$"):
         load_checkpoint(path, module, module, made)
 
