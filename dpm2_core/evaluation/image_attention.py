@@ -59,7 +59,7 @@ def image_attention(model: DeepPointMap2, frame: Frame, point: int | None = None
     encoder = model.encoder
     attention = None if encoder.fusion is None else encoder.fusion.layers[-1].image
     if encoder.image is None or not isinstance(attention, Attention):
-        raise UsageError("these weights have no camera branch with attention, so there is none to show")
+        raise UsageError("these weights have no image attention to show")
     images = [small_image(image, encoder.settings.image) for image in frame.images[:1]]
     views = collate_views([images], encoder.settings.image)
     if views is None:

@@ -47,7 +47,7 @@ def check_view(viewer: bool, record: Path | None, out: Path) -> None:
     if record is not None and not record.parent.is_dir() and record.parent.resolve() != out.resolve():
         raise UsageError(f"--record {record}: no such folder")
     if viewer and not _can_show_viewer():
-        raise Dpm2Error("--view: there is no display for rerun's viewer; --record FILE.rrd needs none")
+        raise Dpm2Error("--view: no display for rerun's viewer; use --record FILE.rrd instead")
 
 
 class LiveView:
@@ -71,7 +71,9 @@ class LiveView:
             try:
                 self._stream.spawn(default_blueprint=layout)
             except Exception as error:
-                raise Dpm2Error(f"--view: rerun's viewer does not start: {error}; --record FILE.rrd does") from None
+                raise Dpm2Error(
+                    f"--view: rerun's viewer does not start: {error}; use --record FILE.rrd instead"
+                ) from None
         if viewer and record is not None:
             self._stream.set_sinks(rerun.GrpcSink(), rerun.FileSink(str(record)), default_blueprint=layout)
         elif record is not None:

@@ -106,9 +106,9 @@ def processor() -> Finding:
     has = list(dict.fromkeys(name for flag, name in known.items() if flag in flags))
     found = f"{model[1] if model else 'unknown'}, {cores} cores, {', '.join(has) or 'no vector instructions known'}"
     if not has:
-        return Finding("processor", "warning", found, "the network needs AVX2 or NEON to be quick")
+        return Finding("processor", "warning", found, "without AVX2 or NEON the network is slow")
     if cores < 2:
-        return Finding("processor", "warning", found, "odometry and map want a core each")
+        return Finding("processor", "warning", found, "odometry and map need a core each")
     return Finding("processor", "ok", found)
 
 
@@ -123,7 +123,7 @@ def memory(enough: float = 2 * _GB) -> Finding:
         free = min(free, float(limit) - float(used))
     found = f"{free / _GB:.1f} GB free"
     if free < enough:
-        return Finding("memory", "warning", found, f"a drive with images wants {enough / _GB:.0f} GB")
+        return Finding("memory", "warning", found, f"a drive with images needs {enough / _GB:.0f} GB")
     return Finding("memory", "ok", found)
 
 
@@ -137,8 +137,8 @@ def gpu() -> Finding:
         return Finding("GPU", "ok", f"{torch.cuda.get_device_name(0)}, CUDA {torch.version.cuda}")
     if not any(Path("/dev").glob("nvidia[0-9]*")):
         return Finding("GPU", "note", "none", "not needed: the SLAM runs on the processor; training takes longer")
-    built = f"CUDA {torch.version.cuda}" if torch.version.cuda else "the processor alone"
-    found = f"there is one, and torch {torch.__version__}, built for {built}, cannot use it"
+    built = f"CUDA {torch.version.cuda}" if torch.version.cuda else "processors only"
+    found = f"present, but torch {torch.__version__}, built for {built}, cannot use it"
     return Finding("GPU", "warning", found, "install a torch whose CUDA fits the driver (nvidia-smi shows both)")
 
 
@@ -155,7 +155,7 @@ def disk(folder: Path, enough: float = 5 * _GB) -> Finding:
     free = shutil.disk_usage(folder).free
     found = f"{free / _GB:.1f} GB free"
     if free < enough:
-        return Finding(name, "warning", found, "bags of drives want more; --folder looks at another disk")
+        return Finding(name, "warning", found, "too little for bags of drives; --folder checks another disk")
     return Finding(name, "ok", found)
 
 
@@ -174,7 +174,7 @@ def ros() -> Finding:
     """ROS 2 in this Python."""
     if find_spec("rclpy") is None:
         where = f"{os.environ['ROS_DISTRO']} is sourced, but not for this Python" if "ROS_DISTRO" in os.environ else ""
-        return Finding("ROS 2", "warning", where or "none", "dpm2 works without; the nodes need it: docs/ros2.md")
+        return Finding("ROS 2", "warning", where or "none", "only the ROS nodes need it: docs/ros2.md")
     rclpy = package_version("ros-rclpy") or package_version("rclpy") or "?"
     kind = os.environ.get("ROS_DISTRO") or f"wheels, rclpy {rclpy}"
     if find_spec("tf2_msgs") is None:
@@ -185,7 +185,7 @@ def ros() -> Finding:
 def dds(timeout: float = 15.0) -> Finding:
     """Send a cloud from a node to itself, in its own process; `timeout` in s."""
     if find_spec("rclpy") is None:
-        return Finding("DDS", "note", "not tried without ROS 2")
+        return Finding("DDS", "note", "not tested without ROS 2")
     names = ("RMW_IMPLEMENTATION", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE")
     chosen = "".join(f", {name}={os.environ[name]}" for name in names if name in os.environ)
     try:

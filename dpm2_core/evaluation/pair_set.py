@@ -51,7 +51,9 @@ class PairSet:
         bounds = (0.0, NEAR), (NEAR, farthest)
         for low, high in bounds:
             if not any(has_pair(drive.poses, low, high) for drive in self.drives):
-                raise UsageError(f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, as is measured")
+                raise UsageError(
+                    f"{root}: no two frames of a drive are {low:g} to {high:g} m apart, which are measured"
+                )
         while len(self.pairs) < pairs:
             d = int(rng.integers(len(self.drives)))
             poses = self.drives[d].poses

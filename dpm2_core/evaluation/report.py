@@ -17,7 +17,9 @@ def metrics_table(metrics: Metrics, title: str, frame: str, failed: str | None =
     how_measured = ["how it is measured"]
     table = FigureTable(title, names=["figure"], figures=["value"], text=how_measured, caption=caption)
     t_err, r_err = metrics.t_err_percent, metrics.r_err_deg_per_100m
-    kitti_note = f"the path is shorter than {min(metrics.lengths_m):g} m; `dpm2 eval --lengths` takes shorter ones"
+    kitti_note = (
+        f"the path is shorter than {min(metrics.lengths_m):g} m; set shorter segments with `dpm2 eval --lengths`"
+    )
     if t_err is not None and r_err is not None:
         start = "each 10th frame" if metrics.lengths_m == OFFICIAL_LENGTHS else "each frame"
         devkit = f"the development kit prints {t_err / 100:.6f} {math.radians(r_err / 100):.6f}"

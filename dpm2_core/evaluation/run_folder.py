@@ -136,7 +136,7 @@ def read_run(path: Path) -> RunFolder:
         UsageError: no trajectory in it, or a damaged file, which is named.
     """
     if not (path / TRAJECTORY).is_file():
-        raise UsageError(f"{path}: no run; want a folder with {TRAJECTORY}, as `dpm2 run` and `dpm2 experiment` write")
+        raise UsageError(f"{path}: not a folder of a run: no {TRAJECTORY}, as `dpm2 run` and `dpm2 experiment` write")
     trajectory = read_trajectory(path / TRAJECTORY, allow_empty=True)  # empty if a localization found nothing
     if trajectory.kind != "tum":
         raise UsageError(f"{path / TRAJECTORY}: want 8 numbers a line, the stamp first")
@@ -164,7 +164,7 @@ def _loop(row: dict[str, str]) -> LoopRow:
 
 def _number(text: str) -> float:
     if not np.isfinite(value := float(text)):
-        raise ValueError(f"{text} is no number")
+        raise ValueError(f"{text} is not a number")
     return value
 
 

@@ -119,7 +119,7 @@ class Result:
         keyframes = self.mapper.poses[self.mapper.session_start :]
         if len(keyframes) != self.recorder.keyframes:
             raise UsageError(
-                "a run that localizes corrects no poses: look at T_map_lidar of each result, by `progress`"
+                "a localization run has no corrected poses: use T_map_lidar of each result, which `progress` receives"
             )
         return self.recorder.poses(keyframes)
 

@@ -51,17 +51,19 @@ class SelfTest:
 
     def finding(self) -> Finding:
         """The result as a line among those of the machine."""
-        keyframe_time = "no keyframe" if self.keyframe_ms is None else f"{self.keyframe_ms:.0f} ms a keyframe"
-        found = f"{self.frames} scans, {self.odometry_ms:.0f} ms each, {keyframe_time}, {100 * self.error_m:.1f} cm off"
+        keyframe_time = "no keyframe" if self.keyframe_ms is None else f"{self.keyframe_ms:.0f} ms per keyframe"
+        found = (
+            f"{self.frames} scans, {self.odometry_ms:.0f} ms each, {keyframe_time}, error {100 * self.error_m:.1f} cm"
+        )
         found = f"{found}; {self.start_s:.1f} s to start"
         if self.failed or not self.error_m < _MAX_ERROR:
             return Finding(
-                "self-test", "error", f"{found}; {self.failed} not registered", "the SLAM does not work here"
+                "self-test", "error", f"{found}; {self.failed} not registered", "the SLAM does not work on this machine"
             )
         if self.odometry_ms > SLOW_ODOMETRY:
             return Finding("self-test", "warning", found, f"too slow for 10 Hz; expected: {EXPECTED}")
         if self.keyframe_ms is not None and self.keyframe_ms > SLOW_KEYFRAME:
-            return Finding("self-test", "warning", found, f"loops will come late; expected: {EXPECTED}")
+            return Finding("self-test", "warning", found, f"loops will be found late; expected: {EXPECTED}")
         return Finding("self-test", "ok", found, f"expected: {EXPECTED}")
 
 

@@ -136,7 +136,7 @@ def ablation_tables(table: Table) -> Iterator[FigureTable]:
     for drives in table[first]:
         columns = ["near m", "near", "far", "turned"]
         figure_table = FigureTable(
-            drives, names=["variant"], figures=columns, text=[f"right near pairs beside {first}"]
+            drives, names=["variant"], figures=columns, text=[f"near pairs that are right, compared with {first}"]
         )
         for name, rows in table.items():
             row = {figure: mean(values) for figure, values in rows[drives].items()}

@@ -34,35 +34,47 @@ class Listed:
 
 EXPERIMENTS: dict[str, Listed] = {
     "kitti": Listed(
-        "DeepPointMap2, table 1", "t_rel and r_rel on KITTI 06 to 10, beside other programs", "kitti:KITTI"
+        "DeepPointMap2, table 1", "t_rel and r_rel on KITTI 06 to 10, compared with other programs", "kitti:KITTI"
     ),
     "kitti360": Listed(
         "DeepPointMap2, 5.2 and figure 5", "mean position error on KITTI-360 07 and 09", "kitti:KITTI_360"
     ),
     "robustness": Listed(
         "DeepPointMap2, table 2 and figure 6",
-        "black images, or a box before the LiDAR, in 5 to 100 % of the frames",
+        "black images, or a box in front of the LiDAR, in 5 to 100 % of the frames",
         "robustness:ROBUSTNESS",
     ),
     "reference-points": Listed(
-        "DeepPointMap2, table 3", "128 to 4096 reference points, sampled or at random", "variants:reference_points"
+        "DeepPointMap2, table 3", "128 to 4096 reference points, from the scan or random", "variants:reference_points"
     ),
-    "fusion": Listed("DeepPointMap2, table 4", "other fusions of LiDAR and image", "variants:fusion"),
+    "fusion": Listed("DeepPointMap2, table 4", "alternative fusions of LiDAR and image", "variants:fusion"),
     "attention": Listed(
-        "DeepPointMap2, figure 7", "attention maps of the same networks, one below the other", "variants:attention"
+        "DeepPointMap2, figure 7",
+        "attention maps of the networks of `fusion`, one below the other",
+        "variants:attention",
     ),
     "gndnet": Listed(
-        "Differentiable SLAM, table 1", "the ground by GndNet, without and with the SLAM loss", "task_tables:gndnet"
+        "Differentiable SLAM, table 1", "ground height by GndNet, without and with the SLAM loss", "task_tables:gndnet"
     ),
-    "dslr": Listed("Differentiable SLAM, table 2", "scans without what moves by DSLR, likewise", "task_tables:dslr"),
+    "dslr": Listed(
+        "Differentiable SLAM, table 2",
+        "scans without moving objects by DSLR, without and with the SLAM loss",
+        "task_tables:dslr",
+    ),
     "dslr-slam": Listed(
-        "Differentiable SLAM, table 3 and figure 3", "odometry on what DSLR makes, likewise", "task_tables:dslr_slam"
+        "Differentiable SLAM, table 3 and figure 3",
+        "odometry on the output of DSLR, without and with the SLAM loss",
+        "task_tables:dslr_slam",
     ),
     "ae-lidar": Listed(
-        "Differentiable SLAM, table 4", "scans as short codes by AE_lidar, likewise", "task_tables:ae_lidar"
+        "Differentiable SLAM, table 4",
+        "scans reconstructed from short codes by AE_lidar, without and with the SLAM loss",
+        "task_tables:ae_lidar",
     ),
     "ae-lidar-slam": Listed(
-        "Differentiable SLAM, beside table 4", "odometry on what AE_lidar makes, likewise", "task_tables:ae_lidar_slam"
+        "Differentiable SLAM, in addition to table 4",
+        "odometry on the output of AE_lidar, without and with the SLAM loss",
+        "task_tables:ae_lidar_slam",
     ),
 }
 
@@ -101,7 +113,7 @@ def _read_tables(path: Path, prefix: str) -> list[FigureTable]:
     try:
         return [shown(record, prefix) for record in json.loads(path.read_text(encoding="utf-8"))["tables"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path}: no record of an experiment: {error}") from None
+        raise UsageError(f"{path}: not a record of an experiment, or damaged: {error}") from None
 
 
 def carry_out(name: str, request: Request, progress: Progress | None) -> Findings:
@@ -120,7 +132,7 @@ def carry_out(name: str, request: Request, progress: Progress | None) -> Finding
     findings = experiment.findings(request, figures)
     commits = sorted({str(part["part"]["commit"]) for part in figures.values()})
     if len(commits) > 1:
-        findings.notes.append(f"parts were made at several commits: {', '.join(commits)}")
+        findings.notes.append(f"the parts were made by dpm2 at several commits: {', '.join(commits)}")
     write_record(request.out / f"{name}.json", _record(request, findings, figures), threads=request.workers)
     tables = [shown(table.record()) for table in findings.tables]
     runs = [
@@ -138,7 +150,7 @@ def _check_options(name: str, request: Request, experiment: Experiment) -> None:
         if field.name not in _COMMON_OPTIONS | experiment.uses and getattr(request, field.name) not in (None, ())
     ]
     if unsupported:
-        raise UsageError(f"{name}: has no use for --{unsupported[0]}")
+        raise UsageError(f"{name}: does not use --{unsupported[0]}")
 
 
 def _check_names(name: str, parts: Sequence[Part]) -> None:
@@ -147,7 +159,7 @@ def _check_names(name: str, parts: Sequence[Part]) -> None:
     repeated = [folder for folder, count in folders.items() if count > 1]
     if repeated:
         raise UsageError(
-            f"{name}: two results of one name ({repeated[0]}); name --sequences, --registration and --peer differently"
+            f"{name}: two results have the same name ({repeated[0]}); check --sequences, --registration and --peer"
         )
 
 

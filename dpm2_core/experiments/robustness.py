@@ -103,9 +103,9 @@ def _findings(request: Request, figures: Mapping[str, Figures]) -> Findings:
                       f"{100 * (mean / 0.60 - 1):+.0f} %")  # fmt: skip
     notes = paper_notes(request, sequences, TESTED)
     if set(sequences) != set(TESTED):
-        notes.append(f"the paper's means are of {', '.join(TESTED)}")
+        notes.append(f"the paper's means are over the sequences {', '.join(TESTED)}")
     if not any(corrupt and corrupt.startswith("camera") for _, _, corrupt in variants):
-        notes.append("no rows with a black camera: there are no images, or this configuration makes no use of them")
+        notes.append("no rows with a black camera: there are no images, or this configuration does not use them")
     runs = run_folders([name for name, _, _ in variants], sequences, request.out)
     _draw_corrupted(request, sequences[0], notes)
     return Findings([table], notes, runs, {"change_percent": changes})

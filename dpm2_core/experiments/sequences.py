@@ -42,16 +42,16 @@ def present(request: Request, paper: Sequence[str], more: Sequence[str] = ()) ->
     problems = {sequence: has_sequence(request.data, reading(request, sequence, more)) for sequence in paper}
     found = [sequence for sequence, problem in problems.items() if not problem]
     if not found:
-        raise UsageError(f"{next(iter(problems.values()))}; or choose others with --sequences")
+        raise UsageError(f"{next(iter(problems.values()))}; choose other sequences with --sequences")
     return found
 
 
 def paper_notes(request: Request, found: Sequence[str], paper: Sequence[str]) -> list[str]:
     """Notes if other sequences, frames or segments than the paper's are measured, or not all of them."""
     missing = [sequence for sequence in paper if sequence not in found]
-    notes = [f"not measured, since they are not there or were not asked for: {', '.join(missing)}"] if missing else []
+    notes = [f"not measured, since they are missing or were not requested: {', '.join(missing)}"] if missing else []
     if not set(found) <= set(paper) or request.frames or request.lengths:
-        notes.append("other sequences, frames or lengths than the paper's: its rows are no comparison")
+        notes.append("other sequences, frames or lengths than the paper's: do not compare with its rows")
     return notes
 
 
@@ -63,7 +63,7 @@ def segments(request: Request) -> str:
 def learned_note(learned: Sequence[str], tested: Sequence[str]) -> list[str]:
     """A note if sequences that were learned from are tested on."""
     both = [sequence for sequence in tested if sequence in learned]
-    return [f"tested on what was learned from: {', '.join(both)}"] if both else []
+    return [f"tested on sequences that were used for training: {', '.join(both)}"] if both else []
 
 
 def registrations(request: Request) -> list[tuple[str, list[str]]]:
@@ -95,7 +95,9 @@ def peer_parts(sequences: Sequence[str], request: Request, settings: Sequence[st
     for text in request.peers:
         name, equals, file = text.partition("=")
         if equals and "{sequence}" not in file and len(sequences) > 1:
-            raise UsageError(f"--peer {text}: of {len(sequences)} sequences; put {{sequence}} where its name stands")
+            raise UsageError(
+                f"--peer {text}: is one file for {len(sequences)} sequences; write {{sequence}} in place of their names"
+            )
         for sequence in sequences:
             drive_settings = reading(request, sequence, settings)
             drive, content = _drive_arguments(request, drive_settings), drive_content(request.data, drive_settings)

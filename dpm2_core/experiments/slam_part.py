@@ -157,7 +157,7 @@ def _read_poses(file: Path, source: Source, span: tuple[int, int], truth: Array,
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from None
     if len(poses) != len(truth):
-        raise UsageError(f"{file}: {len(poses)} poses belong to the {len(truth)} frames of {source.name}")
+        raise UsageError(f"{file}: {len(poses)} poses for the {len(truth)} frames of {source.name}")
     return lidar_poses(poses, source.T_cam_lidar)
 
 

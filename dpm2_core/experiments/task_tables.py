@@ -111,9 +111,9 @@ class TaskTable:
         if settings.slam.gamma == 0 or not any(map(settings.has_windows, range(settings.epochs))):
             slam = settings.slam
             raise UsageError(
-                f"{self.task}: the SLAM loss, which is to be compared, never counts: slam.gamma is {slam.gamma:g}, and"
-                f" slam.begin {slam.begin}, slam.every {slam.every} in {settings.epochs} epochs; --config replaces the"
-                " experiment's own values"
+                f"{self.task}: the training never uses the SLAM loss, which is compared: slam.gamma is {slam.gamma:g},"
+                f" slam.begin {slam.begin}, slam.every {slam.every}, in {settings.epochs} epochs; set them in the file"
+                " of --config, which replaces the experiment's own values"
             )
 
     def findings(self, request: Request, figures: Mapping[str, Figures]) -> Findings:
@@ -150,7 +150,7 @@ class TaskTable:
         settings = settings_of(self._training(request, 0, "with"))
         if settings.has_windows(settings.epochs - 1):
             notes.append(
-                "the last epoch has the SLAM loss: the arms are measured right after it; choose other slam.every"
+                "the last epoch uses the SLAM loss, and the arms are measured right after it; choose another slam.every"
             )
         still_rpe = [
             figures[self._measurement_name(seed, "without")].get("still_rpe_m")
@@ -159,7 +159,7 @@ class TaskTable:
         if self.measured == SLAM and still_rpe[0] is not None and sum(values_by_arm["without"]["output_rpe_m"]) >= sum(
             value for value in still_rpe if value is not None
         ):  # fmt: skip
-            notes.append("odometry on what the network makes is no better than standing still: nothing can be compared")
+            notes.append("odometry on the network's output is no better than standing still: nothing can be compared")
         return notes
 
     def _draw_trajectories(self, request: Request, figures: Mapping[str, Figures], notes: list[str]) -> None:
@@ -216,7 +216,7 @@ GNDNET = TaskTable(
     higher=frozenset({"ground_iou", "ground_precision", "ground_recall", "miou", "precision", "recall"}),
     notes=(
         "the paper's figures are of the ground: ground_... and mse_authors; precision and recall are of obstacles",
-        "its 6,554 test frames are those of 05, 09 and two of 01, 06, 07; which two it does not say",
+        "its 6,554 test frames are those of 05, 09 and two of 01, 06, 07; the paper does not state which two",
     ),
 )
 DSLR = TaskTable(
@@ -231,7 +231,7 @@ DSLR = TaskTable(
     learn=_CARLA_LEARN,
     test=_CARLA_TEST,
     defaults=_DSLR_DEFAULTS,
-    notes=("the paper's row of KITTI 08 needs DSLR-UDA, which learns without twins and is not here",),
+    notes=("the paper's row of KITTI 08 needs DSLR-UDA, which learns without twins and is not part of dpm2",),
 )  # fmt: skip
 DSLR_SLAM = replace(
     DSLR,
@@ -247,8 +247,8 @@ DSLR_SLAM = replace(
         for arm, ate in zip(("", " with SLAM loss"), both, strict=True)
     },
     notes=(
-        "the paper's 0 to 3 are drives recorded for this table; --sequences names others than the pairs of Table 2",
-        "true poses are read from posesN.txt beside the pairs, or from the drive",
+        "the paper's 0 to 3 are drives recorded for this table; tested are the pairs of Table 2, or --sequences",
+        "true poses are read from posesN.txt next to the pairs, or from the drive",
     ),
 )  # fmt: skip
 AE_LIDAR = TaskTable(
@@ -267,7 +267,7 @@ AE_LIDAR_SLAM = replace(
     measured=SLAM,
     figures=dict.fromkeys(("output_ate_m", "output_rpe_m", "output_rpe_deg"), ".4g"),
     paper={},
-    notes=("the paper has no such table; the SLAM loss asks for this",),
+    notes=("the paper has no such table; it shows what the SLAM loss is meant to improve",),
 )
 gndnet, dslr, dslr_slam, ae_lidar, ae_lidar_slam = (
     table.experiment() for table in (GNDNET, DSLR, DSLR_SLAM, AE_LIDAR, AE_LIDAR_SLAM)

@@ -51,9 +51,9 @@ def training_of(
     path = weights_path(start)
     base = network_settings(path)
     if chosen.start:
-        raise UsageError(f"start {chosen.start}: what all variants start from is named by --weights")
+        raise UsageError(f"start {chosen.start}: give the weights that all variants start from by --weights")
     if "preset" in chosen.model_fields_set and chosen.preset != base.preset:
-        raise UsageError(f"preset {chosen.preset}: the network is that of --weights {start}, of preset {base.preset}")
+        raise UsageError(f"preset {chosen.preset}: the weights --weights {start} are of the preset {base.preset}")
     tree = merged(merged(base.model_dump(mode="json"), chosen.network), network)
     data = chosen.data
     if not data.packed:

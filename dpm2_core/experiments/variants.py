@@ -136,7 +136,7 @@ class VariantTable:
             for variant, row in self.paper.items():
                 table.add(variant, {s: {"t_err_percent": t} for s, t in zip(TESTED, row, strict=True)}, "the paper")
             tables.append(table)
-            notes.append("every variant was fine-tuned from the same weights, as far as they fit it")
+            notes.append("every variant was fine-tuned from the same weights, as far as their tensors fit it")
             notes += paper_notes(request, sequences, TESTED)
         names = [self._row_name(variant) for variant in self.variants] if self.judged else []
         runs = run_folders(names, sequences, request.out)
@@ -188,10 +188,10 @@ def _check_slam_settings(request: Request) -> None:
         Config, None, [*_NETWORK_ONLY, f"slam.neural.weights={placeholder}", *_slam_overrides(request)]
     ).slam
     if slam.neural.weights != placeholder:
-        raise UsageError(f"slam.neural.weights={slam.neural.weights}: each variant is driven with its own weights;"
-                         " what all start from is named by --weights")  # fmt: skip
+        raise UsageError(f"slam.neural.weights={slam.neural.weights}: each variant is run with its own weights;"
+                         " give the weights that all start from by --weights")  # fmt: skip
     if slam.registration != "neural":
-        raise UsageError(f"slam.registration={slam.registration}: the variants are driven with the network alone")
+        raise UsageError(f"slam.registration={slam.registration}: the variants are run with the network alone (neural)")
 
 
 def _with_common_changes(change: Mapping[str, Any]) -> dict[str, Any]:

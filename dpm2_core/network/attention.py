@@ -83,7 +83,7 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int, learnable: bool = True) -> None:
         super().__init__()
         if width % heads:
-            raise ValueError(f"attention width {width} is no multiple of {heads} heads")
+            raise ValueError(f"attention width {width} is not a multiple of {heads} heads")
         self.heads = heads
         self.query = nn.Linear(width, width) if learnable else None
         self.key = nn.Linear(width, width) if learnable else None

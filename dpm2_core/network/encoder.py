@@ -106,7 +106,9 @@ class Encoder(nn.Module):
         views = collate_views([images], self.settings.image)
         descriptors = self.encode_batch(points, views)[0]
         if not np.isfinite(descriptors.step).all():
-            raise Dpm2Error("the network's descriptors are not finite: damaged weights, or a library that fails here")
+            raise Dpm2Error(
+                "the network's descriptors are not finite: the weights are damaged, or a library fails on this machine"
+            )
         return descriptors
 
     @torch.inference_mode()

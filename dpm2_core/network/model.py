@@ -121,7 +121,7 @@ class DeepPointMap2(nn.Module):
 def _in_set_frames(encoded: Registration, source: Descriptors, target: Descriptors) -> Registration:
     """Convert a registration of encoded sets, in leveled axes and enlarged, to the sets' own axes and scale."""
     if source.scale != target.scale:
-        return replace(encoded, ok=False, confidence=0.0, overlap=0.0, reason="one is a room, the other is not")
+        return replace(encoded, ok=False, confidence=0.0, overlap=0.0, reason="one scan is of a room, the other is not")
     if source.scale != 1:
         encoded = _rescaled(encoded, source.scale)
     if source.up is None and target.up is None:

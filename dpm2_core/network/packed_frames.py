@@ -26,8 +26,8 @@ def check_fits(drive: PackedDrive, network: NetworkSettings, images: bool) -> No
         less = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
         if less > 0:
             raise UsageError(
-                f"{drive.folder}: packed with points.{name} {packed[name]:g}, the network has {wanted[name]:g}: its"
-                " clouds lack points"
+                f"{drive.folder}: packed with points.{name} {packed[name]:g}, but the network has {wanted[name]:g}:"
+                " the packed clouds lack points"
             )
     if images:
         check_images(drive, network)
@@ -42,7 +42,7 @@ def check_images(drive: PackedDrive, network: NetworkSettings) -> None:
     (height, width), packed = network.image.size, drive.image_size
     if network.image.backbone != "none" and packed is not None and (packed[0] < height or packed[1] < width):
         raise UsageError(
-            f"{drive.folder}: packed with images of {packed[0]} x {packed[1]}, the network has {height} x {width}"
+            f"{drive.folder}: packed with images of {packed[0]} x {packed[1]}, but the network has {height} x {width}"
             " (image.size); pack it with the network's --preset"
         )
 

@@ -50,7 +50,7 @@ def weights_path(weights: str) -> Path:
     path = Path(os.path.expanduser(weights))
     if not path.is_file():
         names = ", ".join(pretrained_names()) or "none"
-        raise UsageError(f"weights {weights}: no such file; weights that come with dpm2: {names}")
+        raise UsageError(f"weights {weights}: no such file; weights shipped with dpm2: {names}")
     return path
 
 

@@ -184,7 +184,7 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> NetworkSettin
     path = Path(__file__).with_name("presets") / f"{name}.yaml"
     settings = settings_from(NetworkSettings, merged(read_yaml(path), changes or {}), default=f"preset {name}")
     if misfits := [*_misfits(settings)]:
-        raise UsageError(f"preset {name} with these changes is no network: {'; '.join(misfits)}")
+        raise UsageError(f"preset {name} with these changes is not a valid network: {'; '.join(misfits)}")
     return settings
 
 

@@ -103,7 +103,7 @@ def load_fitting(model: DeepPointMap2, path: Path) -> list[str]:
     own = model.state_dict()
     fitting = {name: value for name, value in state.items() if name in own and own[name].shape == value.shape}
     if not fitting:
-        raise UsageError(f"{path}: nothing in it fits this network")
+        raise UsageError(f"{path}: none of its tensors fits this network")
     _check_finite(path, fitting)
     model.load_state_dict(fitting, strict=False)
     return sorted(own.keys() - fitting.keys())
@@ -114,7 +114,7 @@ def _load_checked(
 ) -> None:
     stored = metadata.get("preset", "unknown")
     if stored != model.settings.preset:
-        raise UsageError(f"{path}: weights of preset {stored}, the network is preset {model.settings.preset}")
+        raise UsageError(f"{path}: weights of preset {stored}, but the network is of preset {model.settings.preset}")
     load_strictly(model, state, path, f"preset {stored}")
 
 
@@ -162,7 +162,9 @@ def _network_settings(path: Path, metadata: Mapping[str, str]) -> NetworkSetting
     settings = described(path, metadata, NetworkSettings)
     backbone = settings.image.backbone
     if backbone.startswith("timm:") and not _TIMM_NAME.fullmatch(backbone):
-        raise UsageError(f"{path}: image.backbone {backbone}: weights do not choose what is downloaded")
+        raise UsageError(
+            f"{path}: image.backbone {backbone}: not allowed in a weights file, since it would start a download"
+        )
     return settings
 
 
@@ -194,7 +196,7 @@ def check_fit(path: Path, state: Mapping[str, torch.Tensor], make: Callable[[], 
         with torch.device("meta"):
             network = make()
     except (ArithmeticError, AssertionError, IndexError, RuntimeError, TypeError, ValueError) as error:
-        raise UsageError(f"{path}: describes a network that cannot be: {' '.join(str(error).split())}") from None
+        raise UsageError(f"{path}: describes an invalid network: {' '.join(str(error).split())}") from None
     _check_shapes(network, state, f"{path}: does not fit the network that it describes")
 
 

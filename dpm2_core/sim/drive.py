@@ -64,7 +64,9 @@ def simulate(
     world = build_world(drive.road, drive.preset, drive.seed, length, drive.traffic)
     plan, height = world.road.plan, drive.lidar.height
     if plan is not None and height >= plan.headroom:
-        raise UsageError(f"--height {height:g}: the way leads under what is {plan.headroom:.2f} m high")
+        raise UsageError(
+            f"--height {height:g}: the route passes under objects {plan.headroom:.2f} m high; set a lower height"
+        )
     with new_folder(out) as part:  # `sequences`, which identifies a drive, is written last
         _Drive(world, drive).write(part, recipe, workers, progress)
     return True
@@ -77,7 +79,7 @@ def _frame_count(drive: DriveConfig) -> int:
         return 150 if drive.frames is None else drive.frames
     available = len(read_drive(Path(drive.road)))
     if drive.frames is not None and drive.frames > available:
-        raise UsageError(f"--frames {drive.frames}: {drive.road} has {available}")
+        raise UsageError(f"--frames {drive.frames}: {drive.road} has {available} poses")
     return available if drive.frames is None else drive.frames
 
 
@@ -123,12 +125,12 @@ def _already_exists(out: Path, recipe: dict[str, Any]) -> bool:
     try:
         found = json.loads((out / "sequences" / "00" / NOTE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        raise UsageError(f"{out}: is there already and is no simulated drive; choose another folder") from None
+        raise UsageError(f"{out}: exists already and is not a simulated drive; choose another folder") from None
     if found != recipe:
         different = [key for key in recipe if not isinstance(found, dict) or found.get(key) != recipe[key]]
         different += [key for key in found if key not in recipe] if isinstance(found, dict) else []
         what = f"a drive with other {', '.join(different) or 'settings'}, or of another version of dpm2"
-        raise UsageError(f"{out}: holds {what}; remove it or choose another")
+        raise UsageError(f"{out}: contains {what}; remove it or choose another folder")
     return True
 
 

@@ -93,7 +93,7 @@ def office(length: float, rng: np.random.Generator) -> FloorPlan:
         if len(rooms) > 1:  # a single hall has no door, and so no path
             break
     else:
-        raise UsageError(f"a building for a way of {length:g} m has a single room; want a longer way")
+        raise UsageError(f"a building for a route of {length:g} m has a single room; want a longer route: more frames")
     kinds = [
         k for k, room in enumerate(rooms) if room.kind == "room" and room.size.min() > 3.2 and room.size.max() > 4.5
     ]

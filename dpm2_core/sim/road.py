@@ -117,7 +117,7 @@ def make_road(kind: str, preset: Preset, rng: np.random.Generator, length: float
 def _indoors(kind: str, preset: Preset, rng: np.random.Generator, length: float) -> Road:
     """A closed path through a building: it leads through doors and comes back."""
     if kind not in ("loop", "random"):
-        raise UsageError(f"--road {kind}: indoors the way leads through the rooms; want loop or random")
+        raise UsageError(f"--road {kind}: indoors the route leads through rooms; want loop or random")
     plan = (office if preset.indoor == "rooms" else car_park)(length, rng)
     corners = Path(plan.way, True)
     drive = Path(_smooth(corners.xy[:-1], 0.3 if preset.indoor == "rooms" else 1.5, True), True)

@@ -273,7 +273,7 @@ def with_traffic(preset: Preset, nominal: Preset, factor: float) -> Preset:
     if not 0 <= factor <= 1000:
         raise UsageError(f"--traffic {factor:g}: want 0 to 1000 times the preset's")
     if preset.indoor and factor > 1:
-        raise UsageError(f"--traffic {factor:g}: there is none indoors; want 0 to 1")
+        raise UsageError(f"--traffic {factor:g}: there is no traffic indoors; want 0 to 1")
     if factor <= 1:
         return preset.model_copy(update={"traffic": preset.traffic * factor, "people": preset.people * factor})
     wide = {} if preset.wide else {"lane": 1.8, "half_width": 9.4 if preset.parked else 7.2}

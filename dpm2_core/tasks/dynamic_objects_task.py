@@ -150,7 +150,9 @@ def _arrays(scan: TaskScan) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDA
         UsageError: the scan has no labels.
     """
     if scan.labels is None:
-        raise UsageError(f"{scan.sequence}, scan {scan.number}: no labels; what moves is not known")
+        raise UsageError(
+            f"{scan.sequence}, scan {scan.number}: no labels; this task needs them to know the moving objects"
+        )
     points, labels = scan.points.cpu().numpy(), scan.labels.cpu().numpy()
     finite = np.isfinite(points).all(1)
     points = np.where(finite[:, None], points, np.float32(0))

@@ -135,7 +135,7 @@ def ground_of(scan: TaskScan) -> tuple[Tensor, Tensor]:
         UsageError: the scan has no labels.
     """
     if scan.labels is None:
-        raise UsageError(f"{scan.sequence}, scan {scan.number}: no labels; the ground is not known")
+        raise UsageError(f"{scan.sequence}, scan {scan.number}: no labels; this task needs them to know the ground")
     classes = scan.labels
     return torch.isin(classes, classes.new_tensor(GROUND)), ~torch.isin(classes, classes.new_tensor(UNCOUNTED))
 

@@ -193,7 +193,9 @@ def _column_order(xyz: Array, path: Path) -> NDArray[np.intp] | None:
     left, right = (np.exp(1j * (angle - direction * centers)).mean() for direction in (1, -1))
     offset = left if abs(left) >= abs(right) else right
     if abs(offset) < _MIN_EVENNESS:
-        raise UsageError(f"{path}: its columns, or its twin's, are not in even steps of azimuth around the sensor")
+        raise UsageError(
+            f"{path}: its columns, or those of its twin, are not at equal steps of azimuth around the sensor"
+        )
     start = round(float(np.angle(offset)) / (2 * np.pi) * count)
     column = np.arange(count)
     return (column - start if offset is left else start - 1 - column) % count

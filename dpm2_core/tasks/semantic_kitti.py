@@ -40,7 +40,7 @@ def kitti_runs(folder: Path, root: Path, needs: Sequence[RequiredData]) -> list[
         raise UsageError(f"{folder}: no scans (velodyne/NNNNNN.bin)")
     for need in needs:
         if not (folder / need).is_dir():
-            raise UsageError(f"{folder}: no {need}/ beside velodyne/; this task learns from it")
+            raise UsageError(f"{folder}: no folder {need}/ next to velodyne/; this task needs it")
     name = str(folder.relative_to(root)) if folder != root else folder.resolve().name
     run = _KittiRun(folder, name, (folder / "labels").is_dir(), (folder / "static").is_dir(), numbers)
     for number in numbers:
@@ -101,7 +101,7 @@ class _KittiRun:
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from None
         if size % _POINT_BYTES[kind]:
-            raise UsageError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES[kind]}; damaged or cut off")
+            raise UsageError(f"{path}: {size} bytes are not a multiple of {_POINT_BYTES[kind]}; damaged or cut off")
         if size == 0:
             raise UsageError(f"{path}: the file is empty")
         return size // _POINT_BYTES[kind]

@@ -75,21 +75,21 @@ def slam_runs(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[Task
             clouds.append(task.clouds(scan.to(task.device)))
             numbers.append(scan.number)
         if not clouds[0]:
-            raise UsageError(f"{task.name}: makes no clouds that SLAM could run on")
+            raise UsageError(f"{task.name}: --slam does not apply: this task outputs no clouds for the SLAM")
         stamps = stamps_of(np.array(numbers) - numbers[0] + 1).tolist()
         poses = {
             kind: _odometry([scan_clouds[kind].cpu().numpy() for scan_clouds in clouds], stamps) for kind in clouds[0]
         }
         yield TaskRun(name, truth, poses, stamps)
     if not found:
-        raise UsageError(f"{path}: no sequences with poses; want sequences/NN/velodyne and its poses")
+        raise UsageError(f"{path}: no sequences with poses; want sequences/NN/velodyne and their poses")
 
 
 def _sequences_with_poses(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[tuple[str, Array, TaskScans]]:
     """Name, true poses (N, 4, 4) and scans of every sequence."""
     for pair in pairs_of(path, sequences):
         if (truth := pair.poses) is None:
-            raise UsageError(f"{path}: no poses{pair.number}.txt beside the pairs; the SLAM cannot be evaluated")
+            raise UsageError(f"{path}: no poses{pair.number}.txt next to the pairs; the SLAM cannot be evaluated")
         yield pair.name, truth, TaskScans([pair])
     for folder in folders_of(path, sequences):
         truth, scans = open_source(folder).poses, open_scans(folder, task.needs)

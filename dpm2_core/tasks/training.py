@@ -89,7 +89,7 @@ def draw(task: Task, scans: TaskScans, index: int, path: Path) -> None:
         UsageError: there is no such scan.
     """
     if not 0 <= index < len(scans):
-        raise UsageError(f"scan {index}: there are {len(scans)}, counted from 0")
+        raise UsageError(f"scan {index}: there are only {len(scans)} scans, counted from 0")
     task.eval().figure(scans[index].to(task.device), path)
 
 

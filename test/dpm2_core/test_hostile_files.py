@@ -192,8 +192,8 @@ def changed(**sections: object) -> Callable[[DeepPointMap2], dict[str, str]]:
 
 
 WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
-    "a hub's name": (changed(image={"backbone": "timm:hf-hub:owner/model"}), "do not choose what is downloaded"),
-    "an address": (changed(image={"backbone": "timm:local-dir:/etc"}), "do not choose what is downloaded"),
+    "a hub's name": (changed(image={"backbone": "timm:hf-hub:owner/model"}), "not allowed in a weights file"),
+    "an address": (changed(image={"backbone": "timm:local-dir:/etc"}), "not allowed in a weights file"),
     "1e12 channels": (changed(channels=10**12), "network.channels is 1000000000000; at most 65536"),
     "65,536 channels": (changed(decoder={"width": 65536}), "does not fit the network that it describes"),
     "a billion layers": (changed(decoder={"layers": 10**9}), "layers is 1000000000; at most"),

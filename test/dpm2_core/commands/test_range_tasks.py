@@ -55,6 +55,6 @@ def test_train_and_measure(pairs: Path, tmp_path: Path, name: str, stages: list[
     assert figures <= printed.keys()
     assert image.stat().st_size > 1000
 
-    assert "no poses0.txt beside the pairs" in refused("eval-task", name, weights, pairs, "--slam")
+    assert "no poses0.txt next to the pairs" in refused("eval-task", name, weights, pairs, "--slam")
     other = "ae_lidar" if name == "dslr" else "dslr"
     assert f"weights of {name}, not of {other}" in refused("eval-task", other, weights, pairs)

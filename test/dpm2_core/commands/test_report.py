@@ -58,4 +58,4 @@ def test_experiments_below_a_folder_have_their_tables_by_its_name(tmp_path: Path
     assert done.stderr.endswith(f": 2 runs, {len(page) / 1e3:.0f} kB\n")  # it was 0.0 MB
     (tmp_path / "out" / "second" / "kitti.json").write_text("{")
     done, _ = report(tmp_path / "r.html", tmp_path / "out")
-    assert (done.returncode, "second/kitti.json: no record of an experiment" in done.stderr) == (2, True)
+    assert (done.returncode, "second/kitti.json: not a record of an experiment" in done.stderr) == (2, True)

@@ -310,5 +310,5 @@ def test_corrupted_sensors_on_request(recording: Path, tmp_path: Path) -> None:
 def test_a_network_without_weights_is_an_error_of_use(recording: Path, tmp_path: Path) -> None:
     settings = ("--set", "slam.registration=neural", "--set", f"slam.neural.weights={tmp_path}/none.safetensors")
     error = refused("run", recording, "--out", tmp_path / "no", *settings)
-    assert "none.safetensors: no such file; weights that come with dpm2:" in error
+    assert "none.safetensors: no such file; weights shipped with dpm2:" in error
     assert not (tmp_path / "no").exists()

@@ -104,5 +104,5 @@ def test_weights_to_start_from_have_a_name_as_everywhere(tmp_path: Path) -> None
     ]
     assert content.endswith("/small.safetensors")
     done = dpm2("train", "phase2", "--out", tmp_path / "b", "--set", "start=nowhere")
-    assert (done.returncode, "weights nowhere: no such file; weights that come with dpm2: " in done.stderr) == (2, True)
+    assert (done.returncode, "weights nowhere: no such file; weights shipped with dpm2: " in done.stderr) == (2, True)
     assert not (tmp_path / "b").exists()

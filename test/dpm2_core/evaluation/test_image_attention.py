@@ -54,5 +54,5 @@ def test_what_cannot_be_shown_is_said(model: DeepPointMap2, frame: Frame) -> Non
     behind = int(np.flatnonzero(~image_attention(model, frame).seen)[0])
     with pytest.raises(UsageError, match=f"point {behind}: want one in the image"):
         image_attention(model, frame, behind)
-    with pytest.raises(UsageError, match="no camera"):
+    with pytest.raises(UsageError, match="no image attention"):
         image_attention(DeepPointMap2(tiny(image={"backbone": "none"})), frame)

@@ -41,7 +41,7 @@ def test_without_a_display_a_view_is_an_error_at_once(
         monkeypatch.delenv(name, raising=False)
     done = dpm2("run", str(recording), "--out", str(tmp_path / "out"), "--view", "--frames", "0:3")
     assert done.returncode == 1
-    assert "there is no display" in done.stderr
+    assert "no display for rerun's viewer" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

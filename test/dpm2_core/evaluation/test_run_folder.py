@@ -77,7 +77,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str, content: str, proble
 
 
 def test_another_folder_is_no_run(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"no run; want a folder with trajectory\.tum"):
+    with pytest.raises(UsageError, match=r"not a folder of a run: no trajectory\.tum"):
         read_run(tmp_path)
 
 

@@ -38,12 +38,12 @@ def test_what_is_measured_otherwise_than_in_the_paper_is_said(tmp_path: Path) ->
     request, paper = Request(tmp_path, tmp_path), ("06", "10")
     assert (paper_notes(request, paper, paper), segments(request)) == ([], "all segments")
     (missing,) = paper_notes(request, ("10",), paper)
-    assert missing.endswith("asked for: 06")
+    assert missing.endswith("requested: 06")
     for other in (replace(request, lengths=(50.0, 100.0)), replace(request, frames=(0, 400))):
         (note,) = paper_notes(other, paper, paper)
-        assert note.endswith("its rows are no comparison")
+        assert note.endswith("do not compare with its rows")
     (note,) = paper_notes(request, (*paper, "07"), paper)
-    assert note.endswith("its rows are no comparison")
+    assert note.endswith("do not compare with its rows")
     assert segments(replace(request, lengths=(50.0, 100.0))) == "all segments of 50, 100 m"
 
 
@@ -67,7 +67,7 @@ def test_kitti_beside_other_programs(kitti: Path, tmp_path: Path) -> None:
     assert 0 < found["dpm2 geometric"]["mean"]["t_err_percent"] < 5
     assert found["DeepPointMap2"]["06"] == {"t_err_percent": 0.47, "r_err_deg_per_100m": 0.20}
     assert "07, 08, 09" in done.stderr
-    assert "no comparison" in done.stderr
+    assert "do not compare with" in done.stderr
     record = json.loads((out / "kitti.json").read_text())
     speeds = {row["name"]: row["cells"]["10"] for row in record["tables"][1]["rows"]}
     assert speeds["dpm2 geometric"]["fps"] > 0
@@ -133,8 +133,8 @@ def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
     assert record["parts"]["dpm2_geometric_box_before_the_LiDAR_100_/10"]["ape_rmse_m"] != whole["ape_rmse_m"]
     assert set(record["change_percent"]) == set(ours[1:])
     assert "all segments of 2 m;" in record["tables"][0]["caption"]
-    assert "the paper's means are of 06, 07, 08, 09, 10" in record["notes"]
-    assert any("no comparison" in note for note in record["notes"])
+    assert "the paper's means are over the sequences 06, 07, 08, 09, 10" in record["notes"]
+    assert any("do not compare with" in note for note in record["notes"])
     assert (tmp_path / "corrupted_10.png").stat().st_size > 5000
 
 
@@ -144,12 +144,12 @@ def test_robustness_at_every_share(kitti: Path, tmp_path: Path) -> None:
         (("kiti", "DATA", "--out", "OUT"), "kiti: no such experiment; choose from kitti, "),
         (("kitti", "DATA"), "give NAME DATA --out DIR, or --list"),
         (("kitti", "DATA", "--out", "OUT", "--sequences", "42"), "42"),
-        (("kitti", "DATA", "--out", "OUT", "--seeds", "3"), "kitti: has no use for --seeds"),
-        (("robustness", "DATA", "--out", "OUT", "--peer", "kiss-icp"), "robustness: has no use for --peer"),
+        (("kitti", "DATA", "--out", "OUT", "--seeds", "3"), "kitti: does not use --seeds"),
+        (("robustness", "DATA", "--out", "OUT", "--peer", "kiss-icp"), "robustness: does not use --peer"),
         (("kitti", "DATA", "--out", "OUT", "--lengths", "0"), "--lengths 0"),
-        (("kitti", "DATA", "--out", "OUT", "--peer", "x=a.txt"), "put {sequence} where its name stands"),
-        (("kitti", "DATA", "--out", "OUT", "--sequences", "10,10"), "kitti: two results of one name (dpm2/10)"),
-        (("kitti360", "DATA", "--out", "OUT"), "choose others with --sequences"),
+        (("kitti", "DATA", "--out", "OUT", "--peer", "x=a.txt"), "write {sequence} in place of their names"),
+        (("kitti", "DATA", "--out", "OUT", "--sequences", "10,10"), "kitti: two results have the same name (dpm2/10)"),
+        (("kitti360", "DATA", "--out", "OUT"), "choose other sequences with --sequences"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(
@@ -166,7 +166,7 @@ def test_two_peers_in_one_folder_are_refused(kitti: Path, tmp_path: Path) -> Non
     """This is an error, since the second would overwrite the first, and both rows would show its figures."""
     peers = ("--peer", "my slam=a.txt", "--peer", "my_slam=b.txt")
     done = dpm2("experiment", "kitti", kitti, "--out", tmp_path, "--sequences", "10", *peers)
-    assert (done.returncode, "two results of one name (my_slam/10)" in done.stderr) == (2, True)
+    assert (done.returncode, "two results have the same name (my_slam/10)" in done.stderr) == (2, True)
 
 
 @pytest.mark.slow

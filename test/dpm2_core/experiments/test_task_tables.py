@@ -109,7 +109,7 @@ def test_dslr_both_tables_from_the_same_trainings(tmp_path: Path) -> None:
     (data / "poses1.txt").unlink()
     again = dpm2("experiment", "dslr-slam", *rest[:2], tmp_path / "new", *rest[3:])
     assert again.returncode == 2
-    assert "no poses1.txt beside the pairs" in again.stderr
+    assert "no poses1.txt next to the pairs" in again.stderr
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_ae_lidar_says_that_its_last_epoch_has_the_slam_loss(tmp_path: Path) -> 
     rest = (data, "--out", out, "--learn", "0", "--sequences", "1", "--seeds", "1")
     done = dpm2("experiment", "ae-lidar", *rest, *options(*QUICK, *RANGE, "epochs=2", "slam.begin=0"))
     assert done.returncode == 0, done.stderr
-    assert "the last epoch has the SLAM loss" in done.stderr
+    assert "the last epoch uses the SLAM loss" in done.stderr
     assert first_table(out / "ae-lidar.json")["AE_lidar with SLAM loss, CARLA-64"]["chamfer"] == {"mean": 2.83}
     missing = dpm2("experiment", "ae-lidar", data, "--out", out, "--learn", "7", "--sequences", "1")
     assert missing.returncode == 2
@@ -169,7 +169,7 @@ def test_a_gain_by_hand() -> None:
 def test_without_any_slam_loss_there_is_nothing_to_compare(tmp_path: Path, settings: tuple[str, ...]) -> None:
     done = dpm2("experiment", "gndnet", tmp_path, "--out", tmp_path / "out", *options(*settings))
     assert done.returncode == 2
-    assert "the SLAM loss, which is to be compared, never counts: slam.gamma is" in done.stderr
+    assert "the training never uses the SLAM loss, which is compared: slam.gamma is" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -182,7 +182,7 @@ def test_what_was_learned_from_is_found_by_any_name_and_an_unknown_figure_is_lef
     first = next(name for name in figures if "without" in name)
     figures[first] = {**figures[first], "recall": float("nan"), "precision": 0.7}
     findings = GNDNET.findings(request, figures)
-    assert "tested on what was learned from: train/00" in findings.notes
+    assert "tested on sequences that were used for training: train/00" in findings.notes
     cells = findings.tables[0].rows[0].cells
     assert (cells["recall"], cells["precision"]) == ({"mean": 0.5}, {"mean": pytest.approx(0.6)})
     gains = findings.extra["gains"]

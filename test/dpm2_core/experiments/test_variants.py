@@ -99,8 +99,8 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
 
 
 @pytest.mark.parametrize(("asked", "said"), [
-    ("preset=paper", "preset paper: the network is that of --weights .*tiny.safetensors, of preset tiny"),
-    ("start=small", "start small: what all variants start from is named by --weights"),
+    ("preset=paper", "preset paper: the weights --weights .*tiny.safetensors are of the preset tiny"),
+    ("start=small", "start small: give the weights that all variants start from by --weights"),
     ("optimiser.stepps=3", "unknown key optimiser.stepps"),
     ("slam.neural.weights=small", "weights=small: each variant is driven with its own weights; .* by --weights"),
     ("slam.neural={weights: small}", "weights=small: each variant"),

@@ -75,7 +75,7 @@ def test_a_room_and_a_street_are_not_registered(network: DeepPointMap2) -> None:
     for source, target in ((room, street), (street, room)):
         result = network.register(source, target)
         assert not result.ok
-        assert "one is a room, the other is not" in result.reason
+        assert "one scan is of a room, the other is not" in result.reason
     assert network.agreement(room, [street]) == [0.0]
 
 

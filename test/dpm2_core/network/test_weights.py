@@ -72,7 +72,7 @@ def test_overlap_is_checked_after_overlap_alone(model: DeepPointMap2, saved: Pat
 def test_wrong_preset_is_rejected(saved: Path) -> None:
     """The error names both."""
     other = DeepPointMap2(tiny().model_copy(update={"preset": "huge"}))
-    with pytest.raises(UsageError, match="weights of preset tiny, the network is preset huge"):
+    with pytest.raises(UsageError, match="weights of preset tiny, but the network is of preset huge"):
         load_weights(other, saved)
 
 
@@ -126,5 +126,5 @@ def test_weights_that_fit_in_part(tmp_path: Path) -> None:
     for name, value in other.state_dict().items():
         assert torch.equal(value, before[name] if name in random else stored[name]), name
     save_file({"nothing": torch.zeros(1)}, tmp_path / "b.safetensors")
-    with pytest.raises(UsageError, match="nothing in it fits"):
+    with pytest.raises(UsageError, match="none of its tensors fits"):
         load_fitting(other, tmp_path / "b.safetensors")

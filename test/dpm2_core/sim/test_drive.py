@@ -86,7 +86,7 @@ def test_a_complete_drive_is_reused_and_another_one_rejected(recording: Path) ->
 
 def test_another_folder_is_never_touched(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("words")
-    with pytest.raises(UsageError, match="no simulated drive"):
+    with pytest.raises(UsageError, match="not a simulated drive"):
         simulate(tmp_path, DriveConfig(frames=2, lidar=LIDAR, images=False))
     assert _files(tmp_path) == {"thesis.tex": b"words"}
 

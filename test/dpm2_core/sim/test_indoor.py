@@ -106,7 +106,7 @@ def test_every_seed_gives_a_building_with_a_way(length: float) -> None:
 
 
 def test_a_building_too_short_for_two_rooms_is_rejected() -> None:
-    with pytest.raises(UsageError, match="a way of 1 m has a single room"):
+    with pytest.raises(UsageError, match="a route of 1 m has a single room"):
         office(1.0, np.random.default_rng(0))
 
 
@@ -118,7 +118,7 @@ def test_a_car_park_grows_with_the_way_asked_for() -> None:
 def test_what_there_is_not_indoors_is_rejected() -> None:
     with pytest.raises(UsageError, match="--road straight: indoors"):
         build_world("straight", "indoor", 0, 60)
-    with pytest.raises(UsageError, match="--traffic 20: there is none indoors"):
+    with pytest.raises(UsageError, match="--traffic 20: there is no traffic indoors"):
         build_world("loop", "car_park", 0, 60, traffic=20)
 
 
@@ -133,6 +133,6 @@ def test_the_way_is_free_below_the_headroom(inside: World) -> None:
 
 def test_a_lidar_that_does_not_fit_is_rejected(tmp_path: Path) -> None:
     tall = LidarConfig(beams=16, columns=360, height=3.0)
-    with pytest.raises(UsageError, match=r"--height 3: the way leads under"):
+    with pytest.raises(UsageError, match=r"--height 3: the route passes under"):
         simulate(tmp_path / "d", DriveConfig(preset="indoor", frames=1, images=False, lidar=tall))
     assert not list(tmp_path.iterdir())

@@ -116,7 +116,9 @@ def test_columns_that_do_not_go_around_evenly_are_named(tmp_path: Path) -> None:
     for xyz in (shuffled, plain[:, :, :100]):
         for twin in ("s0.npy", "d0.npy"):
             np.save(tmp_path / twin, xyz)
-        with pytest.raises(UsageError, match=r"d0\.npy: its columns, or its twin's, are not in even steps of azimuth"):
+        with pytest.raises(
+            UsageError, match=r"d0\.npy: its columns, or those of its twin, are not at equal steps of azimuth"
+        ):
             open_scans(tmp_path)
     for twin in ("s0.npy", "d0.npy"):
         np.save(tmp_path / twin, 0 * plain)

@@ -82,7 +82,7 @@ def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Pat
     assert scan.labels is None
     assert scan.static is None
     for need in ("labels", "static"):
-        with pytest.raises(UsageError, match=f"00: no {need}/ beside velodyne/"):
+        with pytest.raises(UsageError, match=f"00: no {need}/ next to velodyne/"):
             open_scans(folder, (need,))
     with pytest.raises(UsageError, match="scan 0: no labels"):
         ground_of(scan)
@@ -92,10 +92,10 @@ def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Pat
     ("kind", "name", "keep", "message"),
     [
         ("labels", "000002.label", -4, "1599 labels for 1600 points"),
-        ("labels", "000002.label", -3, "not whole points"),
+        ("labels", "000002.label", -3, "not a multiple of"),
         ("velodyne", "000001.bin", -16, "1600 labels for 1599 points"),
-        ("velodyne", "000001.bin", -7, "not whole points"),
-        ("static", "000005.bin", -1, "not whole points"),
+        ("velodyne", "000001.bin", -7, "not a multiple of"),
+        ("static", "000005.bin", -1, "not a multiple of"),
         ("static", "000005.bin", 0, "the file is empty"),
         ("velodyne", "000004.bin", 0, "the file is empty"),
         ("labels", "000000.label", None, "No such file"),

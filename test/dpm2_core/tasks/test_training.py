@@ -182,7 +182,7 @@ def test_weights_come_back(scans: TaskScans, tmp_path: Path) -> None:
         torch.testing.assert_close(found, task.net([scans[0].points]))
     draw(task, scans, 1, tmp_path / "ground.png")
     assert (tmp_path / "ground.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(UsageError, match="scan 6: there are 6"):
+    with pytest.raises(UsageError, match="scan 6: there are only 6 scans"):
         draw(task, scans, 6, tmp_path / "none.png")
 
 

@@ -283,7 +283,7 @@ def test_descriptors_of_a_keyframe_take_86_kb(noise: np.random.Generator) -> Non
 
 
 def test_missing_weights_and_what_is_none_are_errors_of_use() -> None:
-    with pytest.raises(UsageError, match="nowhere: no such file; weights that come with dpm2"):
+    with pytest.raises(UsageError, match="nowhere: no such file; weights shipped with dpm2"):
         load_network("nowhere", 1)
     with pytest.raises(UsageError, match="not a safetensors file"):
         load_network(__file__, 1)
