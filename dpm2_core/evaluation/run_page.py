@@ -149,7 +149,7 @@ def _figures_table(runs: Sequence[tuple[str, RunFolder]]) -> FigureTable:
     measured = dict.fromkeys(_lengths(run) for _, run in runs if run.metrics.get("t_err_percent") is not None)
     kitti = sorted(measured, key=lambda lengths: lengths != OFFICIAL_LENGTHS) or [OFFICIAL_LENGTHS]
     headings = [name + _lengths_suffix(lengths) for lengths in kitti for name in _KITTI]
-    caption = "APE after SE(3) alignment; RPE and KITTI metric unaligned, the latter over segments of 100 to 800 m if no other"
+    caption = "APE after SE(3) alignment; RPE and KITTI metric unaligned; KITTI segments of 100 to 800 m if no other"
     table = FigureTable("Runs", names=["run"], figures=["frames", *headings, *_FIGURES, "loops", "rejected"],
                         caption=f"{caption} lengths are named.")  # fmt: skip
     for name, run in runs:

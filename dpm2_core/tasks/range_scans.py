@@ -100,7 +100,7 @@ class RangeReader:
         s, (rows, columns) = self._settings, mask.shape
         if rows < s.first + s.rows or columns % s.columns:
             raise UsageError(
-                f"{where}: an image of {rows} x {columns} lacks rows of {s.first} to {s.first + s.rows - 1}, "
+                f"{where}: an image of {rows} x {columns} has no rows {s.first} to {s.first + s.rows - 1}, "
                 f"or its columns are not a multiple of {s.columns}"
             )
         step = columns // s.columns

@@ -121,4 +121,4 @@ def test_doctor(tmp_path: Path) -> None:
     assert "self-test" not in findings
     broken = dpm2("doctor", "--folder", "/proc", "--no-test")
     assert broken.returncode == 1
-    assert "does not work: disk" in broken.stderr
+    assert "these do not work: disk" in broken.stderr

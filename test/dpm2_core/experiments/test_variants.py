@@ -102,9 +102,9 @@ def test_what_is_learned_from_and_how_tells_trainings_apart(kitti: Path, weights
     ("preset=paper", "preset paper: the weights --weights .*tiny.safetensors are of the preset tiny"),
     ("start=small", "start small: give the weights that all variants start from by --weights"),
     ("optimiser.stepps=3", "unknown key optimiser.stepps"),
-    ("slam.neural.weights=small", "weights=small: each variant is driven with its own weights; .* by --weights"),
+    ("slam.neural.weights=small", "weights=small: each variant is run with its own weights; .* by --weights"),
     ("slam.neural={weights: small}", "weights=small: each variant"),
-    ("slam.registration=geometric", "registration=geometric: the variants are driven with the network alone"),
+    ("slam.registration=geometric", "registration=geometric: the variants are run with the network alone"),
 ])  # fmt: skip
 def test_settings_that_no_variant_is_trained_by_are_errors(
     asked: str, said: str, kitti: Path, weights: Path, tmp_path: Path
