@@ -82,4 +82,4 @@ def _check_found(path: Path, sequences: Sequence[str], found: Sequence[ScanSeque
     missing = [name for name in sequences if name not in folders and not (name.isdecimal() and int(name) in pairs)]
     if missing:
         available = sorted(folders) + sorted(str(pair.number) for pair in open_pairs(path))
-        raise UsageError(f"{path}: no sequence {missing[0]}; it has {', '.join(available) or 'none'}")
+        raise UsageError(f"{path}: no sequence {missing[0]}; there are {', '.join(available) or 'none'}")

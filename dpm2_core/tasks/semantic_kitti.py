@@ -40,7 +40,7 @@ def kitti_runs(folder: Path, root: Path, needs: Sequence[RequiredData]) -> list[
         raise UsageError(f"{folder}: no scans (velodyne/NNNNNN.bin)")
     for need in needs:
         if not (folder / need).is_dir():
-            raise UsageError(f"{folder}: no folder {need}/ next to velodyne/; this task needs it")
+            raise UsageError(f"{folder}: no {need}/ next to velodyne/; this task needs it")
     name = str(folder.relative_to(root)) if folder != root else folder.resolve().name
     run = _KittiRun(folder, name, (folder / "labels").is_dir(), (folder / "static").is_dir(), numbers)
     for number in numbers:

@@ -200,7 +200,7 @@ WEIGHTS: dict[str, tuple[Callable[[DeepPointMap2], dict[str, str]], str]] = {
     "65,536 layers": (changed(fusion={"layers": 65536}), "less than or equal to 64"),
     "an image of a terapixel": (changed(image={"size": [10**6, 10**6]}), "image.size is 1000000"),
     "a number without end": (changed(points={"far": float("inf")}), "points.far is inf"),
-    "heads that do not divide": (changed(decoder={"heads": 7}), "cannot be"),
+    "heads that do not divide": (changed(decoder={"heads": 7}), "describes an invalid network"),
     "no JSON": (lambda model: {"preset": "tiny", "network": "{" * 100}, "not JSON"),
     "JSON without end": (lambda model: {"preset": "tiny", "network": "[" * 200_000}, "not JSON"),
     "a list": (lambda model: {"preset": "tiny", "network": "[1]"}, "not a mapping"),

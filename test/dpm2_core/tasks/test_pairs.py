@@ -129,7 +129,7 @@ def test_pairs_by_number_and_their_poses(tmp_path: Path) -> None:
     """Numbers select pairs, with or without leading zeros; poses next to them have one per scan, or are an error."""
     carla64(tmp_path)
     assert open_scans(tmp_path, sequences=["08"]).lengths == [2]
-    with pytest.raises(UsageError, match="no sequence 3; it has 0, 8"):
+    with pytest.raises(UsageError, match="no sequence 3; there are 0, 8"):
         open_scans(tmp_path, sequences=["8", "3"])
     first, last = open_pairs(tmp_path)
     assert first.poses is None

@@ -82,7 +82,7 @@ def test_without_labels_or_twins(write_drive: Callable[..., Path], tmp_path: Pat
     assert scan.labels is None
     assert scan.static is None
     for need in ("labels", "static"):
-        with pytest.raises(UsageError, match=f"00: no folder {need}/ next to velodyne/"):
+        with pytest.raises(UsageError, match=f"00: no {need}/ next to velodyne/"):
             open_scans(folder, (need,))
     with pytest.raises(UsageError, match="scan 0: no labels"):
         ground_of(scan)
