@@ -60,4 +60,4 @@ def check_options(names: Collection[str], given: Collection[str]) -> None:
         takes = sorted(BENCHES[name].split())
         if ignored := sorted(set(given) - set(takes)):
             listed = ", ".join(f"--{option}" for option in takes)
-            raise UsageError(f"--{ignored[0]}: benchmark {name} has no use for it; it takes {listed}")
+            raise UsageError(f"--{ignored[0]}: benchmark {name} does not use it; it uses {listed}")

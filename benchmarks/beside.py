@@ -82,4 +82,4 @@ def _drive(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> dic
 def _table(worlds: dict[str, Any]) -> FigureTable:
     columns = {f"map APE m, {way}": f"{{{way}[map_ape_rmse_m]:.3f}}" for way in WAYS}
     columns |= {f"frames led, {way}": f"{{{way}[frames_led]}}" for way in WAYS}
-    return record_table(f"Beside an odometry with {100 * SLIP:g} % slip", ["world"], columns, worlds)
+    return record_table(f"With another odometry of {100 * SLIP:g} % slip", ["world"], columns, worlds)

@@ -126,7 +126,7 @@ def calibration(rows: Sequence[tuple[Array, Registration]]) -> dict[str, Any]:
 def _table(part: str, drives: dict[str, Any]) -> FigureTable:
     names = ["drive", "pairs", "method"]
     figures = ("registered", "m", "deg", *(f"chi2 {span}" for span in _SPANS))
-    table = FigureTable(f"Covariance, {part}: median chi2 by its expectation", names=names, figures=figures)
+    table = FigureTable(f"Covariance, {part}: median chi2 divided by its expectation", names=names, figures=figures)
     for drive, kinds in drives.items():
         for kind, methods in kinds.items():
             for method, row in methods.items():

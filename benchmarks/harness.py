@@ -130,7 +130,7 @@ def drives(options: Options, more: Sequence[Source] = ()) -> Iterator[dict[str, 
                 raise Dpm2Error(f"{kitti / 'unpack.py'}: {done.stderr.strip().splitlines()[-1:]}")
         sequences = sorted(path for path in (root / "sequences").glob("*") if (path / "velodyne").is_dir())
         if not sequences:
-            raise UsageError(f"{kitti}: neither unpack.py nor sequences/NN/velodyne in it")
+            raise UsageError(f"{kitti}: contains neither unpack.py nor sequences/NN/velodyne")
         yield _named([*(open_source(path, how) for path in sequences), *more])
 
 

@@ -116,7 +116,7 @@ def _table(worlds: dict[str, Any]) -> FigureTable:
     columns = {f"APE m, {way}": f"{{{way}[ape_rmse_m]:.3f}}" for way in WAYS}
     columns |= {f"worst tilt deg, {way}": f"{{{way}[worst_tilt_deg]:.3f}}" for way in WAYS}
     columns |= {"with / without": "{ratio:.2f}"}
-    return record_table(f"{LIDAR.beams} beams, turns of 100 deg/s", ["world"], columns, worlds)
+    return record_table(f"{LIDAR.beams} beams, rotations of 100 deg/s", ["world"], columns, worlds)
 
 
 def _table_of_pauses(pauses: dict[str, Any]) -> FigureTable:

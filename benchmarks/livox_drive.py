@@ -35,7 +35,7 @@ def write_sequence(folder: Path, sequence: Path) -> None:
     if len(rows) != 4 * len(scans):
         raise UsageError(f"{folder / _POSES}: {len(rows)} rows for {len(scans)} scans, want four each")
     if sequence.exists():
-        raise UsageError(f"{sequence}: is there already")
+        raise UsageError(f"{sequence}: exists already")
     poses = rows.reshape(-1, 4, 4)
     times = poses[:, 3, 3].copy()  # in place of the 1 of a transform
     poses[:, 3] = 0, 0, 0, 1

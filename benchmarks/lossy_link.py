@@ -37,7 +37,7 @@ def own_network(module: str) -> int:
     """
     missing = [tool for tool in ("unshare", "ip", "nft") if shutil.which(tool) is None]
     if os.geteuid() != 0 or missing:
-        raise UsageError(f"a network of its own needs root and util-linux, iproute2, nftables; missing: {missing}")
+        raise UsageError(f"a network namespace needs root and util-linux, iproute2, nftables; missing: {missing}")
     command = ["unshare", "--net", sys.executable, "-m", module, *sys.argv[1:]]
     return subprocess.call(command, env=os.environ | {_INSIDE: "1"})
 

@@ -52,7 +52,7 @@ def _reference_table(shares: Mapping[str, Any]) -> FigureTable:
     kinds = next(iter(next(iter(shares.values())).values()))
     columns = {f"{within}, {apart}": f"{{{apart}[{within}]:.2f}}"
                for apart, row in kinds.items() for within in row if within != "pairs"}  # fmt: skip
-    title = "Reference points that are near one of another frame, share"
+    title = "Share of reference points that are near one of another frame"
     return record_table(title, ["drive", "chosen by"], columns, shares, sections=True)
 
 

@@ -88,4 +88,4 @@ def _table(results: dict[str, Any]) -> FigureTable:
         "drift %": "{final_drift_percent:.3f}", "failed": "{failed_frames}", "keyframes": "{keyframes}",
         "loops": "{loops[accepted]}", "wrong": "{loops[wrong]}",
     }  # fmt: skip
-    return record_table("The paper's ways, each put into ours", ["drive", "way"], columns, results)
+    return record_table("The paper's methods, each in place of ours", ["drive", "method"], columns, results)

@@ -41,7 +41,7 @@ def bench_pose_graph(options: Options) -> Report:
     """
     folder = excerpt() / "pose_graphs"
     if not (folder / "kitti_00_GT.g2o").is_file():
-        raise UsageError(f"{folder}: no kitti_00_GT.g2o; set DPM2_KITTI")
+        raise UsageError(f"{folder}: no kitti_00_GT.g2o; set DPM2_KITTI to the KITTI excerpt")
     truth = read_g2o(folder / "kitti_00_GT.g2o").graph.poses
     kitti = {}
     for alpha in ("0.00", "0.30", "0.60"):

@@ -23,8 +23,8 @@ _ACCOUNT = re.compile(r"(\d+) clouds sent: (\d+) processed, (\d+) dropped \(queu
 
 
 def bench(
-    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap, such as that of `make demo`")],
-    times: Annotated[int, typer.Option(min=1, help="Replays of each kind.")] = 5,
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap, such as from `make demo`")],
+    times: Annotated[int, typer.Option(min=1, help="Replays at each rate and in lockstep.")] = 5,
 ) -> int:
     """Play a bag at its own rate, at twice that, and in lockstep. Exit code 1 if a cloud is not accounted for."""
     figures = ("sent", "processed", "dropped", "lost", "sum", "playing s")

@@ -26,5 +26,5 @@ def _kilobytes(name: str) -> int:
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     except OSError:
-        raise Dpm2Error("the memory benchmark reads /proc/self/status, which only Linux has") from None
+        raise Dpm2Error("the memory benchmark works only on Linux: it reads /proc/self/status") from None
     return next(int(line.split()[1]) for line in lines if line.startswith(name))

@@ -37,7 +37,7 @@ FIGURES = ("frames_in", "frames_out", "dropped", "latency_p50_ms", "latency_p95_
 
 
 def bench(
-    sources: Annotated[list[Path] | None, typer.Option("--source", help="KITTI sequences, not the excerpt.")] = None,
+    sources: Annotated[list[Path] | None, typer.Option("--source", help="KITTI sequence, not the excerpt.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for ros.json.")] = Path("benchmarks"),
     repetitions: Annotated[int, typer.Option(min=1, help="Replays of every drive.")] = 3,
 ) -> int:

@@ -46,21 +46,21 @@ DELIVERY = 5.0
 
 @dataclass(frozen=True)
 class Options:
-    """Publish a recording. Exit code 2 for one that cannot be read."""  # the help: typer takes a command from this
+    """Publish a recording. The exit code is 2 if it cannot be read."""  # the help: typer takes a command from this
 
     bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap or .db3 file")]
-    rate: Annotated[float, typer.Option(help="speed, 1 is that of the recording", min=0.001)] = 1.0
+    rate: Annotated[float, typer.Option(help="playing speed, relative to the recording", min=0.001)] = 1.0
     start: Annotated[float, typer.Option(help="seconds to skip at the start", min=0)] = 0.0
-    duration: Annotated[float | None, typer.Option(help="seconds to play, of the recording's time", min=0)] = None
+    duration: Annotated[float | None, typer.Option(help="seconds of the recording to play", min=0)] = None
     loop: Annotated[bool, typer.Option("--loop", help="start again at the end, until stopped")] = False
-    topics: Annotated[list[str] | None, typer.Option(help="only these topics; may be repeated")] = None
+    topics: Annotated[list[str] | None, typer.Option(help="play only this topic; may be repeated")] = None
     wait: Annotated[float, typer.Option(help="longest wait for a subscriber to the clouds, s", min=0)] = 30.0
-    subscribers: Annotated[int, typer.Option(help="how many listeners to wait for", min=1)] = 1
-    listener: Annotated[str, typer.Option("--for", help="only nodes of this name count, such as slam_node")] = ""
+    subscribers: Annotated[int, typer.Option(help="number of these subscribers to wait for", min=1)] = 1
+    listener: Annotated[str, typer.Option("--for", help="wait only for nodes of this name, such as slam_node")] = ""
     clock: Annotated[bool, typer.Option(help="publish /clock, for nodes with use_sim_time")] = True
     log: Annotated[Path | None, typer.Option(help="CSV file with the time at which each message was published")] = None
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="no timing: each cloud follows the dpm2/odom of the one before")
+        bool, typer.Option("--lockstep", help="ignore the timing: publish each cloud after dpm2/odom of the one before")
     ] = False
 
 

@@ -38,9 +38,9 @@ def average(files: Sequence[Path]) -> DeepPointMap2:
 
 
 def average_weights(
-    out: Annotated[Path, typer.Argument(help="Weights to write.")],
-    files: Annotated[list[Path], typer.Argument(metavar="IN...", help="Weights of the stages, the last one last.")],
-    encoder: Annotated[Path | None, typer.Option(help="Weights whose encoder it has instead of the mean.")] = None,
+    out: Annotated[Path, typer.Argument(help="Weights file to write.")],
+    files: Annotated[list[Path], typer.Argument(metavar="IN...", help="Weights files of the stages, in order.")],
+    encoder: Annotated[Path | None, typer.Option(help="Weights file whose encoder replaces the mean.")] = None,
 ) -> None:
     """Write the mean of weights; the averaged decoder may be combined with the encoder of another stage."""
     model = average(files)

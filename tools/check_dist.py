@@ -42,7 +42,7 @@ def check(distribution: Path, extra: str, work: Path) -> None:
         subprocess.run([str(run / name), *arguments], check=True, cwd=work, stdout=subprocess.DEVNULL)
     for name in NODES:
         assert (run / name).is_file(), f"{name} is missing"
-    print(f"{distribution.name} with {extra or 'nothing more'}: sound")
+    print(f"{distribution.name} with {extra or 'no extras'}: ok")
 
 
 def check_all(

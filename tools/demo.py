@@ -44,9 +44,11 @@ class Evaluation:
 
 
 def demo(
-    src: Annotated[Path | None, typer.Argument(help="KITTI sequence, rosbag2 folder or .mcap; none: simulate")] = None,
-    out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("out/demo"),
-    rate: Annotated[float, typer.Option(help="speed of playing; 1: that of the recording", min=0.05)] = 1.0,
+    src: Annotated[
+        Path | None, typer.Argument(help="KITTI sequence, rosbag2 folder or .mcap; default: simulated")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="folder for all output")] = Path("out/demo"),
+    rate: Annotated[float, typer.Option(help="playing speed, relative to the recording", min=0.05)] = 1.0,
 ) -> int:
     """Replay a drive into slam_node and check its output. Exit code 1 if a check fails."""
     console = Console()

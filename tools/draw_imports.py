@@ -84,7 +84,7 @@ def reduced(arrows: Mapping[str, set[str]]) -> Arrows:
     """
     below = {unit: reachable(arrows, unit) for unit in arrows}
     if circle := sorted(unit for unit in arrows if unit in below[unit]):
-        raise Dpm2Error(f"imports run in a circle: {', '.join(circle)}")
+        raise Dpm2Error(f"circular imports: {', '.join(circle)}")
     return {
         unit: {other for other in imported if not any(other in below[between] for between in imported)}
         for unit, imported in arrows.items()

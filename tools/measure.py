@@ -61,17 +61,17 @@ def _is_current(commit: str | None) -> bool:
     return commit is not None and not subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode
 
 
-def measure(names: Annotated[list[str] | None, typer.Argument(help="Records; all without.")] = None) -> None:
+def measure(names: Annotated[list[str] | None, typer.Argument(help="Names of records. Default: all.")] = None) -> None:
     """Measure what is missing, one benchmark after the other."""
     commit = git_commit()
     if commit is None or commit.endswith("+"):
-        raise UsageError("a record names the commit that it is of: commit what has changed first")
+        raise UsageError("a record names the commit that was measured: commit your changes first")
     for name in remaining(names or ()):
-        print(f"{name}: at {measured_at(RECORDS / f'{name}.json') or 'no commit'}, measured again", flush=True)
+        print(f"{name}: at {measured_at(RECORDS / f'{name}.json') or 'no commit'}, measuring again", flush=True)
         bench = [sys.executable, "-m", "dpm2_core.cli", "bench", name, *COMMANDS.get(name, ())]
         command = ["make", TARGETS[name]] if name in TARGETS else bench
         if subprocess.run(command, cwd=REPOSITORY, check=False).returncode:
-            raise Dpm2Error(f"{name}: the benchmark failed; what was measured before it is kept")
+            raise Dpm2Error(f"{name}: the benchmark failed; the records that were measured before it are kept")
 
 
 if __name__ == "__main__":

@@ -254,7 +254,7 @@ def test_what_cannot_be_measured_is_rejected(sequence: Path, tmp_path: Path, mon
         bench(["geometric", "speed"])
     for name, ignored in (("diffslam", "source"), ("geometric", "unseen"), ("pose-graph", "set"), ("map", "pairs")):
         argument = {"settings" if ignored == "set" else ignored: [sequence]}
-        with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} has no use for it; it takes --"):
+        with pytest.raises(UsageError, match=f"--{ignored}: benchmark {name} does not use it; it uses --"):
             bench([name], out=tmp_path, **argument)
     with pytest.raises(UsageError, match="--only tasks: no such part"):
         bench(["finetune"], out=tmp_path, only="tasks")

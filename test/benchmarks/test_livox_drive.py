@@ -52,5 +52,5 @@ def test_what_is_missing_or_in_the_way_is_an_error(folder: Path, tmp_path: Path)
     assert not (tmp_path / "00").exists()
     poses.write_text("".join(rows))
     write_sequence(folder, tmp_path / "00")
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="exists already"):
         write_sequence(folder, tmp_path / "00")

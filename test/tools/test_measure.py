@@ -47,5 +47,5 @@ def test_records_of_this_code_are_left(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_changed_checkout_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measure, "git_commit", lambda: "abc+")
-    with pytest.raises(UsageError, match="commit what has changed"):
+    with pytest.raises(UsageError, match="commit your changes"):
         measure.measure()
