@@ -122,7 +122,7 @@ def _quiet_option(
     quiet: Annotated[
         bool,
         typer.Option(
-            "--quiet", "-q", help="Print only results, on stdout, and errors, on stderr.",
+            "--quiet", "-q", help="No notes and no progress: only results on stdout and errors on stderr.",
             callback=lambda value: QUIET.set(value), expose_value=False,
         ),
     ] = False,

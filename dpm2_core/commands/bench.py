@@ -35,7 +35,7 @@ def bench(
     ] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="Processors that every method may use [2].")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Set KEY=VALUE of the settings; repeat for more.")
+        list[str] | None, typer.Option("--set", help="Change a setting: KEY=VALUE; repeat for more.")
     ] = None,
     unseen: Annotated[
         Path | None,

@@ -55,7 +55,8 @@ def experiment(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file with settings of the trainings.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Set KEY=VALUE of the SLAM, or of the trainings; repeat for more.")
+        list[str] | None,
+        typer.Option("--set", help="Change a setting of the SLAM, or of the trainings: KEY=VALUE; repeat for more."),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Parallel parts, each in a process of its own.")] = 1,
     json_file: JsonFile = None,

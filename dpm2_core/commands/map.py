@@ -37,7 +37,9 @@ def export(
     out: Annotated[Path, typer.Argument(help="File to write; its extension determines the format without --format.")],
     format: Annotated[
         str,
-        typer.Option(help="ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."),
+        typer.Option(
+            help="Format: ply, pcd, las, html, occupancy (YAML and PGM for Nav2), tum, kitti, geojson or g2o."
+        ),
     ] = "",
     voxel: Annotated[
         float | None, typer.Option(min=0.01, max=1000, help="Spacing of the points of a cloud, m [0.3].")

@@ -20,10 +20,12 @@ ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file with settings; `dpm2 config dump` prints every key.")
 ]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", help="Set KEY=VALUE, such as slam.map.voxel=0.3; repeat for more.")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting: KEY=VALUE, such as slam.map.voxel=0.3; repeat for more."),
 ]
 InputOverrides = Annotated[
-    list[str] | None, typer.Option("--set", help="Set KEY=VALUE of input, such as input.sequence=04; repeat for more.")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting of input: KEY=VALUE, such as input.sequence=04; repeat."),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Parallel workers; their number does not change the result.")]
 PROCESSORS = processors()

@@ -46,13 +46,14 @@ def run(
         str | None,
         typer.Option(
             help="Simulate sensor failures, NAME=VALUE,...: camera (black images), no_image, overexposed, "
-            "underexposed, obstruction (a box before the LiDAR), as fractions of the frames; stops (of the exposure); "
+            "underexposed, obstruction (a box in front of the LiDAR), as fractions of the frames; stops (of the exposure); "
             "beams (dead ones) and dust (pulses that return from it), as fractions; sight (largest range, m); "
             "extrinsic_deg, extrinsic_m (errors of the extrinsics); time_offset (delay of the images, s); seed."
         ),
     ] = None,
     map_file: Annotated[
-        Path | None, typer.Option("--map", help="Map file to write during the run, such as drive.dpm2map.")
+        Path | None,
+        typer.Option("--map", help="Map file to write during the run, such as drive.dpm2map. Default: none."),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run of the same drive from the end of --map.")

@@ -26,7 +26,8 @@ ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="YAML file with settings. Default: the built-in values.")
 ]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="Set KEY=VALUE, a key as in the YAML file; repeat for more.")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting: KEY=VALUE, a key as in the YAML file; repeat for more."),
 ]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for checkpoint, log and weights.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in --out.")]
