@@ -35,7 +35,7 @@ def doctor(
         if not no_test:
             status.update("self-test of the SLAM, ten seconds")
             findings.append(self_test().finding())
-    table = FigureTable("This machine", names=["what", "how"], text=["found"])
+    table = FigureTable("This machine", names=["what", "status"], text=["found"])
     for finding in findings:
         advice = f"; {finding.advice}" if finding.advice else ""
         table.add_row(finding.what, finding.level, finding.found + advice)

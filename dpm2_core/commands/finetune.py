@@ -56,7 +56,7 @@ def finetune(
     written = work.finetune(chosen, out)
     with console.status("measuring"):
         after = work.measure(written, chosen, out)
-    title = "Held-out parts: against the SLAM's trajectory"
+    title = "Held-out parts, measured with the SLAM's trajectory"
     table = FigureTable(title, names=["median error of pairs"], figures=["before", "after"])
     for name, figures in before.items():
         for figure in (figure for figure in figures if figure in after[name]):

@@ -25,7 +25,7 @@ Overrides = Annotated[
 ]
 InputOverrides = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change a setting of input: KEY=VALUE, such as input.sequence=04; repeat."),
+    typer.Option("--set", help="Change a setting of input: KEY=VALUE, such as input.sequence=04; repeat for more."),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Parallel workers; their number does not change the result.")]
 PROCESSORS = processors()

@@ -46,9 +46,9 @@ def run(
         str | None,
         typer.Option(
             help="Simulate sensor failures, NAME=VALUE,...: camera (black images), no_image, overexposed, "
-            "underexposed, obstruction (a box in front of the LiDAR), as fractions of the frames; stops (of the exposure); "
-            "beams (dead ones) and dust (pulses that return from it), as fractions; sight (largest range, m); "
-            "extrinsic_deg, extrinsic_m (errors of the extrinsics); time_offset (delay of the images, s); seed."
+            "underexposed, obstruction (a box in front of the LiDAR), as fractions of the frames; stops (of the "
+            "exposure); beams (dead ones) and dust (pulses that return from it), as fractions; sight (largest range, "
+            "m); extrinsic_deg, extrinsic_m (errors of the extrinsics); time_offset (delay of the images, s); seed."
         ),
     ] = None,
     map_file: Annotated[

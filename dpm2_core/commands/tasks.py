@@ -49,7 +49,7 @@ SequencesOption = Annotated[
     str | None,
     typer.Option(help="Sequences of SRC, or numbers of its pairs, separated by commas, such as 00,01. Default: all."),
 ]
-ValSequencesOption = Annotated[str | None, typer.Option(help="Sequences of --val, likewise. Default: all.")]
+ValSequencesOption = Annotated[str | None, typer.Option(help="Sequences of --val, in the same form. Default: all.")]
 ValOption = Annotated[
     Path | None, typer.Option("--val", help="Scans to evaluate on during training, in a format of SRC. Default: none.")
 ]

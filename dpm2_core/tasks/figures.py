@@ -31,7 +31,7 @@ def dynamic_objects_png(
         (~found & ~truth, "standing", "0.7"),
         (found & truth, "dynamic object, found", "tab:green"),
         (~found & truth, "dynamic object, missed", "tab:red"),
-        (found & ~truth, "standing, taken for one", "tab:blue"),
+        (found & ~truth, "static, wrongly found", "tab:blue"),
     )
     for mask, name, color in kinds:
         axes.plot(points[mask, 1], points[mask, 0], ".", ms=1, mew=0, color=color, label=f"{name}: {mask.sum()}")
