@@ -75,7 +75,7 @@ def slam_runs(task: Task, path: Path, sequences: Sequence[str]) -> Iterator[Task
             clouds.append(task.clouds(scan.to(task.device)))
             numbers.append(scan.number)
         if not clouds[0]:
-            raise UsageError(f"{task.name}: --slam does not apply: this task outputs no clouds for the SLAM")
+            raise UsageError(f"{task.name}: this task outputs no clouds, which the SLAM needs")
         stamps = stamps_of(np.array(numbers) - numbers[0] + 1).tolist()
         poses = {
             kind: _odometry([scan_clouds[kind].cpu().numpy() for scan_clouds in clouds], stamps) for kind in clouds[0]

@@ -99,7 +99,7 @@ def test_what_cannot_be_checked_is_rejected(drives: Path, task: AeLidarTask, tmp
     (copied / "poses.txt").unlink()
     with pytest.raises(UsageError, match="no true poses of its 4 scans"):
         slam_figures(task, copied)
-    with pytest.raises(UsageError, match="gndnet: makes no clouds"):
+    with pytest.raises(UsageError, match="gndnet: this task outputs no clouds"):
         slam_figures(GroundTask(GroundTraining()).eval(), drives)
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="no sequences with poses"):
