@@ -37,7 +37,7 @@ EXPERIMENTS: dict[str, Listed] = {
         "DeepPointMap2, table 1", "t_rel and r_rel on KITTI 06 to 10, compared with other programs", "kitti:KITTI"
     ),
     "kitti360": Listed(
-        "DeepPointMap2, 5.2 and figure 5", "mean position error on KITTI-360 07 and 09", "kitti:KITTI_360"
+        "DeepPointMap2, section 5.2 and figure 5", "mean position error on KITTI-360 07 and 09", "kitti:KITTI_360"
     ),
     "robustness": Listed(
         "DeepPointMap2, table 2 and figure 6",
