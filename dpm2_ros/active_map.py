@@ -19,11 +19,11 @@ from dpm2_core.slam.output import save_map
 from dpm2_core.slam.session import check_for_localization, open_for_localization, open_session
 from dpm2_core.slam.store.map_file import left_log, remove_map
 from dpm2_core.slam.store.map_store import MapStore
-from dpm2_ros.map_folder import MapFolder, file_beside
+from dpm2_ros.map_folder import MapFolder, map_file_of
 from dpm2_ros.settings import NodeConfig
 
 AUTO = "auto"
-_FOUND = isotropic(0.01, 0.1)  # possible error of the map itself around a robot localized in it
+_MAP_COVARIANCE = isotropic(0.01, 0.1)  # possible error of the map itself around a robot localized in it
 
 
 class ActiveMap:
@@ -50,7 +50,9 @@ class ActiveMap:
         self.file_problem = ""
         self._unreadable = False  # whether a keyframe of the map to localize in could not be read
         self._T_map_odom: dict[str, Array] | None = None  # by robot, while the map grows; None before any keyframe
-        self._store: MapStore | TiledMap | None = self._opened() if ros.localization_mode else self._first_file()
+        self._store: MapStore | TiledMap | None = (
+            self._open_read_only() if ros.localization_mode else self._create_first_file()
+        )
         # background: gtsam holds Python's global lock while it works, and the odometry must not wait
         self.slam = make_slam(config.slam, robot, self._store, background=True)
 
@@ -78,7 +80,7 @@ class ActiveMap:
             RejectedError: it is invalid; see `Mapper.add`.
         """
         if self.localizer is not None:
-            self._find(keyframe, self.localizer)
+            self._localize(keyframe, self.localizer)
             return []
         result, before = self.slam.map_step(keyframe), self._T_map_odom or {}
         found = {robot: self.mapper.T_map_odom_of(robot) for robot in self.mapper.robots}
@@ -106,21 +108,21 @@ class ActiveMap:
         Raises:
             UsageError, Dpm2Error: there is no usable file; the work before continues.
         """
-        self._complete()
-        asked, saved = self._maps.file(name) if name else None, ""
-        path = None if asked is None else self._copies.get(asked, asked)
+        self._complete_file()
+        requested, saved = self._maps.file(name) if name else None, ""
+        path = None if requested is None else self._copies.get(requested, requested)
         if path is not None and (self._path is None or path.resolve() != self._path.resolve()):
             saved = self.keep() if self._store is None else ""  # else it would be lost
-            self._exchange(open_for_localization(path, self._config.slam))
+            self._switch_to(open_for_localization(path, self._config.slam))
         else:
             if self.localizer is None:
-                self._check_places()
+                self._check_localizable()
                 self.close()  # before it is opened again: with a reader, FILE-wal would remain
-            self._exchange(self._opened())
-        looking = f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
-        return "; ".join(filter(None, (saved, looking)))
+            self._switch_to(self._open_read_only())
+        searching = f"looking for the robot in {self._path}, {len(self.mapper.keyframes)} keyframes"
+        return "; ".join(filter(None, (saved, searching)))
 
-    def _check_places(self) -> None:
+    def _check_localizable(self) -> None:
         """Raises UsageError unless the robot can be localized in the growing map."""
         if not isinstance(self._store, MapStore):
             raise UsageError("no map to localize in: ros.map_file is empty, or could not be written")
@@ -128,7 +130,7 @@ class ActiveMap:
             raise UsageError("no map to localize in: there is no keyframe yet")
         check_for_localization(self._store, self._config.slam)
 
-    def _exchange(self, store: MapStore | TiledMap) -> None:
+    def _switch_to(self, store: MapStore | TiledMap) -> None:
         """Continue with an opened file; the map before is completed in its own file, if it has one."""
         try:
             made = make_map(self._config.slam, store, background=True)
@@ -155,8 +157,8 @@ class ActiveMap:
             raise UsageError(f"not extended: the robot is {localizer.state} in {self._path}")
         if not isinstance(self._store, MapStore):
             raise UsageError(f"not extended: {self._path} is a folder of tiles, which cannot be extended")
-        self._exchange(open_session(self._store.path, self._config.slam, dump_settings(self._config), resume=True))
-        self.mapper.start_session(localizer.T_map_odom, located.covariance + _FOUND)
+        self._switch_to(open_session(self._store.path, self._config.slam, dump_settings(self._config), resume=True))
+        self.mapper.start_session(localizer.T_map_odom, located.covariance + _MAP_COVARIANCE)
         return f"{self._path} is extended by a new session"
 
     def restart(self, robot: str) -> None:
@@ -175,8 +177,8 @@ class ActiveMap:
         Raises:
             Dpm2Error: it cannot be written.
         """
-        self._complete()
-        return self._saved("") if self.saves and self.mapper.keyframes else ""
+        self._complete_file()
+        return self._save("") if self.saves and self.mapper.keyframes else ""
 
     def reset(self) -> None:
         """Begin an empty map; or, in a fixed map, search for the robot anew."""
@@ -184,7 +186,7 @@ class ActiveMap:
             self.localizer.restart()
         else:
             self.close()
-            self._store = self._new_file()
+            self._store = self._create_file()
             self.slam.use(*make_map(self._config.slam, self._store, background=True))
             self._T_map_odom = None
 
@@ -204,12 +206,12 @@ class ActiveMap:
             UsageError: there is nothing to save. Dpm2Error: it cannot be written; or the map file is incomplete or
                 could not be created: then the folder is written, but no copy.
         """
-        text = self._saved(name)
+        text = self._save(name)
         if self.file_problem:
             raise Dpm2Error(text)
         return text
 
-    def _saved(self, name: str) -> str:
+    def _save(self, name: str) -> str:
         """As `save`, but only reports in the message why a map file could not be created."""
         if (folder := self._maps.folder) is None:
             raise UsageError("no map is saved: ros.map_directory is empty")
@@ -223,22 +225,24 @@ class ActiveMap:
             save_map(self.mapper, folder)
         except OSError as error:
             raise Dpm2Error(f"{folder}: no map saved: {error.strerror}") from None
-        moved = isinstance(self._store, MapStore) and not self._store.in_place  # its file, since the last keyframe
-        if self.mapper.store_problem or moved:
+        file_moved = isinstance(self._store, MapStore) and not self._store.in_place  # its file, since the last keyframe
+        if self.mapper.store_problem or file_moved:
             self.finish()  # tries to write again: there may be space by now
         if problem := self.mapper.store_problem:
             raise Dpm2Error(f"map saved in {folder.resolve()}, but its file is incomplete: {problem}")
         path = self._path
         if name and isinstance(self._store, MapStore):
-            path = file_beside(folder)
+            path = map_file_of(folder)
             self._store.copy_to(path)
             self._copies[self._maps.file(name)] = path
-        file = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
+        file_note = f", and as {path.resolve()}" if self._store is not None and path is not None else ""
         if self.file_problem:
-            file = f", but there is no map file: {self.file_problem}"
-        untied = int((~self.mapper.placed).sum())
-        without = f"; map.ply and trajectory.tum lack {untied} that no loop connects to the first" if untied else ""
-        return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file}{without}"
+            file_note = f", but there is no map file: {self.file_problem}"
+        unconnected = int((~self.mapper.placed).sum())
+        missing_note = (
+            f"; map.ply and trajectory.tum lack {unconnected} that no loop connects to the first" if unconnected else ""
+        )
+        return f"map of {len(self.mapper.keyframes)} keyframes saved in {folder.resolve()}{file_note}{missing_note}"
 
     def finish(self) -> None:
         """Complete the pending work; the file stays open."""
@@ -255,7 +259,7 @@ class ActiveMap:
                     self._path.parent.rmdir()
             self._store = None
 
-    def _complete(self) -> None:
+    def _complete_file(self) -> None:
         """Complete the file, if there is one.
 
         Raises:
@@ -265,23 +269,23 @@ class ActiveMap:
         if self.mapper.store_problem:
             raise Dpm2Error(f"map file incomplete, the map continues: {self.mapper.store_problem}")
 
-    def _first_file(self) -> MapStore | None:
+    def _create_first_file(self) -> MapStore | None:
         """A new map file; warns if the requested one exists already, as after a crash: it is not continued."""
-        store, name = self._new_file(), self._config.ros.map_file
-        if store is not None and name != AUTO and self._path != (asked := self._maps.of_robot(Path(name))):
-            there = asked if asked.exists() else left_log(asked) or asked
+        store, name = self._create_file(), self._config.ros.map_file
+        if store is not None and name != AUTO and self._path != (requested := self._maps.of_robot(Path(name))):
+            existing = requested if requested.exists() else left_log(requested) or requested
             self._log.warning(
-                f"{there} exists already and is not changed: {self._path} is a new map without its drives"
+                f"{existing} exists already and is not changed: {self._path} is a new map without its drives"
             )
         return store
 
-    def _new_file(self) -> MapStore | None:
+    def _create_file(self) -> MapStore | None:
         """A new map file, if one is wanted. If it cannot be created, the map is built without it."""
         ros, self._folders, self.file_problem = self._config.ros, {}, ""
         requested = self._maps.usual if ros.map_file == AUTO else Path(ros.map_file)
         if requested.name:
             try:
-                self._path, store = self._created(requested)
+                self._path, store = self._create_unused_file(requested)
             except Dpm2Error as error:
                 self.file_problem = str(error)
                 self._log.error(f"no map file: {error}")
@@ -290,7 +294,7 @@ class ActiveMap:
                 return store
         return None
 
-    def _created(self, requested: Path) -> tuple[Path, MapStore]:
+    def _create_unused_file(self, requested: Path) -> tuple[Path, MapStore]:
         """A new map file. Neither its name nor that of the folder for its clouds exists yet."""
         for path in self._maps.free(requested):
             try:
@@ -301,25 +305,25 @@ class ActiveMap:
                 continue  # another node has just taken the name
         raise AssertionError
 
-    def _opened(self) -> MapStore | TiledMap:
+    def _open_read_only(self) -> MapStore | TiledMap:
         """The map file or folder of tiles, opened read-only."""
         if self._path is None:
             raise UsageError("no map to localize in: ros.map_file does not name one" + self._maps.hint())
         return open_for_localization(self._path, self._config.slam)
 
-    def _find(self, keyframe: Keyframe, localizer: Localizer) -> None:
+    def _localize(self, keyframe: Keyframe, localizer: Localizer) -> None:
         """Localize a keyframe in the fixed map, and log changes of the state. An unreadable map cannot confirm it."""
-        before = localizer.state
+        previous_state = localizer.state
         located = self.located = self.slam.map_step(keyframe).located
         assert located is not None
         if located.unreadable and not self._unreadable:  # once per map, not with each keyframe
             self._log.error(located.registration.reason)
             self._unreadable = True
-        if located.state is before:
+        if located.state is previous_state:
             return
         if located.state is State.RELOCALIZED:
             x, y, z = located.T_map_kf[:3, 3].tolist()
-            kind = "kidnapped; found again" if before.located else "found"
+            kind = "kidnapped; found again" if previous_state.located else "found"
             self._log.info(f"{kind} at ({x:.1f}, {y:.1f}, {z:.1f}) m in {self._config.ros.map_frame}")
         elif located.state in (State.LOST, State.DEGRADED):
             self._log.warning(f"{located.state}: {located.registration.reason}")

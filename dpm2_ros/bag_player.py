@@ -31,7 +31,7 @@ from dpm2_ros.message_types import message_type
 from dpm2_ros.recorded_results import is_result, odometry_frames, published_here, without_frames
 from dpm2_ros.runtime import STOP, end_ros, ros_context
 from dpm2_ros.stamps import stamp_to_msg
-from dpm2_ros.tf_message import MOST_TRANSFORMS, TFMessage
+from dpm2_ros.tf_message import MAX_TRANSFORMS, TFMessage
 
 CLOCK = "/clock"
 LATCHED = (naming.TF_STATIC, naming.VERTICAL_ANGLE_CORRECTION)
@@ -79,15 +79,15 @@ class BagPlayer:
         if missing := [topic for topic in options.topics or () if topic not in self._bag.types]:
             raise UsageError(f"{options.bag}: no topic {', '.join(missing)}; topics: {', '.join(self._bag.types)}")
         # A CameraInfo that was recorded only once was latched.
-        once = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
-        self._latched = (*LATCHED, *once)
+        single = [topic for topic in self._bag.topics(CAMERA_INFO) if self._bag.counts[topic] == 1]
+        self._latched = (*LATCHED, *single)
         self._publishers = self._make_publishers()
         self._timed = [topic for topic in self._publishers if topic not in self._latched]
-        self._looked_at: float | None = None  # time of the last message read from these topics, s from the first
-        recorded = CLOCK in self._publishers
-        if recorded:
+        self._last_read_time: float | None = None  # time of the last message read from these topics, s from the first
+        has_clock = CLOCK in self._publishers
+        if has_clock:
             node.get_logger().info(f"{CLOCK} is that of the recording")
-        self._clock = node.create_publisher(Clock, CLOCK, 10) if options.clock and not recorded else None
+        self._clock = node.create_publisher(Clock, CLOCK, 10) if options.clock and not has_clock else None
         self._lockstep = Lockstep(node, self._bag, self._publishers) if options.lockstep else None
         self._frames: set[str] = set()  # frames whose transforms are left to a node
         self._published: list[str] = []  # lines of the log
@@ -103,7 +103,7 @@ class BagPlayer:
         self._publish_latched()
         self._await_subscribers()
         if not self._options.topics:
-            self._leave_to_nodes()
+            self._leave_out_published()
         if self._lockstep is not None:
             self._lockstep.begin()
         count = played = self._play_once()
@@ -116,7 +116,7 @@ class BagPlayer:
         for note in self._bag.notes:
             self._node.get_logger().warning(note)
         if not count and self._timed and not STOP.is_set():
-            raise UsageError(f"{self._options.bag}: {self._why_nothing()}")
+            raise UsageError(f"{self._options.bag}: {self._no_message_reason()}")
         if self._options.log is not None:
             with atomic_write(self._options.log) as file:
                 file.writelines(["topic,log_time_ns,published_ns\n", *self._published])
@@ -133,7 +133,7 @@ class BagPlayer:
                 self._node.get_logger().warning(f"{topic} is left out: the node publishes it now")
                 continue
             kind = self._bag.types[topic]
-            if (known := message_type(kind)) is None:
+            if (message_class := message_type(kind)) is None:
                 hint = "; dpm2 convert makes a recording with PointCloud2 of it" if kind in CLOUDS else ""
                 self._node.get_logger().warning(
                     f"{printable(topic)} is left out: no message type {printable(kind)}{hint}"
@@ -141,7 +141,7 @@ class BagPlayer:
                 continue
             durability = DurabilityPolicy.TRANSIENT_LOCAL if topic in self._latched else DurabilityPolicy.VOLATILE
             qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
-            publishers[topic] = self._node.create_publisher(known, topic, qos)
+            publishers[topic] = self._node.create_publisher(message_class, topic, qos)
         if not publishers:
             raise UsageError(f"{self._options.bag}: nothing to publish")
         return publishers
@@ -152,15 +152,15 @@ class BagPlayer:
         Of /tf_static only the last transform of each frame is published, all together: a recording may repeat them
         thousands of times, and a subscriber receives only the last hundred messages or so.
         """
-        placed = dict[str, Any]()
+        by_frame = dict[str, Any]()
         for topic, _, data in self._bag.playable([topic for topic in self._latched if topic in self._publishers]):
             if (topic, self._bag.types[topic]) == _STATIC:
-                placed |= self._transforms(bytes(data))
+                by_frame |= self._transforms(bytes(data))
             else:
                 self._publishers[topic].publish(bytes(data))
-        transforms = list(placed.values())
-        for first in range(0, len(transforms), MOST_TRANSFORMS):
-            message = TFMessage(transforms=transforms[first : first + MOST_TRANSFORMS])
+        transforms = list(by_frame.values())
+        for first in range(0, len(transforms), MAX_TRANSFORMS):
+            message = TFMessage(transforms=transforms[first : first + MAX_TRANSFORMS])
             self._publishers[naming.TF_STATIC].publish(message)
 
     def _transforms(self, data: bytes) -> dict[str, Any]:
@@ -184,38 +184,38 @@ class BagPlayer:
     def _await_subscribers(self) -> None:
         """Wait, at most for `Options.wait`, until the clouds (or, without any, the other topics) have subscribers."""
         options, log = self._options, self._node.get_logger()
-        given = [topic for topic in self._publishers if not is_result(topic)] or list(self._publishers)
-        clouds = [topic for topic in given if self._bag.types[topic] in CLOUDS] or given
+        inputs = [topic for topic in self._publishers if not is_result(topic)] or list(self._publishers)
+        clouds = [topic for topic in inputs if self._bag.types[topic] in CLOUDS] or inputs
         awaited = "a subscriber" if options.subscribers == 1 else f"{options.subscribers} subscribers"
         awaited += f" named {options.listener}" * bool(options.listener) + f" to {', '.join(clouds)}"
-        began, info = time.monotonic(), False
-        while self._listeners(clouds) < options.subscribers:
+        began, is_logged = time.monotonic(), False
+        while self._count_subscribers(clouds) < options.subscribers:
             waited = time.monotonic() - began
             if waited >= options.wait:
                 log.warning(f"playing without {awaited} yet")
                 break
-            if waited > 1.0 and not info:
+            if waited > 1.0 and not is_logged:
                 log.info(f"waiting {options.wait:g} s at most for {awaited}")
-                info = True
+                is_logged = True
             if STOP.wait(0.02):
                 return
         if self._lockstep is not None:
             self._lockstep.find(began + options.wait)
         STOP.wait(0.2)  # other topics of the same subscriber are matched within moments of each other
 
-    def _leave_to_nodes(self) -> None:
+    def _leave_out_published(self) -> None:
         """Leave out the topics that nodes of dpm2 publish now."""
-        left = published_here(self._node, self._timed)
-        if not left:
+        omitted = published_here(self._node, self._timed)
+        if not omitted:
             return
-        self._frames = odometry_frames(self._bag, left)
-        for topic in left:
+        self._frames = odometry_frames(self._bag, omitted)
+        for topic in omitted:
             self._timed.remove(topic)
             self._node.destroy_publisher(self._publishers.pop(topic))
         frames = f"; so are transforms from and to {', '.join(sorted(self._frames))}" if self._frames else ""
-        self._node.get_logger().warning(f"{', '.join(left)}: left out, as nodes publish these now{frames}")
+        self._node.get_logger().warning(f"{', '.join(omitted)}: left out, as nodes publish these now{frames}")
 
-    def _listeners(self, topics: Sequence[str]) -> int:
+    def _count_subscribers(self, topics: Sequence[str]) -> int:
         """Number of subscriptions or, if a node's name is given, of nodes with it: a robot may have two LiDARs."""
         if not self._options.listener:
             return sum(self._publishers[topic].get_subscription_count() for topic in topics)
@@ -239,19 +239,19 @@ class BagPlayer:
 
     def _play_once(self) -> int:
         count, now, origin = 0, 0, (0, 0.0)
-        messages = self._selected()
+        messages = self._selected_messages()
         for topic, log_time, data in prefetch(messages if self._lockstep is None else self._lockstep.order(messages)):
             if not count:
                 origin = log_time, time.monotonic()
             if self._lockstep is None:
                 origin = self._pace(log_time, *origin)
             else:
-                self._lockstep.turn(topic, data)
+                self._lockstep.await_turn(topic, data)
             if STOP.is_set():
                 return count
             now = max(now, log_time) if self._lockstep is None else log_time
             if self._lockstep is None or self._lockstep.awaits(topic):  # in lockstep, other messages may be ahead
-                self._tick(now)
+                self._publish_clock(now)
             published = time.monotonic_ns()
             self._publishers[topic].publish(data)
             count += 1
@@ -267,23 +267,23 @@ class BagPlayer:
         messages that were due in the meantime, sent at once, would be more than the subscribers' queues can store.
         """
         due = began + (log_time - origin) * 1e-9 / self._options.rate
-        while (left := due - time.monotonic()) > 0 and not STOP.is_set():
-            self._tick(log_time - round(left * self._options.rate * 1e9))
-            STOP.wait(min(left, CLOCK_PERIOD))
-        if left >= -HELD_UP:
+        while (remaining := due - time.monotonic()) > 0 and not STOP.is_set():
+            self._publish_clock(log_time - round(remaining * self._options.rate * 1e9))
+            STOP.wait(min(remaining, CLOCK_PERIOD))
+        if remaining >= -HELD_UP:
             return origin, began
-        text = f"{-left:.1f} s behind (process stopped or disk slow): playing continues from there"
+        text = f"{-remaining:.1f} s behind (process stopped or disk slow): playing continues from there"
         self._node.get_logger().warning(text, throttle_duration_sec=5)
         return log_time, time.monotonic()
 
-    def _selected(self) -> Iterator[tuple[str, int, bytes]]:
+    def _selected_messages(self) -> Iterator[tuple[str, int, bytes]]:
         """The messages of the requested part of the recording."""
         origin = first = last = None
         for topic, log_time, data in self._bag.playable(self._timed):
             if origin is None or first is None:
                 origin, first = log_time, log_time + round(self._options.start * 1e9)
                 last = None if self._options.duration is None else first + round(self._options.duration * 1e9)
-            self._looked_at = (log_time - origin) * 1e-9
+            self._last_read_time = (log_time - origin) * 1e-9
             if last is not None and log_time > last:
                 return
             if log_time < first:
@@ -294,14 +294,14 @@ class BagPlayer:
             if played:
                 yield topic, log_time, played
 
-    def _why_nothing(self) -> str:
-        start, duration, at = self._options.start, self._options.duration, self._looked_at
+    def _no_message_reason(self) -> str:
+        start, duration, at = self._options.start, self._options.duration, self._last_read_time
         if at is None:
             return f"no message of {', '.join(self._timed)}"
         end = "on" if duration is None else f"to {start + duration:g} s"
         return f"no message from {start:g} s {end}; the {'last' if at < start else 'next'} one is at {at:.1f} s"
 
-    def _tick(self, now: int) -> None:
+    def _publish_clock(self, now: int) -> None:
         if self._clock is not None:
             self._clock.publish(Clock(clock=stamp_to_msg(now)))
 
@@ -313,8 +313,8 @@ def main(arguments: Sequence[str]) -> int:
     ros_context(arguments)
     nodes = list[Any]()
     try:
-        own = remove_ros_args(["bag_player", *arguments])[1:]
-        options = app(args=own, standalone_mode=False, prog_name="bag_player")
+        own_arguments = remove_ros_args(["bag_player", *arguments])[1:]
+        options = app(args=own_arguments, standalone_mode=False, prog_name="bag_player")
         if not isinstance(options, Options):  # --help
             return int(options or 0)
         if options.lockstep and options.rate != 1.0:

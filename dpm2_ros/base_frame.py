@@ -11,7 +11,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
 
-_SAME = 1e-5  # m, and of a rotation's matrix: rounding error of the same pose
+_POSE_TOLERANCE = 1e-5  # m, and of a rotation's matrix: rounding error of the same pose
 
 
 class BaseFrame:
@@ -28,26 +28,28 @@ class BaseFrame:
         T_base_start: (4, 4) that frame in the one of `name`: identity, unless a parent arrived later.
     """
 
-    def __init__(self, wanted: str, own: tuple[str, ...]) -> None:
-        """`wanted`: the requested frame, or empty; `own`: frames that this node publishes as parents."""
-        self._wanted, self._own = frame_name(wanted), own
+    def __init__(self, requested: str, own_frames: tuple[str, ...]) -> None:
+        """`requested`: the requested frame, or empty; `own_frames`: frames that this node publishes as parents."""
+        self._requested, self._own_frames = frame_name(requested), own_frames
         self._tree: TransformTree | None = None  # of the last `look`
         self.name = self.problem = ""
-        self.above = self._wanted
+        self.above = self._requested
         self.T_start_lidar = self.T_base_start = np.eye(4)
         self._T_base_lidar: Array = np.eye(4)  # by the last `look`
 
     @property
     def child_problem(self) -> str:
         """Why the frame must not be a child on /tf, in words; empty if it may."""
-        if self.above == self._wanted:
+        if self.above == self._requested:
             return ""
-        return f"{self._wanted} has a parent in /tf_static, and can have only one: set ros.base_frame to {self.above}"
+        return (
+            f"{self._requested} has a parent in /tf_static, and can have only one: set ros.base_frame to {self.above}"
+        )
 
     @property
     def optional(self) -> bool:
         """Whether the LiDAR's own frame may be used."""
-        return not self._wanted
+        return not self._requested
 
     def restart(self) -> None:
         """Begin a new drive, with the present frame and the present pose of the LiDAR in it."""
@@ -67,10 +69,10 @@ class BaseFrame:
         if tree is self._tree:
             return False
         self._tree = tree
-        if self._wanted:
-            self.above = tree.root(self._wanted, self._own)
+        if self._requested:
+            self.above = tree.root(self._requested, self._own_frames)
         lidar_frame = frame_name(lidar_frame)
-        name = self._wanted or tree.root(lidar_frame, self._own)
+        name = self._requested or tree.root(lidar_frame, self._own_frames)
         try:
             self._T_base_lidar = np.eye(4) if name == lidar_frame else tree.lookup(name, lidar_frame)
         except UsageError as error:
@@ -78,7 +80,7 @@ class BaseFrame:
                 self.problem = f"ros.base_frame: {error}; no dpm2/odom and no /tf until /tf_static has it"
             return False
         if name == self.name:
-            moved = not np.allclose(self._T_base_lidar, self.T_base_start @ self.T_start_lidar, atol=_SAME)
+            moved = not np.allclose(self._T_base_lidar, self.T_base_start @ self.T_start_lidar, atol=_POSE_TOLERANCE)
             self.problem = f"/tf_static has moved the LiDAR in {name}: ~/reset applies its new pose" if moved else ""
             return False
         if self.name:

@@ -50,11 +50,11 @@ def build() -> Path:
     header = Path(sysconfig.get_paths()["include"]) / "Python.h"
     if not header.is_file():
         raise Dpm2Error(f"tf2_msgs cannot be built: no {header} (Debian, Ubuntu: apt install python3-dev)")
-    with tempfile.TemporaryDirectory(dir=_writable(target.parent)) as folder:
+    with tempfile.TemporaryDirectory(dir=_check_writable(target.parent)) as folder:
         package = Path(folder) / "tf2_msgs"
         _generate(package)
         _compile(package)
-        _tidy(package)
+        _remove_unused(package)
         shutil.rmtree(target, ignore_errors=True)
         package.rename(target)
     for support in SUPPORTS:
@@ -64,7 +64,7 @@ def build() -> Path:
     return target
 
 
-def _writable(folder: Path) -> Path:
+def _check_writable(folder: Path) -> Path:
     try:
         with tempfile.TemporaryFile(dir=folder):
             return folder
@@ -72,7 +72,7 @@ def _writable(folder: Path) -> Path:
         raise Dpm2Error(f"tf2_msgs cannot be installed into {folder}: {error.strerror}") from None
 
 
-def _introspection(package: Path) -> Path:
+def _introspection_folder(package: Path) -> Path:
     return package.parent / "introspection" / "tf2_msgs"
 
 
@@ -93,8 +93,8 @@ def _generate(package: Path) -> None:
     (package / "msg" / "TFMessage.msg").write_text(DEFINITION)
     with contextlib.redirect_stdout(io.StringIO()):
         convert_msg_to_idl(package, "tf2_msgs", Path("msg/TFMessage.msg"), package / "msg")
-    ratio = [str(Path(sys.prefix) / "share")]
-    arguments = ("tf2_msgs", [f"{package}:msg/TFMessage.idl"], ratio, package)
+    include_paths = [str(Path(sys.prefix) / "share")]
+    arguments = ("tf2_msgs", [f"{package}:msg/TFMessage.idl"], include_paths, package)
     descriptions = HashTypeDescription("description").generate_type_hashes(*arguments)
     found = json.loads(Path(descriptions[0]).read_text())["type_hashes"][0]["hash_string"]
     if found != TYPE_HASH:
@@ -104,14 +104,14 @@ def _generate(package: Path) -> None:
     GenerateCTypesupport("c", typesupport_implementations=list(SUPPORTS)).generate(*arguments)
     GeneratePython("py", typesupport_implementations=["rosidl_typesupport_c"]).generate(*arguments)
     # A folder of its own, because it gives its files the same names as GenerateC does.
-    GenerateIntrospectionCTypesupport("introspection").generate(*arguments[:3], _introspection(package))
+    GenerateIntrospectionCTypesupport("introspection").generate(*arguments[:3], _introspection_folder(package))
 
 
 def _compile(package: Path) -> None:
     import numpy as np
 
     include, lib = Path(sys.prefix) / "include", Path(sys.prefix) / "lib"
-    flags = ["-O2", "-fPIC", f"-I{package.parent}", f"-I{_introspection(package).parent}", f"-I{include}"]
+    flags = ["-O2", "-fPIC", f"-I{package.parent}", f"-I{_introspection_folder(package).parent}", f"-I{include}"]
     flags += [f"-I{folder}" for folder in include.iterdir() if folder.is_dir()]
     flags += [f"-I{sysconfig.get_paths()['include']}", f"-I{np.get_include()}"]
     objects = []
@@ -128,7 +128,7 @@ def _compile(package: Path) -> None:
     _run(["g++", "-shared", "-o", str(package / MODULE), *objects, f"-L{lib}", f"-Wl,-rpath,{lib}", *libraries])
 
 
-def _tidy(package: Path) -> None:
+def _remove_unused(package: Path) -> None:
     """Remove all files that a Python process does not import."""
     for suffix in ("c", "cpp", "h", "hpp", "o"):
         for leftover in package.rglob(f"*.{suffix}"):
@@ -140,9 +140,9 @@ def _tidy(package: Path) -> None:
 
 
 def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        errors = [line for line in result.stderr.splitlines() if "error" in line] or result.stderr.splitlines()
         raise Dpm2Error(f"tf2_msgs cannot be compiled: {errors[0] if errors else command[0]}")
 
 

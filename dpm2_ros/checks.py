@@ -16,11 +16,11 @@ from dpm2_core.geometry import se3
 from dpm2_core.slam.mapping.admission import RejectedError, check_pose
 from dpm2_core.slam.store.cloud_codec import MAX_POINTS
 from dpm2_ros.conversions import check_frame
-from dpm2_ros.tf_message import MOST_TRANSFORMS
+from dpm2_ros.tf_message import MAX_TRANSFORMS
 
-_MOST_BYTES = 1 << 28
-_MOST_FRAMES = 2000
-_SAME = 1e-3  # m, and of a rotation's matrix: two publishers of the same pose may differ by this
+_MAX_BYTES = 1 << 28
+_MAX_FRAMES = 2000
+_POSE_TOLERANCE = 1e-3  # m, and of a rotation's matrix: two publishers of the same pose may differ by this
 
 
 def check_header(header: Any) -> None:
@@ -33,7 +33,7 @@ def check_header(header: Any) -> None:
 
 def check_size(message: Any, points: int = 0) -> None:
     """Raises RejectedError for a message that is larger than that of any sensor."""
-    if len(message.data) > _MOST_BYTES or points > MAX_POINTS:
+    if len(message.data) > _MAX_BYTES or points > MAX_POINTS:
         raise RejectedError("size", f"too large: {len(message.data)} bytes, {points} points")
 
 
@@ -68,8 +68,8 @@ def checked_pose(pose: Any) -> Array:
 
 def check_transforms(message: Any) -> None:
     """Raises RejectedError for a TFMessage of more transforms than any robot sends at once."""
-    if len(message.transforms) > MOST_TRANSFORMS:
-        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {MOST_TRANSFORMS} are read")
+    if len(message.transforms) > MAX_TRANSFORMS:
+        raise RejectedError("size", f"{len(message.transforms)} transforms; at most {MAX_TRANSFORMS} are read")
 
 
 def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
@@ -86,8 +86,8 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
             check_frame(parent)
             check_frame(child)
             T_parent_child = checked_pose(stamped.transform)
-            if len(tree) >= _MOST_FRAMES and tree.parent(child) is None:
-                raise RejectedError("frame", f"there are {_MOST_FRAMES} frames already")
+            if len(tree) >= _MAX_FRAMES and tree.parent(child) is None:
+                raise RejectedError("frame", f"there are {_MAX_FRAMES} frames already")
         except UsageError as error:
             problem = f"tf {parent[:80]!r} -> {child[:80]!r}: {error}"
         else:
@@ -97,14 +97,14 @@ def extended(tree: TransformTree, message: Any) -> tuple[TransformTree, str]:
 
 def replaced(before: TransformTree, after: TransformTree) -> str:
     """Which frames of a tree have another parent or pose in a second tree, in words; empty if none has."""
-    said = []
+    changes = []
     for frame in before.frames:
         old, new = before.parent(frame), after.parent(frame)
         if old is None or new is None or old is new:
             continue
         if old[0] != new[0]:
-            said.append(f"{frame} has the parent {new[0]}, no longer {old[0]}")
-        elif not np.allclose(old[1], new[1], atol=_SAME):
+            changes.append(f"{frame} has the parent {new[0]}, no longer {old[0]}")
+        elif not np.allclose(old[1], new[1], atol=_POSE_TOLERANCE):
             meters, degrees = se3.apart(old[1], new[1])
-            said.append(f"{frame} has moved by {meters:.2f} m and {degrees:.1f} deg in {old[0]}")
-    return "; ".join(said)
+            changes.append(f"{frame} has moved by {meters:.2f} m and {degrees:.1f} deg in {old[0]}")
+    return "; ".join(changes)

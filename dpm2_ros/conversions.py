@@ -30,11 +30,11 @@ from dpm2_core.slam.mapping.admission import RejectedError
 from dpm2_core.slam.store.rows import MAX_ID
 from dpm2_ros.stamps import stamp_to_msg
 
-_KEYFRAME = re.compile(
+_KEYFRAME_NAME = re.compile(
     r"(?:(?P<robot>[\w/]{1,200})/)?kf_(?P<id>[0-9]{1,10})(?:\.(?P<session>[0-9a-f]{8}-?))?", re.ASCII
 )
 EARLIER = "-"
-_FRAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")
+_FRAME_NAME = re.compile(r"[^\s\x00-\x1f\x7f]{1,200}")
 _SWAP = np.roll(np.eye(6), 3, axis=0)  # [rotation, translation] to [translation, rotation], and its own inverse
 
 
@@ -151,8 +151,8 @@ def bytes_to_array(data: bytes | memoryview) -> array.array[int]:
 
 def keyframe_name(robot: str, id: int, session: str = "") -> str:
     """Name of a keyframe: `kf_12`, in a namespace `robot/kf_12`, of one drive `robot/kf_12.5f3a9c01`."""
-    last = f"kf_{id}.{session}" if session else f"kf_{id}"
-    return f"{robot}/{last}" if robot else last
+    name = f"kf_{id}.{session}" if session else f"kf_{id}"
+    return f"{robot}/{name}" if robot else name
 
 
 def parse_keyframe_name(name: str) -> tuple[str, int, str]:
@@ -161,7 +161,7 @@ def parse_keyframe_name(name: str) -> tuple[str, int, str]:
     Raises:
         RejectedError: it is not the name of a keyframe.
     """
-    found = _KEYFRAME.fullmatch(name)
+    found = _KEYFRAME_NAME.fullmatch(name)
     if found is None or int(found["id"]) > MAX_ID:
         raise RejectedError("name", f"{name[:80]!r} is no keyframe; want ROBOT/kf_NUMBER.SESSION")
     return found["robot"] or "", int(found["id"]), found["session"] or ""
@@ -169,7 +169,7 @@ def parse_keyframe_name(name: str) -> tuple[str, int, str]:
 
 def check_frame(name: str) -> None:
     """Raises RejectedError unless it can be the name of a frame."""
-    if not _FRAME.fullmatch(name):
+    if not _FRAME_NAME.fullmatch(name):
         raise RejectedError("frame", f"{name[:80]!r} is not the name of a frame")
 
 
@@ -191,11 +191,11 @@ def keyframe_to_base(keyframe: Keyframe, T_base_lidar: Array, T_start_odom: Arra
     fix = keyframe.fix
     if fix is not None:
         fix = fix.moved(T_base_lidar)
-    picture = keyframe.thumbnail
+    thumbnail = keyframe.thumbnail
     return replace(
         keyframe,
         fix=fix,
-        thumbnail=None if picture is None else moved_thumbnail(picture, T_base_lidar),
+        thumbnail=None if thumbnail is None else moved_thumbnail(thumbnail, T_base_lidar),
         T_odom_kf=T_start_odom @ keyframe.T_odom_kf @ se3.inverse(T_base_lidar),
         up=None,  # a base is level
         cloud=se3.transform(T_base_lidar, keyframe.cloud),

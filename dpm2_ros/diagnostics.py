@@ -13,8 +13,8 @@ from dpm2_ros.mapping import BEHIND, MapperThread
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 PERIOD = 1.0
 """s between two messages."""
-_RECENT = 10.0  # s
-_LONGEST = 1000  # characters of a text, which may quote a message
+_RECENT_TIME = 10.0  # s
+_MAX_TEXT_LENGTH = 1000  # characters of a text, which may quote a message
 
 
 def publish_diagnostics(node: GuardedNode, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
@@ -31,9 +31,11 @@ def publish_diagnostics(node: GuardedNode, statuses: Callable[[], list[Diagnosti
 
 def status(node: GuardedNode, part: str, level: bytes, text: str, figures: Mapping[str, object]) -> DiagnosticStatus:
     """The status of a part of a node."""
-    values = [KeyValue(key=key, value=excerpt(str(value), _LONGEST)) for key, value in figures.items()]
+    values = [KeyValue(key=key, value=excerpt(str(value), _MAX_TEXT_LENGTH)) for key, value in figures.items()]
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
-    return DiagnosticStatus(level=level, name=name, message=excerpt(text, _LONGEST), hardware_id="", values=values)
+    return DiagnosticStatus(
+        level=level, name=name, message=excerpt(text, _MAX_TEXT_LENGTH), hardware_id="", values=values
+    )
 
 
 def mapper_status(node: GuardedNode, mapper: MapperThread) -> DiagnosticStatus:
@@ -63,7 +65,7 @@ def message_status(node: GuardedNode) -> DiagnosticStatus:
     rejections = node.rejections
     total = sum(rejections.values())
     level, text = OK, f"{total} messages rejected"
-    if node.since_rejection < _RECENT:
+    if node.since_rejection < _RECENT_TIME:
         level, text = WARN, f"{text}, the last {node.since_rejection:.0f} s ago"
     if node.errors:
         level, text = WARN, f"{text}; {node.errors} internal errors"

@@ -25,8 +25,8 @@ from dpm2_core.slam.mapping.mapper import Mapper
 from dpm2_core.slam.mapping.occupancy_map import FREE, OCCUPIED, Grid
 from dpm2_ros.conversions import bytes_to_array, header, pose_to_msg, poses_to_msgs
 
-_REST = 4.0  # times the work on one message: least time from its start to that of the next
-_AGAIN = -1  # value of `_shown` if the message must be built again
+_REST_FACTOR = 4.0  # times the work on one message: least time from its start to that of the next
+_NEEDS_REBUILD = -1  # value of `_shown_changes` if the message must be built again
 GRAY, GREEN, BLUE, RED = (0.7, 0.7, 0.7), (0.1, 0.8, 0.2), (0.2, 0.5, 1.0), (1.0, 0.2, 0.2)
 
 
@@ -41,15 +41,15 @@ def pose_graph_to_msg(mapper: Mapper, stamp: int, frame_id: str) -> MarkerArray:
     """Nodes gray, odometry edges green, accepted loops blue, rejected ones red."""
     positions, edges = mapper.poses[:, :3, 3], mapper.edges
     odometry = [edge for edge in edges if edge.kind == "odometry"]
-    kept = [edge for edge in edges if edge.kind == "loop"]
+    accepted = [edge for edge in edges if edge.kind == "loop"]
     rejected = {(loop.from_node, loop.to_node): loop for loop in mapper.loops}
-    for loop in kept:
+    for loop in accepted:
         rejected.pop((loop.from_node, loop.to_node), None)
     parts = (
         (Marker.SPHERE_LIST, GRAY, 0.6, positions),
-        (Marker.LINE_LIST, GREEN, 0.15, _ends(positions, odometry)),
-        (Marker.LINE_LIST, BLUE, 0.3, _ends(positions, kept)),
-        (Marker.LINE_LIST, RED, 0.1, _ends(positions, list(rejected.values()))),
+        (Marker.LINE_LIST, GREEN, 0.15, _end_points(positions, odometry)),
+        (Marker.LINE_LIST, BLUE, 0.3, _end_points(positions, accepted)),
+        (Marker.LINE_LIST, RED, 0.1, _end_points(positions, list(rejected.values()))),
     )
     markers = []
     for id, (kind, color, size, points) in enumerate(parts):
@@ -78,7 +78,7 @@ def loop_to_msg(loop: Edge, stamp: int, from_name: str, to_name: str) -> Diagnos
     return DiagnosticArray(header=header(stamp, from_name), status=[status])
 
 
-def _ends(positions: Array, edges: Sequence[Edge]) -> Array:
+def _end_points(positions: Array, edges: Sequence[Edge]) -> Array:
     """(2 E, 3) end points of E edges."""
     return positions[np.array([(edge.from_node, edge.to_node) for edge in edges], np.intp).reshape(-1)]
 
@@ -106,8 +106,8 @@ class Projection:
         names = ["dpm2/projection", *["dpm2/second_projection"] * second]
         self._publishers = [node.create_publisher(Image, name, 1) for name in names]
 
-    def show(self, frame: Frame, cameras: Sequence[str], beside: Mapping[str, tuple[int, Any]]) -> None:
-        """Publish each image of a frame; `cameras`: topics of the cameras; `beside`: see `Bundle`."""
+    def show(self, frame: Frame, cameras: Sequence[str], messages: Mapping[str, tuple[int, Any]]) -> None:
+        """Publish each image of a frame; `cameras`: topics of the cameras; `messages`: `beside` of its `Bundle`."""
         for image in frame.images:
             topic = image.camera.name
             publisher = self._publishers[cameras.index(topic)]
@@ -115,8 +115,8 @@ class Projection:
                 continue
             pixels = painted(image, frame.points)
             height, width = pixels.shape[:2]
-            at = header(frame.stamp, beside[topic][1].header.frame_id)
-            message = Image(header=at, height=height, width=width, encoding="rgb8")
+            image_header = header(frame.stamp, messages[topic][1].header.frame_id)
+            message = Image(header=image_header, height=height, width=width, encoding="rgb8")
             message.step, message.data = 3 * width, bytes_to_array(pixels.tobytes())
             publisher.publish(message)
 
@@ -132,44 +132,44 @@ class Display:
         """`make`: called in the map's thread; returns the message, or a generator that builds it in steps and returns
         it."""
         self._publisher, self._period, self._make = publisher, period, make
-        self._shown = 0
-        self._last, self._worked = -np.inf, 0.0
-        self._working = False
+        self._shown_changes = 0
+        self._started_at, self._work_time = -np.inf, 0.0
+        self._is_working = False
         self._steps: Generator[None, None, Any] | None = None  # of the message that is being built
 
     def due(self, changes: int) -> bool:
         """Whether to publish now; if so, `publish` is expected to follow."""
-        if self._working:
+        if self._is_working:
             return False
         if not self._publisher.get_subscription_count():
             if self._steps is not None:  # the next subscriber gets the map of that time
                 self.again()
             return False
         if self._steps is None:
-            rest = _REST * self._worked if self._shown != _AGAIN else 0.0
-            waited = time.monotonic() - self._last >= max(self._period(), rest)
-            if changes == self._shown or not waited:
+            rest = _REST_FACTOR * self._work_time if self._shown_changes != _NEEDS_REBUILD else 0.0
+            period_passed = time.monotonic() - self._started_at >= max(self._period(), rest)
+            if changes == self._shown_changes or not period_passed:
                 return False
-            self._shown, self._last, self._worked = changes, time.monotonic(), 0.0
-        self._working = True
+            self._shown_changes, self._started_at, self._work_time = changes, time.monotonic(), 0.0
+        self._is_working = True
         return True
 
     def again(self) -> None:
         """Build the message again, from the start: it was incomplete, or the one being built is outdated."""
-        self._steps, self._shown = None, _AGAIN
+        self._steps, self._shown_changes = None, _NEEDS_REBUILD
 
     def publish(self) -> None:
         """Build and send the message, or do one step of that."""
         begin, steps, self._steps = time.monotonic(), self._steps, None
         try:
-            made = steps or self._make()
-            if isinstance(made, Generator):
-                next(made)
-                self._steps = made
+            result = steps or self._make()
+            if isinstance(result, Generator):
+                next(result)
+                self._steps = result
             else:
-                self._publisher.publish(made)
+                self._publisher.publish(result)
         except StopIteration as done:
             self._publisher.publish(done.value)
         finally:
-            self._worked += time.monotonic() - begin
-            self._working = False
+            self._work_time += time.monotonic() - begin
+            self._is_working = False

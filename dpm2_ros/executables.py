@@ -44,23 +44,23 @@ def bag_player(arguments: Sequence[str] | None = None) -> int:
     return _run(work, arguments)
 
 
-def _spin(name: str, kind: str, arguments: Sequence[str]) -> int:
-    """A node of the class `kind`, in the module of its name."""
+def _spin(name: str, class_name: str, arguments: Sequence[str]) -> int:
+    """A node of the class `class_name`, in the module of its name."""
     if "--help" in arguments:
         print(f"usage: {name} [{_MANAGED}] [--ros-args -p NAME:=VALUE ...]; docs/parameters.md lists the parameters")
         return 0
-    of_ros = [text for text in arguments if text != _MANAGED]
+    ros_arguments = [text for text in arguments if text != _MANAGED]
 
     def load() -> Callable[[], Any]:
         from rclpy.utilities import remove_ros_args
 
-        if unknown := remove_ros_args(["", *of_ros])[1:]:
+        if unknown := remove_ros_args(["", *ros_arguments])[1:]:
             raise UsageError(f"unknown argument {unknown[0]}; those of ROS, such as -p, come after --ros-args")
         with importing():
-            node = getattr(import_module(f"dpm2_ros.{name}"), kind)
-        return partial(node, len(of_ros) < len(arguments))
+            node = getattr(import_module(f"dpm2_ros.{name}"), class_name)
+        return partial(node, len(ros_arguments) < len(arguments))
 
-    return spin_node(load, of_ros)
+    return spin_node(load, ros_arguments)
 
 
 def _run(work: Callable[[Sequence[str]], int], arguments: Sequence[str] | None) -> int:

@@ -34,11 +34,11 @@ SILENT = 5.0
 """s without a message after which a drive counts as over; a robot announces its last keyframe every 2 s."""
 BESIDE = 2.5
 """s for which two drives must both send messages to count as two robots."""
-_STREAMS = 256  # known drives, most of them over
-_APART = 8  # robots in the namespace of another one
-_HELD = 16_000_000  # bytes that may wait
-_ACKS = 50  # acknowledgments between two ticks, to drives whose robot is not decided
-_BACKLOG = 32  # keyframes that may wait for the mapper
+_MAX_STREAMS = 256  # known drives, most of them over
+_MAX_FURTHER_ROBOTS = 8  # robots in the namespace of another one
+_MAX_WAITING_BYTES = 16_000_000  # bytes that may wait
+_MAX_ACKS = 50  # acknowledgments between two ticks, to drives whose robot is not decided
+_MAX_BACKLOG = 32  # keyframes that may wait for the mapper
 
 
 class Feed:
@@ -56,22 +56,22 @@ class Feed:
         self._robot = namespace.strip("/")
         self.opened = -float("inf")
         self._streams: dict[str, Stream] = {}  # by session, the one with the latest message at the end
-        self._acks = 0
-        self._cloud_topic, self._seen_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
+        self._ack_count = 0
+        self._cloud_topic, self._descriptor_topic = f"{namespace}/dpm2/keyframe_cloud", f"{namespace}/dpm2/keyframe"
         self._pose_topic = namespace + ODOM
         self._subscriptions: list[Any] = []
-        self._received: Any = None
+        self._ack_publisher: Any = None
 
     def open(self) -> None:
         """Subscribe, for the first time or again; the known drives are kept."""
         node, self.opened = self._node, time.monotonic()
         self._subscriptions = [
             node.create_subscription(Odometry, self._pose_topic, self._on_pose, WIRE),
-            node.create_subscription(PointCloud2, self._seen_topic, self._on_seen, WIRE),
+            node.create_subscription(PointCloud2, self._descriptor_topic, self._on_descriptors, WIRE),
             node.create_subscription(UInt8MultiArray, self._cloud_topic, self._on_cloud, WIRE),
             node.create_subscription(Odometry, f"{self._namespace}/dpm2/odom", self._on_odom, 10),
         ]
-        self._received = node.create_publisher(UInt32MultiArray, f"{self._namespace}/dpm2/keyframes_received", 10)
+        self._ack_publisher = node.create_publisher(UInt32MultiArray, f"{self._namespace}/dpm2/keyframes_received", 10)
 
     @property
     def robots(self) -> dict[str, Stream]:
@@ -79,12 +79,12 @@ class Feed:
         return {stream.robot: stream for stream in self._streams.values() if stream.robot is not None}
 
     @property
-    def proven(self) -> bool:
+    def has_delivered(self) -> bool:
         """Whether a keyframe of this namespace was passed to the mapper."""
         return any(stream.taken for stream in self._streams.values())
 
     @property
-    def beside(self) -> list[str]:
+    def further_robots(self) -> list[str]:
         """Names of further robots in this namespace that send messages now."""
         recent = time.monotonic() - SILENT
         return [name for name, s in self.robots.items() if name != self._robot and s.heard > recent]
@@ -98,13 +98,13 @@ class Feed:
     def tick(self) -> None:
         """Called twice per second: pass on keyframes that wait, and acknowledge those that have arrived."""
         now = time.monotonic()
-        self._acks = 0
-        for stream in list(self._streams.values())[-_ACKS:]:
+        self._ack_count = 0
+        for stream in list(self._streams.values())[-_MAX_ACKS:]:
             if (id := stream.give_up(now)) is not None:
                 self._node.reject(
                     self._pose_topic, "keyframe given up", f"keyframe {id} of {self._robot or '/'} was never valid"
                 )
-            self._hand_on(stream, now)
+            self._pass_on(stream, now)
             if now - stream.heard < 2 * SILENT and (stream.robot is not None or stream.holds):
                 self._acknowledge(stream, now)
 
@@ -119,10 +119,10 @@ class Feed:
         Those of a drive whose robot is not decided are not: they are sent again.
         """
         for stream in self.robots.values():
-            self._hand_on(stream, time.monotonic(), math.inf)
+            self._pass_on(stream, time.monotonic(), math.inf)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._node.destroy_publisher(self._received)
+        self._node.destroy_publisher(self._ack_publisher)
 
     def _on_odom(self, message: Odometry) -> None:
         frame = message.header.frame_id
@@ -131,28 +131,28 @@ class Feed:
         main = [self._robot] if self._robot in known else []
         for robot in (*main, *reversed(known)):  # of two with the same frame, the first
             if known[robot].odom_frame == frame and known[robot].live:
-                if not self._has_begun_anew(known[robot]):
+                if not self._has_restarted(known[robot]):
                     self._mapper.broadcast(stamp_ns(message.header), robot, frame)
                 return
 
-    def _has_begun_anew(self, drive: Stream) -> bool:
+    def _has_restarted(self, drive: Stream) -> bool:
         """Whether the robot of a drive has restarted since its last message: its odometry is then of another drive."""
         return any(s.robot is None and s.live and drive.heard < s.since <= s.heard for s in self._streams.values())
 
     def _on_pose(self, message: Odometry) -> None:
-        self._take_part("pose", message.child_frame_id, lambda id: _checked_pose(message, id))
+        self._add_part("pose", message.child_frame_id, lambda id: _checked_pose(message, id))
 
     def _on_cloud(self, message: UInt8MultiArray) -> None:
         if not message.layout.dim:
             raise RejectedError("name", "a cloud without the name of its keyframe")
-        self._take_part("cloud", message.layout.dim[0].label, lambda id: _checked_payload(message, id))
+        self._add_part("cloud", message.layout.dim[0].label, lambda id: _checked_payload(message, id))
 
-    def _on_seen(self, message: PointCloud2) -> None:
-        self._take_part("seen", message.header.frame_id, lambda id: self._usable(message, id))
+    def _on_descriptors(self, message: PointCloud2) -> None:
+        self._add_part("seen", message.header.frame_id, lambda id: self._usable_descriptors(message, id))
 
-    def _take_part(self, part: str, name: str, checked: Callable[[int], Any]) -> None:
+    def _add_part(self, part: str, name: str, checked: Callable[[int], Any]) -> None:
         """Add one of the messages of a keyframe, by its name; the stream counts a rejected one."""
-        stream, id = self._hear(name)
+        stream, id = self._find_stream(name)
         if not stream.wants(id, part):
             return
         try:
@@ -161,11 +161,11 @@ class Feed:
             stream.reject(id, time.monotonic())
             raise
         if stream.put(id, part, value):
-            self._hand_on(stream, time.monotonic())
+            self._pass_on(stream, time.monotonic())
         if stream.robot != self._robot and stream.holds:
-            self._bound()
+            self._limit_memory()
 
-    def _usable(self, message: PointCloud2, id: int) -> Descriptors | None:
+    def _usable_descriptors(self, message: PointCloud2, id: int) -> Descriptors | None:
         """Descriptors that the mapper's network can compare; None: it computes its own from the keyframe's cloud."""
         _check_budget(message, id)
         descriptors, weights = descriptors_from_msg(message)
@@ -179,49 +179,49 @@ class Feed:
             check_descriptors(descriptors, channels)
         except RejectedError as error:
             text = f"keyframe {id}: {error}; it is used with new descriptors of its cloud"
-            self._node.reject(self._seen_topic, error.reason, text)
+            self._node.reject(self._descriptor_topic, error.reason, text)
             return None
         return descriptors
 
-    def _hear(self, name: str) -> tuple[Stream, int]:
+    def _find_stream(self, name: str) -> tuple[Stream, int]:
         """The drive of a keyframe with that name, and its id."""
         _, id, session = parse_keyframe_name(name)
         now, live, session = time.monotonic(), not session.endswith(EARLIER), session.removesuffix(EARLIER)
         stream = self._streams.pop(session, None) or Stream(session, now)
         self._streams[session] = stream
         stream.hear(now, live)
-        while len(self._streams) > _STREAMS:
-            unknown = (s for s in self._streams.values() if not s.taken)
-            oldest = next(unknown, None) or next(s for s in self._streams.values() if s.robot != self._robot)
+        while len(self._streams) > _MAX_STREAMS:
+            without_keyframes = (s for s in self._streams.values() if not s.taken)
+            oldest = next(without_keyframes, None) or next(s for s in self._streams.values() if s.robot != self._robot)
             del self._streams[oldest.session]
-        if session and stream.robot is None and now - stream.acknowledged > 0.4 and self._acks < _ACKS:
-            self._acks += 1
+        if session and stream.robot is None and now - stream.acknowledged > 0.4 and self._ack_count < _MAX_ACKS:
+            self._ack_count += 1
             self._acknowledge(stream, now)
         return stream, id
 
-    def _bound(self) -> None:
+    def _limit_memory(self) -> None:
         """Limit the memory of other drives: the messages of those with the oldest last message are dropped."""
-        held = {session: s.holds for session, s in self._streams.items() if s.robot != self._robot}
-        total = sum(held.values())
-        for session, size in held.items():
-            if total <= _HELD:
+        sizes = {session: s.holds for session, s in self._streams.items() if s.robot != self._robot}
+        total = sum(sizes.values())
+        for session, size in sizes.items():
+            if total <= _MAX_WAITING_BYTES:
                 return
             self._streams[session].drop()
             total -= size
 
-    def _hand_on(self, stream: Stream, now: float, most: float = _BACKLOG) -> None:
+    def _pass_on(self, stream: Stream, now: float, max_waiting: float = _MAX_BACKLOG) -> None:
         """Pass the complete keyframes before the first gap to the mapper, once the drive's robot is decided.
 
         Args:
-            most: keyframes that may wait in the mapper.
+            max_waiting: keyframes that may wait in the mapper.
         """
-        while self._mapper.waiting < most and (stream.robot is not None or self._place(stream, now)):
-            taken = stream.take()
-            if taken is None:
+        while self._mapper.waiting < max_waiting and (stream.robot is not None or self._decide_robot(stream, now)):
+            keyframe = stream.take()
+            if keyframe is None:
                 return
-            self._add(stream, *taken)
+            self._add_keyframe(stream, *keyframe)
 
-    def _place(self, stream: Stream, now: float) -> bool:
+    def _decide_robot(self, stream: Stream, now: float) -> bool:
         """Decide whose drive it is: this robot's, or that of another one in the same namespace; returns whether that is
         decided."""
         main, name = self.robots.get(self._robot), self._robot or "/"
@@ -236,13 +236,15 @@ class Feed:
             return True
         if main.heard < stream.since + BESIDE:
             return False
-        if len(self.beside) >= _APART:
-            raise RejectedError("too many robots", f"more than {_APART} further robots in the namespace of {name}")
+        if len(self.further_robots) >= _MAX_FURTHER_ROBOTS:
+            raise RejectedError(
+                "too many robots", f"more than {_MAX_FURTHER_ROBOTS} further robots in the namespace of {name}"
+            )
         stream.robot = f"{self._robot}.{stream.session or 'none'}"
         self._node.get_logger().error(f"two robots in namespace {name}: the second one is {stream.robot} in the map")
         return True
 
-    def _add(self, stream: Stream, id: int, parts: Parts) -> None:
+    def _add_keyframe(self, stream: Stream, id: int, parts: Parts) -> None:
         assert stream.robot is not None
         pose, (packed, fix, thumbnail) = parts["pose"], parts["cloud"]
         keyframe = keyframe_from(pose, stream.robot, id, stream.last, parts["seen"])
@@ -255,7 +257,7 @@ class Feed:
         if stream.session:
             stream.acknowledged = now
             written, missing = self._mapper.written, self._mapper.missing
-            self._received.publish(received_to_msg(stream.session, *stream.arrived(written, missing)))
+            self._ack_publisher.publish(received_to_msg(stream.session, *stream.arrived(written, missing)))
 
 
 def _checked_pose(message: Odometry, id: int) -> Odometry:

@@ -21,9 +21,9 @@ from dpm2_core.errors import Dpm2Error, printable
 from dpm2_core.slam.mapping.admission import RejectedError
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-_QUIET = 5.0  # s between two log lines about the same reason
-_MOST_KINDS = 200  # pairs of topic and reason; further ones are counted together
-_LENGTH = 300  # characters of a log line, whatever is in the message
+_LOG_PERIOD = 5.0  # s between two log lines about the same reason
+_MAX_KINDS = 200  # pairs of topic and reason; further ones are counted together
+_MAX_LENGTH = 300  # characters of a log line, whatever is in the message
 
 
 class GuardedNode(Node):
@@ -37,7 +37,7 @@ class GuardedNode(Node):
     def __init__(self, name: str, **options: Any) -> None:
         self.errors = self.answering = 0
         self._rejections: dict[str, int] = {}
-        self._said: dict[str, float] = {}
+        self._logged_at: dict[str, float] = {}
         self._last_rejection = -float("inf")
         self._guard_lock = threading.Lock()
         super().__init__(name, **options)  # may subscribe to /clock
@@ -73,29 +73,29 @@ class GuardedNode(Node):
         """
         kind = f"{where}: {reason}"
         with self._guard_lock:
-            if kind not in self._rejections and len(self._rejections) >= _MOST_KINDS:
+            if kind not in self._rejections and len(self._rejections) >= _MAX_KINDS:
                 kind = "others"
             self._rejections[kind] = self._rejections.get(kind, 0) + 1
             self._last_rejection = time.monotonic()
-            said = self._may_say(kind)
-        if said:
+            is_due = self._log_is_due(kind)
+        if is_due:
             self.get_logger().warning(f"{where}: rejected: {excerpt(text)}")
 
     def fail(self, where: str, error: BaseException) -> None:
         """Count and log an exception that is a bug; any thread may call."""
         with self._guard_lock:
             self.errors += 1
-            said = len(self._said) <= 2 * _MOST_KINDS and self._may_say(f"{where} {type(error).__name__}")
-        if said:
+            is_due = len(self._logged_at) <= 2 * _MAX_KINDS and self._log_is_due(f"{where} {type(error).__name__}")
+        if is_due:
             lines = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {lines[-3000:]}")
 
-    def _may_say(self, kind: str) -> bool:
+    def _log_is_due(self, kind: str) -> bool:
         """Whether a log line of that kind is due; if so, it is noted as written. Call it with the lock."""
         now = time.monotonic()
-        if now - self._said.get(kind, -float("inf")) < _QUIET:
+        if now - self._logged_at.get(kind, -float("inf")) < _LOG_PERIOD:
             return False
-        self._said[kind] = now
+        self._logged_at[kind] = now
         return True
 
     def _guarded(self, callback: Callable[..., Any], where: str) -> Callable[..., Any]:
@@ -145,15 +145,15 @@ async def respond(node: GuardedNode, work: Future[str], response: Any) -> None:
 async def until(condition: Callable[[], bool]) -> None:
     """In a callback: let the executor run other callbacks until the condition is true."""
     while not condition():
-        await _other_callbacks()
+        await _run_other_callbacks()
 
 
 @types.coroutine
-def _other_callbacks() -> Generator[None, None, None]:
+def _run_other_callbacks() -> Generator[None, None, None]:
     """Awaited in a callback: the executor runs other callbacks, then resumes this one."""
     yield
 
 
-def excerpt(text: str, length: int = _LENGTH) -> str:
+def excerpt(text: str, length: int = _MAX_LENGTH) -> str:
     """A text of unknown origin, safe for a terminal: unprintable characters are escaped, a long text is cut."""
     return printable(text if len(text) <= length else f"{text[:length]}...")

@@ -17,8 +17,8 @@ class Health:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._latency: deque[float] = deque(maxlen=200)
-        self._done: deque[float] = deque(maxlen=50)
+        self._latencies: deque[float] = deque(maxlen=200)
+        self._finished_at: deque[float] = deque(maxlen=50)
         self._seconds: dict[str, deque[float]] = {}
         self.processed = self.failed = 0
         self.last: OdometryResult | None = None
@@ -33,8 +33,8 @@ class Health:
             self.processed += 1
             self.failed += tracked.failed
             self.last = tracked
-            self._latency.append(latency)
-            self._done.append(now)
+            self._latencies.append(latency)
+            self._finished_at.append(now)
             for stage, seconds in tracked.seconds.items():
                 self._seconds.setdefault(stage, deque(maxlen=200)).append(seconds)
             if tracked.registration.ok:
@@ -57,12 +57,12 @@ class Health:
                 out["breaks"] = self.last.breaks
             if self._last_good is not None:
                 out["last good registration (s ago)"] = f"{now - self._last_good:.1f}"
-            latency, seconds = list(self._latency), {stage: list(s) for stage, s in self._seconds.items()}
+            latency, seconds = list(self._latencies), {stage: list(s) for stage, s in self._seconds.items()}
         if latency:  # from here on without the lock, for which the worker would have to wait
             p50, p95 = np.percentile(latency, [50, 95]) * 1000
             out |= {"latency p50 (ms)": f"{p50:.1f}", "latency p95 (ms)": f"{p95:.1f}"}
         return out | {f"{stage} p50 (ms)": f"{1000 * np.median(s):.1f}" for stage, s in seconds.items()}
 
     def _rate(self, now: float) -> float:
-        recent = [done for done in self._done if done > now - 5]
+        recent = [done for done in self._finished_at if done > now - 5]
         return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0

@@ -30,11 +30,11 @@ BUDGET = 99_000
 Descriptors may use half of it, 325 of 128 channels: with more, the cloud would have too few points for loop
 verification."""
 
-_FIX = struct.Struct("<q15d")  # stamp, ns; position, covariance, antenna, as in `Fix`
-_OF_FIX, _OF_THUMBNAIL = "fix", "thumbnail"
-_LARGEST_THUMBNAIL = 20_000  # bytes: a larger one would replace points of the cloud; 320 pixels have 6000 to 25 000
-_FEATURE = "feature"
-_MOST_CHANNELS = 4096
+_FIX_FORMAT = struct.Struct("<q15d")  # stamp, ns; position, covariance, antenna, as in `Fix`
+_FIX_LABEL, _THUMBNAIL_LABEL = "fix", "thumbnail"
+_MAX_THUMBNAIL_SIZE = 20_000  # bytes: a larger one would replace points of the cloud; 320 pixels have 6000 to 25 000
+_FEATURE_FIELD = "feature"
+_MAX_CHANNELS = 4096
 
 
 def of_earlier_drive(parts: Sequence[bytes]) -> list[bytes]:
@@ -73,17 +73,17 @@ def payload_to_msgs(keyframe: Keyframe, name: str, weights: str = "") -> tuple[P
     """
     d, fix, thumbnail = keyframe.descriptors, keyframe.fix, keyframe.thumbnail
     descriptors = descriptors_to_msg(d, keyframe.stamp, name, weights)
-    behind = {}
+    extras = {}
     if fix is not None:
-        behind[_OF_FIX] = _FIX.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
-    if thumbnail is not None and (picture := within(thumbnail, _LARGEST_THUMBNAIL)) is not None:
-        behind[_OF_THUMBNAIL] = picture
-    room = BUDGET - len(descriptors.data) - sum(map(len, behind.values()))
+        extras[_FIX_LABEL] = _FIX_FORMAT.pack(fix.stamp, *fix.geodetic, *fix.covariance.ravel(), *fix.antenna)
+    if thumbnail is not None and (reduced := within(thumbnail, _MAX_THUMBNAIL_SIZE)) is not None:
+        extras[_THUMBNAIL_LABEL] = reduced
+    max_size = BUDGET - len(descriptors.data) - sum(map(len, extras.values()))
     cloud, voxel = keyframe.cloud, 0.3
-    while len(packed := pack_cloud(cloud, keyframe.origin)) > room:
+    while len(packed := pack_cloud(cloud, keyframe.origin)) > max_size:
         voxel *= 1.15
         cloud = keyframe.cloud[voxel_first(keyframe.cloud, voxel)]
-    parts = {name: packed, **behind}
+    parts = {name: packed, **extras}
     dimensions = [MultiArrayDimension(label=key, size=len(part), stride=len(part)) for key, part in parts.items()]
     data = bytes_to_array(b"".join(parts.values()))
     return descriptors, UInt8MultiArray(layout=MultiArrayLayout(dim=dimensions), data=data)
@@ -101,20 +101,20 @@ def payload_from_msg(message: UInt8MultiArray) -> Payload:
     ends = np.cumsum([dimension.size for dimension in dimensions]).tolist()
     if ends[-1] != len(data):
         raise RejectedError("size", f"{len(data)} bytes for parts of {ends[-1]}")
-    behind = {d.label: data[end - d.size : end] for d, end in zip(dimensions[1:], ends[1:], strict=True)}
-    fix, thumbnail = behind.get(_OF_FIX), behind.get(_OF_THUMBNAIL)
+    extras = {d.label: data[end - d.size : end] for d, end in zip(dimensions[1:], ends[1:], strict=True)}
+    fix, thumbnail = extras.get(_FIX_LABEL), extras.get(_THUMBNAIL_LABEL)
     try:
         if thumbnail is not None:
             image_of(thumbnail)
     except ValueError as error:
         raise RejectedError("thumbnail", str(error)) from None
-    return Payload(data[: ends[0]], None if fix is None else _fix_from(fix), thumbnail)
+    return Payload(data[: ends[0]], None if fix is None else _unpack_fix(fix), thumbnail)
 
 
-def _fix_from(data: bytes) -> Fix:
-    if len(data) != _FIX.size:
+def _unpack_fix(data: bytes) -> Fix:
+    if len(data) != _FIX_FORMAT.size:
         raise RejectedError("fix", f"a fix of {len(data)} bytes")
-    stamp, *numbers = _FIX.unpack(data)
+    stamp, *numbers = _FIX_FORMAT.unpack(data)
     values = np.array(numbers)
     try:
         return Fix(stamp, values[:3], values[3:12].reshape(3, 3), values[12:])
@@ -133,10 +133,10 @@ def descriptors_to_msg(d: Descriptors | None, stamp: int, name: str, weights: st
     values, features = np.zeros((0, 6), np.float32), np.zeros((0, 1), np.int8)
     if d is not None:
         values, features = np.column_stack([d.xyz, d.axes, d.step]), d.features
-    most = BUDGET // 2 // _row(features.shape[1]).itemsize
-    columns = dict(zip(("x", "y", "z", "axis_x", "axis_y", "step"), values[:most].T, strict=True))
-    feature = f"{_FEATURE}:{weights}" if weights else _FEATURE
-    message = columns_to_msg({**columns, feature: features[:most]}, stamp, name)
+    max_count = BUDGET // 2 // _row_dtype(features.shape[1]).itemsize
+    columns = dict(zip(("x", "y", "z", "axis_x", "axis_y", "step"), values[:max_count].T, strict=True))
+    feature = f"{_FEATURE_FIELD}:{weights}" if weights else _FEATURE_FIELD
+    message = columns_to_msg({**columns, feature: features[:max_count]}, stamp, name)
     message.is_dense = True
     return message
 
@@ -149,11 +149,11 @@ def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]
     """
     if not message.width:
         return None, ""
-    feature = next((f for f in message.fields if f.name.partition(":")[0] == _FEATURE), None)
+    feature = next((f for f in message.fields if f.name.partition(":")[0] == _FEATURE_FIELD), None)
     channels = 0 if feature is None or feature.datatype != PointField.INT8 else feature.count
-    if not 0 < channels <= _MOST_CHANNELS:
+    if not 0 < channels <= _MAX_CHANNELS:
         raise RejectedError("descriptors", f"a cloud that holds descriptors of {channels} channels of int8")
-    dtype = _row(channels)
+    dtype = _row_dtype(channels)
     if message.point_step != dtype.itemsize or len(message.data) != dtype.itemsize * message.width:
         raise RejectedError(
             "descriptors", f"{len(message.data)} bytes for {message.width} descriptors of {channels} channels"
@@ -163,5 +163,5 @@ def descriptors_from_msg(message: PointCloud2) -> tuple[Descriptors | None, str]
     return Descriptors(xyz, features, step, axis), "" if feature is None else feature.name.partition(":")[2][:64]
 
 
-def _row(channels: int) -> np.dtype[np.void]:
+def _row_dtype(channels: int) -> np.dtype[np.void]:
     return np.dtype([("xyz", "<f4", 3), ("axis", "<f4", 2), ("step", "<f4"), ("feature", "i1", channels)])

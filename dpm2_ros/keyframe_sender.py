@@ -34,9 +34,9 @@ from dpm2_ros.keyframe_messages import WIRE, of_earlier_drive, payload_to_msgs
 from dpm2_ros.settings import RosSettings
 from dpm2_ros.unsent import KeyframeFile, left_behind, path_of
 
-_MOST_ACKED = 1001  # numbers in an acknowledgment
-_TICK, _BURST = 0.25, 8  # s between two calls of `_repeat`, and keyframes sent again by one
-_FAREWELL = 4.0  # s; acknowledgments arrive twice per second, and those of one second must agree
+_MAX_ACK_NUMBERS = 1001  # numbers in an acknowledgment
+_RESEND_PERIOD, _MAX_RESENT = 0.25, 8  # s between two calls of `_resend`, and keyframes sent again by one
+_CLOSE_TIMEOUT = 4.0  # s; acknowledgments arrive twice per second, and those of one second must agree
 
 
 class KeyframeSender:
@@ -55,12 +55,12 @@ class KeyframeSender:
         self._pose = node.create_publisher(Odometry, "dpm2/keyframe_odom", WIRE)
         self._drives: list[Delivery] = []  # those that are over and not delivered, then the current one
         if not ros.embed_mapper:
-            self._drives += self._left_behind()
+            self._drives += self._undelivered_drives()
             self.restart()
-            self._received = node.create_subscription(
+            self._ack_subscription = node.create_subscription(
                 UInt32MultiArray, "dpm2/keyframes_received", self._on_received, 10
             )
-            node.create_timer(_TICK, self._repeat)
+            node.create_timer(_RESEND_PERIOD, self._resend)
 
     @property
     def arrived(self) -> tuple[int, int]:
@@ -78,7 +78,7 @@ class KeyframeSender:
     def restart(self) -> None:
         """Begin a new drive, with its own session. The mapper is notified at once that the drive before is over."""
         session = secrets.token_hex(4)
-        drive = Delivery(session, self._file(session), False, time.monotonic())
+        drive = Delivery(session, self._create_file(session), False, time.monotonic())
         last = None
         with self._lock:
             for empty in (earlier for earlier in self._drives if not len(earlier.file)):
@@ -86,7 +86,7 @@ class KeyframeSender:
             self._drives = [*(earlier for earlier in self._drives if len(earlier.file)), drive]
             for earlier in self._drives[:-1]:
                 if not earlier.earlier:
-                    with suppress(sqlite3.Error, OSError, RuntimeError):  # `_repeat` reads it again, and logs it
+                    with suppress(sqlite3.Error, OSError, RuntimeError):  # `_resend` reads it again, and logs it
                         last = of_earlier_drive(earlier.file.read(len(earlier.file) - 1))[0]
                 earlier.earlier = True
             for earlier in self._drives[1:-1]:
@@ -103,26 +103,26 @@ class KeyframeSender:
         parts = [bytes(serialize_message(part)) for part in (pose, *payload_to_msgs(keyframe, name, self._weights))]
         if drive is not None:
             with self._lock:
-                first, before = drive is self._drives[0], drive.file.problem
-                drive.append(parts, time.monotonic() if first else None)
+                is_current_turn, before = drive is self._drives[0], drive.file.problem
+                drive.append(parts, time.monotonic() if is_current_turn else None)
                 if drive.file.problem and not before:
                     self._log.error(f"{drive.file.path}: {drive.file.problem}; further keyframes are in memory only")
-            if not first:
+            if not is_current_turn:
                 return
         self._publish(parts)
 
     def close(self) -> None:
-        """Before the node ends: wait until the mapper, if one runs, has all in its file, but at most `_FAREWELL`.
+        """Before the node ends: wait until the mapper, if one runs, has all in its file, but at most `_CLOSE_TIMEOUT`.
 
         Keyframes that it does not have stay on disk, for the next start.
         """
-        end = time.monotonic() + _FAREWELL
-        while any(drive.late for drive in self._drives) and self._received.get_publisher_count():
+        end = time.monotonic() + _CLOSE_TIMEOUT
+        while any(drive.late for drive in self._drives) and self._ack_subscription.get_publisher_count():
             if time.monotonic() > end:
                 break
-            time.sleep(_TICK)
-            take_waiting(self._received)  # no executor does it any more
-            self._repeat()
+            time.sleep(_RESEND_PERIOD)
+            take_waiting(self._ack_subscription)  # no executor does it any more
+            self._resend()
         with self._lock:
             for drive in self._drives:
                 late, file = drive.late, drive.file
@@ -133,11 +133,11 @@ class KeyframeSender:
                 if file.path is not None and late > lost:
                     self._log.warning(f"{late - lost} keyframes not delivered: sent at the next start from {file.path}")
                 if lost:
-                    kept = "on the disk" if file.path is None else f"in {file.path}"
+                    where = "on the disk" if file.path is None else f"in {file.path}"
                     why = file.problem or "ros.map_directory is empty"
-                    self._log.error(f"{lost} keyframes neither delivered nor {kept}: {why}")
+                    self._log.error(f"{lost} keyframes neither delivered nor {where}: {why}")
 
-    def _file(self, session: str) -> KeyframeFile:
+    def _create_file(self, session: str) -> KeyframeFile:
         """The file of a new drive, on disk if possible."""
         if self._folder is not None:
             path = path_of(self._folder, self._robot, session)
@@ -150,7 +150,7 @@ class KeyframeSender:
                 return file
         return KeyframeFile()
 
-    def _left_behind(self) -> Iterator[Delivery]:
+    def _undelivered_drives(self) -> Iterator[Delivery]:
         """Drives of processes that ended before everything was delivered."""
         for session, path in [] if self._folder is None else left_behind(self._folder, self._robot):
             try:
@@ -169,9 +169,9 @@ class KeyframeSender:
             publisher.publish(message)
 
     def _on_received(self, message: UInt32MultiArray) -> None:
-        if not message.layout.dim or not 0 < len(message.data) <= _MOST_ACKED:
+        if not message.layout.dim or not 0 < len(message.data) <= _MAX_ACK_NUMBERS:
             raise RejectedError(
-                "acknowledgment", f"an acknowledgment of {len(message.data)} numbers; want 1 to {_MOST_ACKED}"
+                "acknowledgment", f"an acknowledgment of {len(message.data)} numbers; want 1 to {_MAX_ACK_NUMBERS}"
             )
         with self._lock:
             drive = self._drives[0]
@@ -179,7 +179,7 @@ class KeyframeSender:
                 below, *above = message.data.tolist()
                 drive.acknowledge(below, set(above), time.monotonic())
 
-    def _repeat(self) -> None:
+    def _resend(self) -> None:
         """Send a few keyframes again that were not acknowledged for a while; announce the last one."""
         now = time.monotonic()
         with self._lock:
@@ -187,7 +187,7 @@ class KeyframeSender:
                 self._drives.pop(0).file.close(keep=False)
             drive = self._drives[0]
             try:
-                again = [self._read(drive, id) for id in drive.due(now, _BURST)]
+                resent = [self._read(drive, id) for id in drive.due(now, _MAX_RESENT)]
                 last = self._read(drive, len(drive.file) - 1)[0] if drive.announces(now) else None
             except (sqlite3.Error, OSError, RuntimeError) as error:
                 self._log.error(f"{drive.file.path}: not sent: {error}", throttle_duration_sec=10)
@@ -195,7 +195,7 @@ class KeyframeSender:
                     drive.file.close(keep=True)
                     self._drives.remove(drive)
                 return
-        for parts in again:
+        for parts in resent:
             self._publish(parts)
         if last is not None:
             self._pose.publish(last)

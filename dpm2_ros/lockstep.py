@@ -29,8 +29,8 @@ ODOMETRY = "dpm2/odom"
 TIMEOUT = 10.0
 """Longest wait for the odometry of a cloud, s, after which the next one is published: a node rejects a repeated stamp.
 """
-_SECOND = "input.second_points_topic"
-_AGAIN = 2.0
+_SECOND_TOPIC = "input.second_points_topic"
+_RETRY_PERIOD = 2.0
 """Seconds without a response after which a node is asked once more: Fast DDS drops a response without an error here, if
 the node has not discovered the client within 0.1 s."""
 
@@ -51,9 +51,9 @@ class Lockstep:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._clouds: list[str] = []  # topics whose clouds get an odometry
-        self._joining: list[str] = []  # topics of second LiDARs, whose clouds are joined to those
+        self._second_topics: list[str] = []  # topics of second LiDARs, whose clouds are joined to those
         self._awaited: int | None = None  # stamp of the cloud whose odometry is awaited, ns; 0: it has no stamp
-        self._beside: dict[str, int] = {}  # stamp of the last image or joining cloud, by topic
+        self._last_stamps: dict[str, int] = {}  # stamp of the last image or joining cloud, by topic
         self._sent = self._missing = 0
 
     def find(self, end: float) -> None:
@@ -64,47 +64,49 @@ class Lockstep:
         """
         topic, clouds = self._odometry.topic_name, [t for t in self._publishers if self._bag.types[t] in CLOUDS]
         while not STOP.wait(0.02):
-            nodes = {_node(info) for info in self._node.get_publishers_info_by_topic(topic)}
-            takers = {
-                cloud: nodes & {_node(info) for info in self._node.get_subscriptions_info_by_topic(cloud)}
+            nodes = {_node_name(info) for info in self._node.get_publishers_info_by_topic(topic)}
+            subscribers = {
+                cloud: nodes & {_node_name(info) for info in self._node.get_subscriptions_info_by_topic(cloud)}
                 for cloud in clouds
                 if self._publishers[cloud].get_subscription_count()
             }
-            taken = [cloud for cloud, found in takers.items() if found]
-            if taken and self._odometry.get_publisher_count():
+            used = [cloud for cloud, found in subscribers.items() if found]
+            if used and self._odometry.get_publisher_count():
                 # Two LiDARs of one node have one odometry, that of the first; a parameter names the second.
-                among = nodes if len(clouds) > 1 else set()
-                self._joining = [second for node in sorted(among) if (second := self._second_of(*node)) in taken]
-                self._clouds = [cloud for cloud in taken if cloud not in self._joining]
+                candidates = nodes if len(clouds) > 1 else set()
+                self._second_topics = [
+                    second for node in sorted(candidates) if (second := self._second_topic_of(*node)) in used
+                ]
+                self._clouds = [cloud for cloud in used if cloud not in self._second_topics]
                 if self._clouds:
-                    self._check_alone(takers)
+                    self._check_one_topic_per_node(subscribers)
                     return
             if time.monotonic() >= end:
                 raise Dpm2Error(
                     f"lockstep: no node subscribes to {' or '.join(clouds) or 'clouds'} and publishes {topic}"
                 )
 
-    def _check_alone(self, takers: Mapping[str, set[tuple[str, str]]]) -> None:
+    def _check_one_topic_per_node(self, subscribers: Mapping[str, set[tuple[str, str]]]) -> None:
         """Raises Dpm2Error unless each node computes its odometry from one of the cloud topics."""
-        for one, other in combinations(self._clouds, 2):
-            if common := takers[one] & takers[other]:
+        for a, b in combinations(self._clouds, 2):
+            if common := subscribers[a] & subscribers[b]:
                 raise Dpm2Error(
-                    f"lockstep: {min(common)[1]} takes clouds of {one} and {other}, and its {_SECOND} is neither: "
+                    f"lockstep: {min(common)[1]} takes clouds of {a} and {b}, and its {_SECOND_TOPIC} is neither: "
                     "which of them get an odometry is not known; replay without lockstep"
                 )
 
-    def _second_of(self, namespace: str, name: str) -> str:
+    def _second_topic_of(self, namespace: str, name: str) -> str:
         """The topic of a node's second LiDAR, by its parameter; empty if it does not respond, or has none."""
         client = self._node.create_client(GetParameters, f"{namespace.rstrip('/')}/{name}/get_parameters")
         try:
             if not client.wait_for_service(TIMEOUT):
                 return ""
-            end, asked, answers = time.monotonic() + TIMEOUT, list[Any](), list[Any]()
-            while not answers and not STOP.is_set() and (left := end - time.monotonic()) > 0:
-                asked.append(client.call_async(GetParameters.Request(names=[_SECOND])))
-                self._executor.spin_until_future_complete(asked[-1], min(left, _AGAIN))
-                answers = [future.result() for future in asked if future.done()]
-            values = answers[0].values if answers else []
+            end, futures, responses = time.monotonic() + TIMEOUT, list[Any](), list[Any]()
+            while not responses and not STOP.is_set() and (remaining := end - time.monotonic()) > 0:
+                futures.append(client.call_async(GetParameters.Request(names=[_SECOND_TOPIC])))
+                self._executor.spin_until_future_complete(futures[-1], min(remaining, _RETRY_PERIOD))
+                responses = [future.result() for future in futures if future.done()]
+            values = responses[0].values if responses else []
             topic: str = values[0].string_value if values else ""
             return topic and expand_topic_name(topic, name, namespace)
         finally:
@@ -122,11 +124,11 @@ class Lockstep:
         that is joined to it, as far as they have a subscriber.
         """
         listened = [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count()]
-        beside = [t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._joining]
-        others = {topic: -SWEEP if self._bag.types[topic] == IMU else 0 for topic in beside}
+        topics = [t for t in listened if self._bag.types[t] in (*IMAGES, IMU) or t in self._second_topics]
+        others = {topic: -SWEEP if self._bag.types[topic] == IMU else 0 for topic in topics}
         return clouds_after_others(messages, self._clouds, others)
 
-    def turn(self, topic: str, data: bytes) -> None:
+    def await_turn(self, topic: str, data: bytes) -> None:
         """Before a message is published: wait, if it is a cloud, for the odometry of the previous cloud.
 
         The messages synchronized with a cloud (images and the cloud that is joined to it) are published before the
@@ -138,11 +140,11 @@ class Lockstep:
             Dpm2Error: the node is gone.
         """
         kind, stamp, awaited = self._bag.types[topic], serialized_stamp(data, 0), self._awaited
-        if kind in IMAGES or topic in self._joining:
-            before = self._beside.get(topic, 0)
-            if awaited is not None and not (passed(before, awaited) and before <= stamp):
+        if kind in IMAGES or topic in self._second_topics:
+            last_stamp = self._last_stamps.get(topic, 0)
+            if awaited is not None and not (passed(last_stamp, awaited) and last_stamp <= stamp):
                 self._await_odometry()
-            self._beside[topic] = stamp
+            self._last_stamps[topic] = stamp
         elif kind in (FIX, IMU) and awaited is not None and stamp <= awaited + SWEEP:
             self._await_odometry()
         if topic in self._clouds:
@@ -185,5 +187,5 @@ class Lockstep:
             self._awaited = None
 
 
-def _node(info: Any) -> tuple[str, str]:
+def _node_name(info: Any) -> tuple[str, str]:
     return info.node_namespace, info.node_name

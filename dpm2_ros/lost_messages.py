@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections import deque
 from statistics import median
 
-_LEAST = 5
+_MIN_STEPS = 5
 """Number of steps of the stamps after which their period is known."""
-_PAUSE = 20
+_MIN_PAUSE = 20
 """Periods from which on a gap counts as a pause of the sensor or of the recorder, not as a loss."""
-_OFF = 0.25
+_PERIOD_TOLERANCE = 0.25
 """Periods by which a gap may differ from a whole number of periods."""
 
 
@@ -26,8 +26,8 @@ class Losses:
 
     def __init__(self) -> None:
         self.count = 0
-        self._number: int | None = None
-        self._stamp: int | None = None
+        self._last_number: int | None = None
+        self._last_stamp: int | None = None
         self._steps: deque[int] = deque(maxlen=50)  # ns
 
     def add(self, stamp: int, number: int | None) -> int:
@@ -37,32 +37,32 @@ class Losses:
             stamp: ns.
             number: its publisher's sequence number; None if there is none, or if there are several publishers.
         """
-        before, self._number = self._number, number
-        lost = self._step(stamp)
+        before, self._last_number = self._last_number, number
+        lost = self._lost_by_stamp(stamp)
         if number is not None:
-            lost = _between(before, number)
+            lost = _missing_between(before, number)
         self.count += lost
         return lost
 
     def skip(self, number: int | None) -> None:
         """Note that a message with that number arrived but is not used: it is not lost."""
         if number is not None:
-            self.count += _between(self._number, number)
-            self._number = number
+            self.count += _missing_between(self._last_number, number)
+            self._last_number = number
 
-    def _step(self, stamp: int) -> int:
+    def _lost_by_stamp(self, stamp: int) -> int:
         """Number of lost messages, by the stamps only."""
-        before, self._stamp = self._stamp, stamp
+        before, self._last_stamp = self._last_stamp, stamp
         step = 0 if before is None else stamp - before
         if step <= 0:  # the first, a repeated one, or a looped bag
             return 0
-        periods = step / median(self._steps) if len(self._steps) >= _LEAST else 1.0
+        periods = step / median(self._steps) if len(self._steps) >= _MIN_STEPS else 1.0
         self._steps.append(step)
         whole = round(periods)
-        return whole - 1 if 1 < whole < _PAUSE and abs(periods - whole) <= _OFF else 0
+        return whole - 1 if 1 < whole < _MIN_PAUSE and abs(periods - whole) <= _PERIOD_TOLERANCE else 0
 
 
-def _between(before: int | None, number: int) -> int:
+def _missing_between(before: int | None, number: int) -> int:
     """Number of messages missing between two sequence numbers; another publisher begins at 1 again."""
     if before is None:
         return 0

@@ -11,7 +11,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import numbered
 from dpm2_core.slam.store.map_file import SUFFIX, left_log
 
-_NAME = "drive"
+_DEFAULT_NAME = "drive"
 
 
 class MapFolder:
@@ -27,7 +27,7 @@ class MapFolder:
     @property
     def usual(self) -> Path:
         """The default map file of a drive, an argument of `free`; an empty path if nothing is saved."""
-        return Path() if self.folder is None else self.folder / f"{_NAME}{SUFFIX}"
+        return Path() if self.folder is None else self.folder / f"{_DEFAULT_NAME}{SUFFIX}"
 
     def file(self, name: str) -> Path:
         """The map of that name.
@@ -41,13 +41,13 @@ class MapFolder:
 
     def of_robot(self, requested: Path) -> Path:
         """The path, with the robot's name added to that of the file."""
-        return requested.with_name(self._of_robot(requested.stem) + requested.suffix)
+        return requested.with_name(self._with_robot(requested.stem) + requested.suffix)
 
     def free(self, requested: Path) -> Iterator[Path]:
         """Unused paths: `requested` with the robot's name and a number added. Neither the file, nor a folder for its
         clouds, nor a write-ahead log that a former map left exists."""
         for path in numbered(self.of_robot(requested), requested.suffix):
-            if not _taken(path) and (self.folder is None or not (self.folder / path.stem).exists()):
+            if not _is_taken(path) and (self.folder is None or not (self.folder / path.stem).exists()):
                 yield path
 
     def claimed(self, name: str, file: Path | None) -> Path:
@@ -58,9 +58,9 @@ class MapFolder:
             OSError: it cannot be created.
         """
         assert self.folder is not None
-        own = file.stem if file is not None else self._of_robot(_NAME)
+        own = file.stem if file is not None else self._with_robot(_DEFAULT_NAME)
         for folder in numbered(self.folder / (name.removesuffix(SUFFIX) or own)):
-            if name and _taken(file_beside(folder)):
+            if name and _is_taken(map_file_of(folder)):
                 continue  # another drive's map
             with suppress(FileExistsError):
                 folder.mkdir(parents=True)
@@ -69,22 +69,22 @@ class MapFolder:
 
     def hint(self) -> str:
         """The newest map in the folder, in words; empty if there is none."""
-        found = sorted(self.folder.glob(f"*{SUFFIX}"), key=_age) if self.folder is not None else []
+        found = sorted(self.folder.glob(f"*{SUFFIX}"), key=_modification_time) if self.folder is not None else []
         return f"; the newest in {self.folder} is {found[-1]}" if found else ""
 
-    def _of_robot(self, stem: str) -> str:
+    def _with_robot(self, stem: str) -> str:
         return f"{stem}_{self._robot.replace('/', '_')}" if self._robot else stem
 
 
-def file_beside(folder: Path) -> Path:
+def map_file_of(folder: Path) -> Path:
     """The map file that belongs to a folder of clouds."""
     return folder.with_name(f"{folder.name}{SUFFIX}")
 
 
-def _taken(file: Path) -> bool:
+def _is_taken(file: Path) -> bool:
     """Whether there is a map, or the write-ahead log that a moved map left behind and needs."""
     return file.exists() or left_log(file) is not None
 
 
-def _age(path: Path) -> float:
+def _modification_time(path: Path) -> float:
     return path.stat().st_mtime

@@ -19,7 +19,7 @@ from dpm2_ros.keyframe_sender import weights_identity
 from dpm2_ros.lifecycle import ManagedNode
 from dpm2_ros.mapping import MapperThread
 
-_MOST_ROBOTS = 64
+_MAX_ROBOTS = 64
 PATIENCE = 10.0
 """s within which a namespace must deliver a keyframe before its subscriptions may be closed."""
 
@@ -34,22 +34,22 @@ class MapperNode(ManagedNode):
         super().__init__("mapper_node")
         if self._config.ros.localization_mode:
             raise UsageError("ros.localization_mode: only slam_node can localize")
-        self._own = self.get_namespace().rstrip("/")
+        self._own_namespace = self.get_namespace().rstrip("/")
         self.start(managed)
 
-    def configure(self, back: ExitStack) -> None:
+    def configure(self, undo: ExitStack) -> None:
         """See `ManagedNode`."""
         self._weights = weights_identity(self._config.slam)
-        self._open_map(back)
+        self._open_map(undo)
         self._feeds: dict[str, Feed] = {}
         slow_service(self, Trigger, "~/reset", self._on_reset)
         publish_diagnostics(self, self._statuses)
 
-    def activate(self, back: ExitStack) -> None:
+    def activate(self, undo: ExitStack) -> None:
         """Subscribe, with the same map. Keyframes sent in the meantime were not acknowledged, and are sent again."""
         for feed in self._feeds.values():
             feed.open()
-        back.callback(self._pause)
+        undo.callback(self._close_feeds)
         self._discover()
         self.create_timer(0.5, self._discover)
         self.create_timer(0.5, self._tick)
@@ -64,31 +64,31 @@ class MapperNode(ManagedNode):
         assert self._mapper is not None
         return self._mapper
 
-    def _pause(self) -> None:
+    def _close_feeds(self) -> None:
         for feed in self._feeds.values():
             feed.close()
 
     def _discover(self) -> None:
         """Subscribe to the robots that publish now, and always to the one of this node's own namespace."""
         topics = [topic for topic, _ in self.get_topic_names_and_types() if topic.endswith(ODOM)]
-        for namespace in (self._own, *(topic.removesuffix(ODOM) for topic in topics)):
-            if namespace in self._feeds or not f"{namespace}/".startswith(f"{self._own}/"):
+        for namespace in (self._own_namespace, *(topic.removesuffix(ODOM) for topic in topics)):
+            if namespace in self._feeds or not f"{namespace}/".startswith(f"{self._own_namespace}/"):
                 continue
-            if len(self._feeds) >= _MOST_ROBOTS and not self._make_room():
-                self.reject(ODOM, "too many robots", f"{namespace}: not subscribed, {_MOST_ROBOTS} others are")
+            if len(self._feeds) >= _MAX_ROBOTS and not self._close_idle_feed():
+                self.reject(ODOM, "too many robots", f"{namespace}: not subscribed, {_MAX_ROBOTS} others are")
                 return
             feed = self._feeds[namespace] = Feed(self, self._map, namespace, self._weights)
             feed.open()
         for namespace, feed in list(self._feeds.items()):
-            if self._idle(namespace, feed) and not self.count_publishers(namespace + ODOM):
+            if self._is_idle(namespace, feed) and not self.count_publishers(namespace + ODOM):
                 self._feeds.pop(namespace).close()
 
-    def _idle(self, namespace: str, feed: Feed) -> bool:
+    def _is_idle(self, namespace: str, feed: Feed) -> bool:
         """Whether that feed can be closed without a loss."""
-        return namespace != self._own and not feed.proven and time.monotonic() - feed.opened > PATIENCE
+        return namespace != self._own_namespace and not feed.has_delivered and time.monotonic() - feed.opened > PATIENCE
 
-    def _make_room(self) -> bool:
-        oldest = next((namespace for namespace, feed in self._feeds.items() if self._idle(namespace, feed)), None)
+    def _close_idle_feed(self) -> bool:
+        oldest = next((namespace for namespace, feed in self._feeds.items() if self._is_idle(namespace, feed)), None)
         if oldest is not None:
             self._feeds.pop(oldest).close()
         return oldest is not None
@@ -112,16 +112,16 @@ class MapperNode(ManagedNode):
 
     def _statuses(self) -> list[DiagnosticStatus]:
         now, figures = time.monotonic(), {}
-        beside = [name for feed in self._feeds.values() for name in feed.beside]
+        further_robots = [name for feed in self._feeds.values() for name in feed.further_robots]
         for feed in self._feeds.values():
             for robot, stream in feed.robots.items():
                 figures[robot or "/"] = f"{stream.taken} keyframes, last message {now - stream.heard:.0f} s ago"
         text = f"{len(figures)} robots"
-        if beside:
-            text += f"; several in one namespace: {', '.join(beside)} kept separate"
+        if further_robots:
+            text += f"; several in one namespace: {', '.join(further_robots)} kept separate"
         if shared := self._shared_frames():
             text += f"; robots share an odom_frame: {', '.join(shared)}; set another for each"
             problem = f"map -> {shared[0]} jumps between two robots: set another ros.odom_frame for each"
             self.get_logger().error(problem, once=True)
-        robots = status(self, "robots", WARN if beside or shared else OK, text, figures)
+        robots = status(self, "robots", WARN if further_robots or shared else OK, text, figures)
         return [mapper_status(self, self._map), robots, message_status(self)]

@@ -65,9 +65,9 @@ class MapperThread:
         self.active = ActiveMap(config, robot, node.get_logger())
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapper", initializer=lower_priority)
         self._stamp = 0  # of the last keyframe, ns
-        self._restarted: dict[str, Future[None]] = {}  # by robot: done once its odometry's restart is known here
+        self._restarts: dict[str, Future[None]] = {}  # by robot: done once its odometry's restart is known here
         self._lock = threading.Lock()
-        self._added = self._taken = self.written = 0  # keyframes
+        self._added = self._processed = self.written = 0  # keyframes
         self.missing: dict[int, str] = {}
         self._changes = self.keyframes
         ros = config.ros
@@ -85,11 +85,11 @@ class MapperThread:
                 (OccupancyGrid, "dpm2/grid", lambda: _GRID_PERIOD, self._grid),
             )
         ]
-        self._drawn: tuple[object, OccupancyMap] | None = None  # what the grid was drawn from, and the grid
-        self._of_no_use = ""  # why the grid is unusable, in words
-        self._settled: Future[None] = self._submit(lambda: None)  # done: no `_settle` is pending
+        self._drawn_grid: tuple[object, OccupancyMap] | None = None  # what the grid was drawn from, and the grid
+        self._grid_problem = ""  # why the grid is unusable, in words
+        self._settling: Future[None] = self._submit(lambda: None)  # done: no `_settle` is pending
         self._settled_at = time.monotonic()
-        node.create_timer(0.1, self._show)
+        node.create_timer(0.1, self._update_displays)
         slow_service(node, Trigger, "~/save_map", self._on_save)
 
     @property
@@ -100,7 +100,7 @@ class MapperThread:
     @property
     def waiting(self) -> int:
         """Number of keyframes that were added but are not in the map yet."""
-        return self._added - self._taken
+        return self._added - self._processed
 
     @property
     def store_problem(self) -> str:
@@ -113,7 +113,7 @@ class MapperThread:
         Args:
             T_own_odom: (4, 4) `odom_frame` in the odometry frame of the robot's keyframes; None: they are the same.
         """
-        restarted = self._restarted.get(robot)
+        restarted = self._restarts.get(robot)
         T_map_odom = self.active.T_map_odom(robot) if restarted is None or restarted.done() else None
         if T_map_odom is not None:
             T = T_map_odom if T_own_odom is None else T_map_odom @ T_own_odom
@@ -123,7 +123,7 @@ class MapperThread:
         """Add the keyframe that `make`, called in the map's thread, returns; returns how many were added before it."""
         with self._lock:
             number, self._added = self._added, self._added + 1
-            self._submit(lambda: self._take_in(number, make))
+            self._submit(lambda: self._process_keyframe(number, make))
         return number
 
     def hint(self, T_map_base: Array) -> str:
@@ -136,17 +136,17 @@ class MapperThread:
 
     def localise(self) -> Future[str]:
         """End the map that is being built, if any, and localize the robot in the map file; returns a message."""
-        return self._thread.submit(self._change, self.active.localise)
+        return self._thread.submit(self._change_map, self.active.localise)
 
     def load(self) -> Future[str]:
         """Localize the robot in the map that `ros.map_name` names, or in the same one again; returns a message."""
         if not (name := self._config.ros.map_name) and self.active.localizer is None:
             raise UsageError("no map is loaded: ros.map_name is empty, and localization_mode is off")
-        return self._thread.submit(self._change, lambda: self.active.localise(name))
+        return self._thread.submit(self._change_map, lambda: self.active.localise(name))
 
     def extend(self) -> Future[str]:
         """Extend the map in which the robot was localized by a new session; returns a message."""
-        return self._thread.submit(self._change, self.active.extend)
+        return self._thread.submit(self._change_map, self.active.extend)
 
     def apply(self, config: NodeConfig) -> None:
         """Apply settings that have changed while the node runs: those of the displays, and the map's name."""
@@ -155,19 +155,19 @@ class MapperThread:
 
     def restart(self, robot: str) -> None:
         """A robot's odometry has restarted: the map stays, the robot's pose in it is no longer known."""
-        self._restarted[robot] = self._submit(lambda: self.active.restart(robot))
+        self._restarts[robot] = self._submit(lambda: self.active.restart(robot))
 
-    async def before_reset(self, response: Trigger.Response, begins: str) -> None:
-        """Save the map, and fill the response of a reset service: with `begins`, or with why there is no reset."""
+    async def before_reset(self, response: Trigger.Response, success_text: str) -> None:
+        """Save the map, and fill the response of a reset service with `success_text`, or with why there is no reset."""
         await respond(self._node, self._thread.submit(self.active.keep), response)
         if response.success:
-            response.message = "; ".join(filter(None, (response.message, begins)))
+            response.message = "; ".join(filter(None, (response.message, success_text)))
         else:
             response.message = f"no reset: {response.message}"
 
     def reset(self) -> None:
         """The odometry restarts, and with it an empty map or the search for the robot; see `ActiveMap.reset`."""
-        self._restarted[self._robot] = self._submit(lambda: self._change(self.active.reset))
+        self._restarts[self._robot] = self._submit(lambda: self._change_map(self.active.reset))
 
     def close(self) -> None:
         """Add the keyframes that still wait, save the map, end the thread.
@@ -211,7 +211,7 @@ class MapperThread:
         elif error is not None:
             self._node.fail("mapper", error)
 
-    def _change(self, work: Callable[[], Any]) -> Any:
+    def _change_map(self, work: Callable[[], Any]) -> Any:
         """Do work that changes the map; displays that are being built of the map before are dropped."""
         for display in self._displays:
             display.again()
@@ -223,13 +223,13 @@ class MapperThread:
         if self.active.settle():
             self._changes += 1
         if not self.store_problem:
-            self.written = self._taken
+            self.written = self._processed
         self._settled_at = time.monotonic()
 
-    def _take_in(self, number: int, make: Callable[[], Keyframe]) -> None:
-        before, behind = self.keyframes, self.store_problem
+    def _process_keyframe(self, number: int, make: Callable[[], Keyframe]) -> None:
+        before, previous_problem = self.keyframes, self.store_problem
         try:
-            self._add(make())
+            self._add_keyframe(make())
         except RejectedError:
             raise
         except Exception as error:
@@ -237,13 +237,13 @@ class MapperThread:
                 self.missing[number] = str(error) or type(error).__name__
             raise
         finally:
-            self._taken += 1
+            self._processed += 1
             if not self.store_problem:
-                self.written = self._taken
-            elif not behind:
+                self.written = self._processed
+            elif not previous_problem:
                 self._node.get_logger().error(f"map file incomplete: {self.store_problem}")
 
-    def _add(self, keyframe: Keyframe) -> None:
+    def _add_keyframe(self, keyframe: Keyframe) -> None:
         loops = self.active.add(keyframe)
         if self.active.localizer is not None:
             return
@@ -261,13 +261,13 @@ class MapperThread:
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         save = partial(self.active.save, self._config.ros.map_name)
-        await respond(self._node, self._thread.submit(self._change, save), response)
+        await respond(self._node, self._thread.submit(self._change_map, save), response)
         return response
 
-    def _show(self) -> None:
-        again = bool(self.store_problem) and time.monotonic() - self._settled_at >= RETRY
-        if self._settled.done() and (again or self.active.mapper.graph.busy):
-            self._settled = self._submit(self._settle)
+    def _update_displays(self) -> None:
+        retry = bool(self.store_problem) and time.monotonic() - self._settled_at >= RETRY
+        if self._settling.done() and (retry or self.active.mapper.graph.busy):
+            self._settling = self._submit(self._settle)
         for display in self._displays:
             if display.due(self._changes):
                 self._submit(display.publish)
@@ -283,16 +283,16 @@ class MapperThread:
 
     def _grid(self) -> Any:
         mapper, ros = self.active.mapper, self._config.ros
-        of = (mapper, ros.grid, ros.grid_max_cells)
-        if self._drawn is None or self._drawn[0] != of:
-            self._drawn = of, OccupancyMap(ros.grid, ros.grid_max_cells)
-            self._of_no_use = ""
-        grid = self._drawn[1]
+        source = (mapper, ros.grid, ros.grid_max_cells)
+        if self._drawn_grid is None or self._drawn_grid[0] != source:
+            self._drawn_grid = source, OccupancyMap(ros.grid, ros.grid_max_cells)
+            self._grid_problem = ""
+        grid = self._drawn_grid[1]
         if not mapper.update_grid(grid, _GRID_WORK):  # incomplete: of a loaded map, or after a loop in a large one
             self._displays[-1].again()
-        before, self._of_no_use = self._of_no_use, why_of_no_use(mapper.poses[mapper.placed])
-        if self._of_no_use and not before:
-            self._node.get_logger().warning(f"dpm2/grid: {self._of_no_use}")
+        before, self._grid_problem = self._grid_problem, why_of_no_use(mapper.poses[mapper.placed])
+        if self._grid_problem and not before:
+            self._node.get_logger().warning(f"dpm2/grid: {self._grid_problem}")
         return grid_to_msg(grid.grid(), self._stamp, ros.map_frame)
 
     def _map(self) -> Generator[None, None, PointCloud2]:

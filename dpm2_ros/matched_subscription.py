@@ -34,10 +34,10 @@ class MatchedSubscription:
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Callable[..., None], ros: RosSettings) -> None:
-        self._node, self._wanted, self._callback = node, kind, callback
-        self._setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
-        self._given, self.topic = topic, node.resolve_topic_name(topic)
-        self._suits = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, kind
+        self._node, self._requested_kind, self._callback = node, kind, callback
+        self._reliability_setting, self._depth = ros.reliability, _IMU_DEPTH if kind is Imu else ros.queue_depth
+        self._unresolved_topic, self.topic = topic, node.resolve_topic_name(topic)
+        self._current = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, kind
         self._subscription: Any = None
         self.problem = ""
         self.refresh()
@@ -48,42 +48,44 @@ class MatchedSubscription:
 
     def refresh(self) -> None:
         """Adapt the subscription to the present publishers."""
-        requested, offered = self._suits[0], self._node.get_publishers_info_by_topic(self.topic)
+        requested, offered = self._current[0], self._node.get_publishers_info_by_topic(self.topic)
         best_effort = [info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered]
-        if self._setting != "auto":
-            requested = ReliabilityPolicy[self._setting.upper()]
+        if self._reliability_setting != "auto":
+            requested = ReliabilityPolicy[self._reliability_setting.upper()]
         elif offered:
             requested = ReliabilityPolicy.BEST_EFFORT if any(best_effort) else ReliabilityPolicy.RELIABLE
         latched = DurabilityPolicy.TRANSIENT_LOCAL
-        keeps = self._wanted is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
-        durability = latched if keeps else DurabilityPolicy.VOLATILE  # for one sent only once, long ago
+        is_latched = (
+            self._requested_kind is CameraInfo and offered and all(i.qos_profile.durability == latched for i in offered)
+        )
+        durability = latched if is_latched else DurabilityPolicy.VOLATILE  # for one sent only once, long ago
         self.problem = ""
-        kind = self._kind_of({info.topic_type for info in offered})
+        kind = self._kind_for({info.topic_type for info in offered})
         if requested == ReliabilityPolicy.RELIABLE and best_effort and all(best_effort):
             self.problem = f"{self.topic} is best effort, but ros.reliability is reliable: set it to auto"
-        now, self._suits = self._suits, (requested, durability, kind)
-        if self._subscription is not None and self._suits == now:
+        previous, self._current = self._current, (requested, durability, kind)
+        if self._subscription is not None and self._current == previous:
             return
-        before, other_type = self._subscription, kind is not now[2]
-        raw = self._wanted is PointCloud2 and kind is not PointCloud2
-        if before is not None and other_type:  # DDS allows one type per topic
-            self._node.destroy_subscription(before)
+        old_subscription, type_changed = self._subscription, kind is not previous[2]
+        raw = self._requested_kind is PointCloud2 and kind is not PointCloud2
+        if old_subscription is not None and type_changed:  # DDS allows one type per topic
+            self._node.destroy_subscription(old_subscription)
         keep = HistoryPolicy.KEEP_LAST
         qos = QoSProfile(depth=self._depth, history=keep, reliability=requested, durability=durability)
-        self._subscription = self._node.create_subscription(kind, self._given, self._callback, qos, raw=raw)
-        if before is not None:
-            if not other_type:
-                self._node.destroy_subscription(before)
+        self._subscription = self._node.create_subscription(kind, self._unresolved_topic, self._callback, qos, raw=raw)
+        if old_subscription is not None:
+            if not type_changed:
+                self._node.destroy_subscription(old_subscription)
             self._node.get_logger().info(f"{self.topic}: {requested.name.lower()} {kind.__name__}, as its publisher")
 
-    def _kind_of(self, offered: set[str]) -> type:
+    def _kind_for(self, offered: set[str]) -> type:
         """What to subscribe to, given the types of the publishers."""
-        if self._wanted in _IMAGES:
+        if self._requested_kind in _IMAGES:
             kinds = [kind for kind, name in zip(_IMAGES, IMAGES, strict=True) if name in offered]
-            return kinds[0] if len(kinds) == 1 else self._wanted
+            return kinds[0] if len(kinds) == 1 else self._requested_kind
         custom = sorted(offered.intersection(LIVOX))
-        if self._wanted is not PointCloud2 or not custom or CLOUD in offered:
-            return self._wanted
+        if self._requested_kind is not PointCloud2 or not custom or CLOUD in offered:
+            return self._requested_kind
         found = message_type(custom[0])
         if found is None:
             self.problem = (
@@ -91,4 +93,4 @@ class MatchedSubscription:
                 f"send PointCloud2 (xfer_format: 0)"
             )
             self._node.get_logger().error(self.problem, once=True)
-        return found or self._wanted
+        return found or self._requested_kind

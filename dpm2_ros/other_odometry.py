@@ -32,10 +32,10 @@ from dpm2_ros.transform_history import TransformHistory
 
 WAIT = 0.1
 """s that a cloud waits for an odometry message that arrives after it."""
-_MEMORY = 0.02  # weight of the newest step in the mean distances, of which `slip` is the ratio
-_SLIPS = 0.05  # a larger slip is reported; a wheel's radius is often wrong by 2 %, which does no harm
-_DOUBTFUL = 1.5  # times the assumed error
-_RECENT = 10.0  # s
+_MEAN_WEIGHT = 0.02  # weight of the newest step in the mean distances, of which `slip` is the ratio
+_MAX_SLIP = 0.05  # a larger slip is reported; a wheel's radius is often wrong by 2 %, which does no harm
+_MAX_DOUBT = 1.5  # times the assumed error
+_RECENT_TIME = 10.0  # s
 
 
 class OtherOdometry:
@@ -58,11 +58,11 @@ class OtherOdometry:
         self._child = ""  # the frame whose pose the topic has
         self.source = node.resolve_topic_name(TF if ros.odom_source == "tf" else ros.odom_topic)
         self.problem, self.missed, self.found, self.outweighed = f"no usable message on {self.source} yet", 0, 0, 0
-        self._in_a_row = 0  # consecutive clouds without it
-        self._unmet: tuple[int, str, float] | None = None  # the last of these: stamp, base, end of the longest wait
+        self._consecutive_missed = 0  # clouds without it
+        self._last_missed: tuple[int, str, float] | None = None  # its stamp, base, and end of the longest wait
         self._comparison: Comparison | None = None
-        self._struck: tuple[float, str] | None = None  # when it was outweighed last, and why
-        self._ways = np.zeros(2)  # m per cloud, recent means of the distance: its own, and that of the scans
+        self._last_outweighed: tuple[float, str] | None = None  # when it was outweighed last, and why
+        self._mean_distances = np.zeros(2)  # m per cloud, recent means of the distance: its own, and that of the scans
         self._subscription: MatchedSubscription | None = None
         if ros.odom_source == "topic":
             self._subscription = MatchedSubscription(node, Odometry, ros.odom_topic, self._on_odometry, ros)
@@ -76,18 +76,18 @@ class OtherOdometry:
         """Its pose of the LiDAR at a stamp (ns), as soon as it is received; None if it is not received in time."""
         began = time.monotonic()
         with self._changed:
-            end = began + (WAIT if self._in_a_row < PATIENCE else 0.0)
-            while (found := self._look(stamp, base)) is None and (left := end - time.monotonic()) > 0:
-                self._changed.wait(left)
-            self._in_a_row = 0 if found is not None else self._in_a_row + 1
-            self._unmet = None if found is not None else (stamp, base, began + WAIT)
+            end = began + (WAIT if self._consecutive_missed < PATIENCE else 0.0)
+            while (found := self._try_find(stamp, base)) is None and (remaining := end - time.monotonic()) > 0:
+                self._changed.wait(remaining)
+            self._consecutive_missed = 0 if found is not None else self._consecutive_missed + 1
+            self._last_missed = None if found is not None else (stamp, base, began + WAIT)
         self.found, self.missed = self.found + (found is not None), self.missed + (found is None)
         if found is None:
             self._comparison = None
             return None
         T_odom_base, covariance = found
         if covariance is not None:
-            covariance = _turned(covariance, T_base_lidar)
+            covariance = _rotated(covariance, T_base_lidar)
         return Guess(T_odom_base @ T_base_lidar, covariance)
 
     def T_odom_base(self, stamp: int, base: str) -> Array | None:
@@ -103,19 +103,19 @@ class OtherOdometry:
         if comparison is None or comparison.unsure:
             return ""
         if comparison.used:  # else it jumped, which is no slip
-            ways = [np.linalg.norm(T[:3, 3]) for T in (comparison.T_other, comparison.T_scans)]
-            self._ways = (1 - _MEMORY) * self._ways + _MEMORY * np.array(ways)
+            distances = [np.linalg.norm(T[:3, 3]) for T in (comparison.T_other, comparison.T_scans)]
+            self._mean_distances = (1 - _MEAN_WEIGHT) * self._mean_distances + _MEAN_WEIGHT * np.array(distances)
             return ""
         self.outweighed += 1
         meters, degrees = se3.apart(comparison.T_other, comparison.T_scans)
         text = f"outweighed: {meters:.2f} m, {degrees:.1f} deg from the motion of the scans"
-        self._struck = time.monotonic(), text
+        self._last_outweighed = time.monotonic(), text
         return text
 
     @property
     def slip(self) -> float:
         """By which fraction its recent distances are longer than those of the scans; NaN while the robot stands."""
-        other, scans = self._ways
+        other, scans = self._mean_distances
         return float(other / scans - 1) if scans > 1e-3 else float("nan")
 
     @property
@@ -123,18 +123,18 @@ class OtherOdometry:
         """What contradicts it, or why it has no pose, in words; empty if nothing does."""
         if self.problem:
             return (self._subscription.problem if self._subscription is not None else "") or self.problem
-        said = []
-        if self._struck is not None and (ago := time.monotonic() - self._struck[0]) < _RECENT:
-            said.append(f"{self._struck[1]}, {ago:.0f} s ago")
-        if self._comparison is not None and self._comparison.doubt > _DOUBTFUL:
-            said.append(f"its error is {self._comparison.doubt:.1f} times the assumed one")
+        problems = []
+        if self._last_outweighed is not None and (age := time.monotonic() - self._last_outweighed[0]) < _RECENT_TIME:
+            problems.append(f"{self._last_outweighed[1]}, {age:.0f} s ago")
+        if self._comparison is not None and self._comparison.doubt > _MAX_DOUBT:
+            problems.append(f"its error is {self._comparison.doubt:.1f} times the assumed one")
         if self._comparison is not None and self._comparison.unsure:
-            said.append("left out: its own covariance is larger than that of the predicted motion")
-        if abs(self.slip) > _SLIPS:
-            said.append(f"its distances are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
-        return "; ".join(said)
+            problems.append("left out: its own covariance is larger than that of the predicted motion")
+        if abs(self.slip) > _MAX_SLIP:
+            problems.append(f"its distances are {abs(self.slip):.1%} too {'long' if self.slip > 0 else 'short'}")
+        return "; ".join(problems)
 
-    def _look(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
+    def _try_find(self, stamp: int, base: str) -> tuple[Array, Array | None] | None:
         """As `_find`; sets `problem`."""
         try:
             found = self._find(stamp, base)
@@ -153,17 +153,17 @@ class OtherOdometry:
         if source != base:
             T_child_base = static.lookup(source, base)
             T = T @ T_child_base
-            covariance = None if covariance is None else _turned(covariance, T_child_base)
+            covariance = None if covariance is None else _rotated(covariance, T_child_base)
         return T, covariance
 
-    def _tell(self) -> None:
+    def _notify_waiting(self) -> None:
         """A message has arrived: a waiting `guess` looks again. If the last cloud without a pose would have had one by
         waiting, the next cloud waits again."""
-        if self._unmet is not None and self._in_a_row >= PATIENCE:
-            stamp, base, end = self._unmet
+        if self._last_missed is not None and self._consecutive_missed >= PATIENCE:
+            stamp, base, end = self._last_missed
             with suppress(UsageError):
                 if time.monotonic() <= end and self._find(stamp, base) is not None:
-                    self._in_a_row = 0
+                    self._consecutive_missed = 0
         self._changed.notify()
 
     def _on_tf(self, message: Any) -> None:
@@ -174,7 +174,7 @@ class OtherOdometry:
                 check_frame(parent)
                 check_frame(child)
                 self._history.add(parent, child, stamp_ns(stamped.header), stamped.transform)
-            self._tell()
+            self._notify_waiting()
 
     def _on_odometry(self, message: Odometry) -> None:
         check_header(message.header)
@@ -193,11 +193,11 @@ class OtherOdometry:
         with self._changed:
             self._child = child
             self._history.add(frame, child, stamp_ns(message.header), message.pose.pose, covariance)
-            self._tell()
+            self._notify_waiting()
 
 
-def _turned(covariance: Array, T_body_other: Array) -> Array:
+def _rotated(covariance: Array, T_body_other: Array) -> Array:
     """A covariance (6, 6) along the axes of another frame of the same body. It is rotated only: with a lever arm, large
     values of directions that a driver does not measure, such as 1e6, would spread to all directions."""
-    turn = np.kron(np.eye(2), T_body_other[:3, :3].T)
-    return np.asarray(turn @ covariance @ turn.T)
+    R = np.kron(np.eye(2), T_body_other[:3, :3].T)
+    return np.asarray(R @ covariance @ R.T)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
 CONFIG_FILE = "config_file"
-_OF_RCLPY = ("use_sim_time", "start_type_description_service")
+_RCLPY_PARAMETERS = ("use_sim_time", "start_type_description_service")
 _HEAD = """# Parameters
 
 <!-- Written by `make parameters` from the settings themselves; a test keeps it up to date. -->
@@ -54,7 +54,9 @@ def load_parameters(node: Node) -> NodeConfig:
     """
     fields = dict(flat_fields(NodeConfig))
     declared = {
-        name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items() if name not in _OF_RCLPY
+        name: parameter.value
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if name not in _RCLPY_PARAMETERS
     }
     # `ros2 param dump` writes null for unset values, which rcl reads as a text.
     unset = {name for name, info in fields.items() if info.default is None}
@@ -69,16 +71,16 @@ def load_parameters(node: Node) -> NodeConfig:
     path = Path(os.path.expanduser(file)) if file else None
     load_settings(NodeConfig, path)  # checked alone, to report its errors as those of the file
     # Only the given values: a preset may change the rest.
-    tree = _with({} if path is None else read_settings(NodeConfig, path), given)
+    tree = _with_values({} if path is None else read_settings(NodeConfig, path), given)
     config = settings_from(NodeConfig, tree, dict.fromkeys(given, "ROS parameter"))
     for name in declared:
         node.undeclare_parameter(name)
     _declare(node, CONFIG_FILE, file, "YAML file with settings, as for `dpm2 run --config`.", None)
     for name, info in fields.items():
-        value = _plain(functools.reduce(getattr, name.split("."), config))
+        value = _to_ros_value(functools.reduce(getattr, name.split("."), config))
         if name.endswith("_topic") and value:
             _check_topic(node, name, value)
-        _declare(node, name, value, _text(info), info)
+        _declare(node, name, value, _description(info), info)
     return config
 
 
@@ -100,7 +102,7 @@ def follow_changes(node: Node, config: NodeConfig, apply: Callable[[NodeConfig],
         nonlocal current
         given = {parameter.name: parameter.value for parameter in parameters if parameter.name in CHANGEABLE}
         try:
-            tree = _with(current.model_dump(), given)
+            tree = _with_values(current.model_dump(), given)
             current = settings_from(NodeConfig, tree, dict.fromkeys(given, "ROS parameter"))
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -111,7 +113,7 @@ def follow_changes(node: Node, config: NodeConfig, apply: Callable[[NodeConfig],
     node.add_on_set_parameters_callback(on_set)
 
 
-def _with(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def _with_values(tree: dict[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """The same tree, with the given parameters set; lists arrive as arrays."""
     for name, value in given.items():
         put(NodeConfig, tree, name.split("."), value.tolist() if hasattr(value, "tolist") else value)
@@ -130,7 +132,7 @@ def _descriptor(description: str, value: Any, info: FieldInfo | None) -> Paramet
     descriptor = ParameterDescriptor(description=description, dynamic_typing=value is None)
     if info is None:
         return descriptor
-    descriptor.additional_constraints = f"{_type_name(info.annotation)} {_allowed(info)}".strip()
+    descriptor.additional_constraints = f"{_type_name(info.annotation)} {_limits_text(info)}".strip()
     limits = {type(limit): limit for limit in _limits(info)}
     if annotated_types.Ge in limits and annotated_types.Le in limits:  # ROS ranges have two closed ends
         low, high = limits[annotated_types.Ge].ge, limits[annotated_types.Le].le
@@ -141,16 +143,16 @@ def _descriptor(description: str, value: Any, info: FieldInfo | None) -> Paramet
     return descriptor
 
 
-def _plain(value: Any) -> Any:
+def _to_ros_value(value: Any) -> Any:
     """A value of a type that ROS has: no tuples, enumerations or paths."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
+        return [_to_ros_value(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
-def _text(info: FieldInfo) -> str:
+def _description(info: FieldInfo) -> str:
     return " ".join((info.description or "").split())
 
 
@@ -165,7 +167,7 @@ def _limits(info: FieldInfo) -> list[Any]:
     return flat
 
 
-def _allowed(info: FieldInfo) -> str:
+def _limits_text(info: FieldInfo) -> str:
     signs = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
     pairs = ((word, getattr(limit, sign, None)) for limit in _limits(info) for sign, word in signs)
     return ", ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
@@ -208,9 +210,9 @@ def _sections() -> Iterator[str]:
                 "| parameter | type | default | meaning |",
                 "|---|---|---|---|",
             )
-        kind_text = ", ".join(filter(None, (_type_name(info.annotation), _allowed(info))))
-        default = json.dumps(_plain(info.get_default(call_default_factory=True)), default=str)
-        text = _text(info).replace("|", "&#124;") + (" *Changeable.*" if name in CHANGEABLE else "")
+        kind_text = ", ".join(filter(None, (_type_name(info.annotation), _limits_text(info))))
+        default = json.dumps(_to_ros_value(info.get_default(call_default_factory=True)), default=str)
+        text = _description(info).replace("|", "&#124;") + (" *Changeable.*" if name in CHANGEABLE else "")
         yield f"| `{name}` | {kind_text} | `{default}` | {text} |"
 
 

@@ -47,12 +47,14 @@ class Requests:
         return response
 
     async def _on_load_map(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return await self._ask(MapperThread.load, response)
+        return await self._run_in_mapper_thread(MapperThread.load, response)
 
     async def _on_localization_mode(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        return await self._ask(MapperThread.localise if request.data else MapperThread.extend, response)
+        return await self._run_in_mapper_thread(
+            MapperThread.localise if request.data else MapperThread.extend, response
+        )
 
-    async def _ask(self, work: Callable[[MapperThread], Future[str]], response: Any) -> Any:
+    async def _run_in_mapper_thread(self, work: Callable[[MapperThread], Future[str]], response: Any) -> Any:
         """The response, filled with the result of `work` in the mapper's thread."""
         if self._mapper is None:
             response.success, response.message = False, "the mapper is another node's: ros.embed_mapper is off"

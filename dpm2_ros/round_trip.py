@@ -22,7 +22,7 @@ from dpm2_ros.runtime import end_ros, ros_context
 
 SIZE = 2_000_000
 """Bytes: 120,000 points."""
-_PATIENCE = 10.0  # s during which messages are sent
+_SEND_TIME = 10.0  # s during which messages are sent
 
 
 def receive(topic: str) -> dict[str, object]:
@@ -35,11 +35,11 @@ def receive(topic: str) -> dict[str, object]:
     node = rclpy.create_node("dpm2_round_trip_receiver")
     arrived: list[float] = []
 
-    def take(message: UInt8MultiArray) -> None:
+    def on_message(message: UInt8MultiArray) -> None:
         sent = int.from_bytes(bytes(message.data[:8]), "little")
         arrived.append((time.time_ns() - sent) / 1e6)
 
-    node.create_subscription(UInt8MultiArray, topic, take, qos_profile_sensor_data)
+    node.create_subscription(UInt8MultiArray, topic, on_message, qos_profile_sensor_data)
     sender = subprocess.Popen([sys.executable, "-m", "dpm2_ros.round_trip", topic])
     try:
         while len(arrived) < 3 and sender.poll() is None:  # it ends by itself, however long its start takes
@@ -49,16 +49,16 @@ def receive(topic: str) -> dict[str, object]:
         sender.wait()
         end_ros(node)
     if not arrived:
-        raise Dpm2Error(f"no message of {SIZE} bytes came from another process within {_PATIENCE:g} s")
+        raise Dpm2Error(f"no message of {SIZE} bytes came from another process within {_SEND_TIME:g} s")
     return {"rmw": rclpy.get_rmw_implementation_identifier(), "ms": min(arrived)}
 
 
 def send(topic: str) -> None:
-    """Send five messages per second, until the process is ended, but at most for `_PATIENCE`."""
+    """Send five messages per second, until the process is ended, but at most for `_SEND_TIME`."""
     ros_context([])
     node = rclpy.create_node("dpm2_round_trip_sender")
     publisher = node.create_publisher(UInt8MultiArray, topic, qos_profile_sensor_data)
-    end = time.monotonic() + _PATIENCE
+    end = time.monotonic() + _SEND_TIME
     while time.monotonic() < end:
         content = time.time_ns().to_bytes(8, "little") + bytes(SIZE - 8)
         publisher.publish(UInt8MultiArray(data=array.array("B", content)))

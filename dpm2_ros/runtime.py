@@ -27,12 +27,12 @@ from dpm2_core.interrupt import hang_up_as_terminated
 from dpm2_ros.share import share_directory
 from dpm2_ros.shared_memory import free_shared_memory
 
-_SWITCH = 5e-4
+_SWITCH_INTERVAL = 5e-4
 """s after which a thread must release Python's global lock. The odometry acquires it tens of times per frame; with the
 default of 5 ms, a network in the thread of the map delays the odometry each time."""
-_SLICE = 0.05  # s after `Stop.set` within which `Stop.wait` returns
-_PROFILE, _NEW_NAME = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
-_NICER = 10  # steps of niceness: a tenth of the odometry's share if both compete for a processor
+_WAIT_SLICE = 0.05  # s after `Stop.set` within which `Stop.wait` returns
+_PROFILE_VARIABLE, _NEW_PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
+_NICENESS_STEPS = 10  # steps of niceness: a tenth of the odometry's share if both compete for a processor
 
 
 class Stop:
@@ -61,8 +61,8 @@ class Stop:
             Whether it is set.
         """
         end = time.monotonic() + timeout
-        while not self._is_set and (left := end - time.monotonic()) > 0:
-            time.sleep(min(left, _SLICE))
+        while not self._is_set and (remaining := end - time.monotonic()) > 0:
+            time.sleep(min(remaining, _WAIT_SLICE))
         return self._is_set
 
 
@@ -89,10 +89,12 @@ def use_dds_profile() -> None:
     It reads the variable when the process creates its first participant; that of Jazzy reads only the older name.
     """
     configured = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") or Path("DEFAULT_FASTRTPS_PROFILES.xml").is_file()
-    if os.environ.get(_PROFILE) or (configured and not os.environ.get(_NEW_NAME)):
+    if os.environ.get(_PROFILE_VARIABLE) or (configured and not os.environ.get(_NEW_PROFILE_VARIABLE)):
         return
     try:
-        os.environ[_PROFILE] = os.environ.get(_NEW_NAME) or str(share_directory() / "config" / "fastdds.xml")
+        os.environ[_PROFILE_VARIABLE] = os.environ.get(_NEW_PROFILE_VARIABLE) or str(
+            share_directory() / "config" / "fastdds.xml"
+        )
     except Dpm2Error as error:
         print(f"large messages may be lost, without the DDS profile: {error}", file=sys.stderr)
 
@@ -136,7 +138,7 @@ def spin_node(load: Callable[[], Callable[[], Any]], arguments: Sequence[str]) -
         make = load()
         gc.freeze()  # a garbage collection of all imported objects would take longer than a frame
         if not STOP.is_set():  # else no map is opened, no network loaded
-            sys.setswitchinterval(_SWITCH)
+            sys.setswitchinterval(_SWITCH_INTERVAL)
             nodes.append(make())
             _spin(nodes[0])
     finally:
@@ -199,13 +201,13 @@ def _on_one_processor() -> Iterator[None]:
         return
     allowed = os.sched_getaffinity(0)
     try:
-        _allow({min(allowed)})
+        _set_affinity({min(allowed)})
         yield
     finally:
-        _allow(allowed)
+        _set_affinity(allowed)
 
 
-def _allow(processors: set[int]) -> None:
+def _set_affinity(processors: set[int]) -> None:
     """Let all threads of this process run on these."""
     for thread in os.listdir("/proc/self/task"):
         with suppress(OSError):  # it has ended
@@ -216,4 +218,4 @@ def lower_priority() -> None:
     """Lower the priority of this thread and of those that it starts: the map may wait, the next scan may not."""
     if sys.platform == "linux":  # elsewhere a single thread has no priority that can be set like this
         thread = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICER)
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICENESS_STEPS)

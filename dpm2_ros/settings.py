@@ -116,11 +116,11 @@ class RosSettings(Settings):
 
     @field_validator("map_directory", "map_file")
     @classmethod
-    def _expanded(cls, path: str) -> str:
+    def _expand_home(cls, path: str) -> str:
         return os.path.expanduser(path)  # no shell expands ~ in a ROS parameter
 
     @model_validator(mode="after")
-    def _different(self) -> RosSettings:
+    def _check_frames_differ(self) -> RosSettings:
         frames = [self.map_frame, self.own_frame, frame_name(self.base_frame)]
         if self.own_frame != self.odom_frame:
             frames.append(self.odom_frame)

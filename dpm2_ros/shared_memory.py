@@ -12,8 +12,8 @@ import re
 import time
 from pathlib import Path
 
-_SEGMENT = re.compile(r"fastrtps_[0-9a-f]{16}")  # not the ports, which Fast DDS itself takes over
-_YOUNG = 60.0  # s; Fast DDS makes a lock file first, and locks it then
+_SEGMENT_NAME = re.compile(r"fastrtps_[0-9a-f]{16}")  # not the ports, which Fast DDS itself takes over
+_MIN_AGE = 60.0  # s; Fast DDS makes a lock file first, and locks it then
 
 
 def free_shared_memory(folder: Path = Path("/dev/shm")) -> None:
@@ -24,10 +24,10 @@ def free_shared_memory(folder: Path = Path("/dev/shm")) -> None:
     """
     for lock in folder.glob("fastrtps_*_el"):
         segment = lock.with_name(lock.name.removesuffix("_el"))
-        if not _SEGMENT.fullmatch(segment.name):
+        if not _SEGMENT_NAME.fullmatch(segment.name):
             continue
         try:
-            if time.time() - lock.stat().st_mtime < _YOUNG:
+            if time.time() - lock.stat().st_mtime < _MIN_AGE:
                 continue
             with lock.open("r+b") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -64,11 +64,11 @@ class Diagnostics:
 
     def _statuses(self) -> list[DiagnosticStatus]:
         out = [self._odometry()]
-        known = self._inputs.calibration
-        for part, camera in zip(("camera", "second camera"), known.cameras, strict=False):
-            out.append(self._beside(part, "image", camera.topic))
-        if known.second_topic:
-            out.append(self._beside("second lidar", "cloud", known.second_topic))
+        calibration = self._inputs.calibration
+        for part, camera in zip(("camera", "second camera"), calibration.cameras, strict=False):
+            out.append(self._sensor_status(part, "image", camera.topic))
+        if calibration.second_topic:
+            out.append(self._sensor_status("second lidar", "cloud", calibration.second_topic))
         if (imu := self._imu()) is not None:
             out.append(imu)
         if self._inputs.gnss is not None:
@@ -108,11 +108,11 @@ class Diagnostics:
         )
 
     def _odometry(self) -> DiagnosticStatus:
-        absence, last = self._absence(), self._health.last
-        if absence is not None or last is None:
-            level, text = absence or (OK, "the first cloud is being processed")
+        no_cloud, last = self._no_cloud(), self._health.last
+        if no_cloud is not None or last is None:
+            level, text = no_cloud or (OK, "the first cloud is being processed")
         else:
-            found = [_tracked(last), *self._beside_tracking(last)]
+            found = [_tracking_condition(last), *self._further_conditions(last)]
             level, text = max(level for level, _ in found), "; ".join(text for _, text in found)
         return self._status("odometry", level, text, self._odometry_figures())
 
@@ -133,10 +133,10 @@ class Diagnostics:
             figures |= {"cloud stamp (s)": stamp, "clock (s)": clock}
         return figures
 
-    def _absence(self) -> tuple[bytes, str] | None:
+    def _no_cloud(self) -> tuple[bytes, str] | None:
         """Level and reason, in words, if no cloud arrives; None if one has arrived recently."""
         topic, last = self._inputs.calibration.points_topic, self._inputs.synchronizer.last_arrival
-        if not (text := _silence("cloud", topic, last)):
+        if not (text := _silence_text("cloud", topic, last)):
             return None
         if problem := self._inputs.problem(topic):
             return ERROR, problem
@@ -144,7 +144,7 @@ class Diagnostics:
             text += f"; point clouds are published on {', '.join(found)}"
         return STALE, text
 
-    def _beside_tracking(self, last: OdometryResult) -> list[tuple[bytes, str]]:
+    def _further_conditions(self, last: OdometryResult) -> list[tuple[bytes, str]]:
         """Further levels and texts, of the last result and of the clouds since the last message."""
         topic, log = self._inputs.calibration.points_topic, self._node.get_logger()
         dropped, lost = self._inputs.synchronizer.dropped, self._inputs.losses.count
@@ -180,9 +180,9 @@ class Diagnostics:
         if abs(now - stamp) <= OTHER_CLOCK * 1e9:
             return ""
         if not self._node.get_parameter("use_sim_time").value:
-            text = f"clouds are stamped {_date(stamp)}, the clock of this machine says {_date(now)}"
+            text = f"clouds are stamped {_date_text(stamp)}, the clock of this machine says {_date_text(now)}"
             return f"{text}: set the sensor's clock, or for a recording use_sim_time and /clock"
-        return f"clouds are stamped {_date(stamp)}, /clock says {_date(now)}"
+        return f"clouds are stamped {_date_text(stamp)}, /clock says {_date_text(now)}"
 
     def _localization(self, mapper: MapperThread) -> DiagnosticStatus:
         located, figures = mapper.active.located, {"keyframes of the map": str(mapper.keyframes)}
@@ -224,7 +224,7 @@ class Diagnostics:
         if not problem and last is not None and last.imu:
             problem = last.imu
             self._node.get_logger().warning(f"{topic}: {problem}; going on without the IMU", once=True)
-        problem = problem or _silence("sample", topic, inputs.imu_last)  # also if no cloud arrives
+        problem = problem or _silence_text("sample", topic, inputs.imu_last)  # also if no cloud arrives
         text = f"{problem}; going on without" if problem else "in use"
         return self._status("imu", WARN if problem else OK, text, {"received": inputs.imu_received})
 
@@ -240,18 +240,18 @@ class Diagnostics:
         """Why no fix arrives, or why the fixes are unusable, in words; else empty."""
         last, clouds, topic = self._inputs.gnss_last, self._inputs.times, self._inputs.calibration.gnss_topic
         stamp, arrival = last or (0, None)
-        if problem := self._inputs.problem(topic) or _silence("fix", topic, arrival):
+        if problem := self._inputs.problem(topic) or _silence_text("fix", topic, arrival):
             return problem
         ahead = (stamp - clouds[0]) * 1e-9 if clouds else 0.0
         return f"stamps of another clock, {ahead:+.0f} s from the clouds'" if abs(ahead) > OTHER_CLOCK + SILENT else ""
 
-    def _beside(self, part: str, what: str, topic: str) -> DiagnosticStatus:
+    def _sensor_status(self, part: str, what: str, topic: str) -> DiagnosticStatus:
         """Status of a sensor other than the LiDAR; `part` is its name, `what` that of its messages."""
         sensor = self._inputs.synchronizer.sensors[topic]
         figures = {"received": sensor.received, "matched": sensor.matched, "late": sensor.late}
-        if unheard := self._inputs.problem(topic):
-            level, text = ERROR, unheard
-        elif silence := _silence(what, topic, sensor.last_arrival):
+        if subscription_problem := self._inputs.problem(topic):
+            level, text = ERROR, subscription_problem
+        elif silence := _silence_text(what, topic, sensor.last_arrival):
             level, text = WARN, silence
         elif problem := self._frames.problems.get(topic):
             level, text = ERROR, problem
@@ -262,7 +262,7 @@ class Diagnostics:
         return self._status(part, level, f"{text}; going on without", figures)
 
 
-def _tracked(last: OdometryResult) -> tuple[bytes, str]:
+def _tracking_condition(last: OdometryResult) -> tuple[bytes, str]:
     """Level of the state, and the state with its reason."""
     level, registration = _LEVEL[last.state], last.registration
     if last.failed:
@@ -270,13 +270,13 @@ def _tracked(last: OdometryResult) -> tuple[bytes, str]:
     return level, f"{last.state}: {registration.reason}" if registration.reason else str(last.state)
 
 
-def _date(stamp: int) -> str:
+def _date_text(stamp: int) -> str:
     """A stamp in ns as text."""
     date = datetime.fromtimestamp(stamp // 10**9, UTC)
     return f"{stamp * 1e-9:.3f} s ({date:%Y-%m-%d %H:%M:%S} UTC)"
 
 
-def _silence(what: str, topic: str, last_arrival: float | None) -> str:
+def _silence_text(what: str, topic: str, last_arrival: float | None) -> str:
     """Text if no message has arrived on a topic recently; else empty. `what`: the kind of its messages, in one word."""
     if last_arrival is None:
         return f"no {what} on {topic} yet"

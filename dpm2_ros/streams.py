@@ -11,13 +11,13 @@ from dpm2_core.estimates import Keyframe
 
 AHEAD = 64
 """Keyframes that may wait for an earlier one; those beyond are sent again."""
-_MOST_WAITING = 1000  # ids in one acknowledgment
-_HALVES = 64  # incomplete keyframes that may wait; those beyond are also sent again
-_STUCK = 6.0  # s in which a robot sends a keyframe four times
-_TIMES = 3
+_MAX_ACK_IDS = 1000  # ids in one acknowledgment
+_MAX_INCOMPLETE = 64  # incomplete keyframes that may wait; those beyond are also sent again
+_GIVE_UP_TIME = 6.0  # s in which a robot sends a keyframe four times
+_MIN_REJECTIONS = 3
 Parts = dict[str, Any]
 """The received parts of a keyframe, each checked: `pose`, `cloud` (a `Payload`), `seen` (its descriptors, or None)."""
-_WHOLE = 3
+_PART_COUNT = 3
 
 
 class Stream:
@@ -42,9 +42,9 @@ class Stream:
         self.last: Keyframe | None = None
         self.odom_frame = ""
         self._parts: OrderedDict[int, Parts] = OrderedDict()
-        self._above: dict[int, tuple[int, Parts]] = {}  # complete keyframes and ids, by id or counted from `next`
-        self._given: deque[tuple[int, int]] = deque()  # ids that were passed on, and the mapper's numbers for them
-        self._bad: tuple[float, int] | None = None  # since when, and how often, messages of `next` were rejected
+        self._complete: dict[int, tuple[int, Parts]] = {}  # complete keyframes and ids, by id or counted from `next`
+        self._passed_on: deque[tuple[int, int]] = deque()  # ids that were passed on, and the mapper's numbers for them
+        self._rejections: tuple[float, int] | None = None  # since when, and how often, messages of `next` were rejected
 
     def arrived(self, written: int, missing: Container[int] = ()) -> tuple[int, list[int]]:
         """Ids that have arrived: all below a number, which are in the map file, and some above, which wait in memory.
@@ -52,24 +52,24 @@ class Stream:
         Args:
             written: all of the mapper's numbers below this are in its file, except those in `missing`.
         """
-        while self._given and (number := self._given[0][1]) < written and number not in missing:
-            self._given.popleft()
-        below = self._given[0][0] if self._given else self.next
-        return below, [*range(below, self.next), *sorted(self._above)][:_MOST_WAITING]
+        while self._passed_on and (number := self._passed_on[0][1]) < written and number not in missing:
+            self._passed_on.popleft()
+        below = self._passed_on[0][0] if self._passed_on else self.next
+        return below, [*range(below, self.next), *sorted(self._complete)][:_MAX_ACK_IDS]
 
     @property
     def holds(self) -> int:
         """Size of the messages that wait, bytes."""
-        return sum(map(_size, [*self._parts.values(), *(parts for _, parts in self._above.values())]))
+        return sum(map(_size, [*self._parts.values(), *(parts for _, parts in self._complete.values())]))
 
     @property
     def ready(self) -> bool:
         """Whether the next keyframe is complete."""
-        return self.next in self._above
+        return self.next in self._complete
 
     def wants(self, id: int, part: str) -> bool:
         """Whether a part (pose, cloud or seen) of a keyframe is still missing."""
-        if self.session and (not self.next <= id < self.next + AHEAD or id in self._above):
+        if self.session and (not self.next <= id < self.next + AHEAD or id in self._complete):
             return False
         return part not in self._parts.get(id, ())
 
@@ -77,13 +77,13 @@ class Stream:
         """Add a valid part; returns whether its keyframe is complete now."""
         parts = self._parts.setdefault(id, {})
         parts[part] = value
-        if len(parts) < _WHOLE:
-            while len(self._parts) > _HALVES:
+        if len(parts) < _PART_COUNT:
+            while len(self._parts) > _MAX_INCOMPLETE:
                 self._parts.popitem(last=False)
             return False
         del self._parts[id]
-        self._above[id if self.session else self.next + len(self._above)] = id, parts
-        if len(self._above) > AHEAD:  # only without a session
+        self._complete[id if self.session else self.next + len(self._complete)] = id, parts
+        if len(self._complete) > AHEAD:  # only without a session
             self.take()
         return True
 
@@ -91,32 +91,37 @@ class Stream:
         """Remove and return the next keyframe, if it is complete."""
         if not self.ready:
             return None
-        self.next, self._bad = self.next + 1, None
-        return self._above.pop(self.next - 1)
+        self.next, self._rejections = self.next + 1, None
+        return self._complete.pop(self.next - 1)
 
     def given(self, id: int, number: int) -> None:
         """Note that a keyframe was passed to the mapper, which gave it that number."""
         if self.session:
-            self._given.append((id, number))
+            self._passed_on.append((id, number))
 
     def reject(self, id: int, now: float) -> None:
         """Note that a message of a keyframe was invalid."""
         if self.session and id == self.next:
-            since, times = self._bad or (now, 0)
-            self._bad = since, times + 1
+            since, count = self._rejections or (now, 0)
+            self._rejections = since, count + 1
 
     def give_up(self, now: float) -> int | None:
         """Skip the next keyframe and return its id, if it was received repeatedly and never valid; else None."""
-        if self._bad is None or not self._above or now - self._bad[0] < _STUCK or self._bad[1] < _TIMES:
+        if (
+            self._rejections is None
+            or not self._complete
+            or now - self._rejections[0] < _GIVE_UP_TIME
+            or self._rejections[1] < _MIN_REJECTIONS
+        ):
             return None
-        self._bad, self.next = None, self.next + 1
+        self._rejections, self.next = None, self.next + 1
         self._parts.pop(self.next - 1, None)
         return self.next - 1
 
     def drop(self) -> None:
         """Discard the messages that wait: they are sent again."""
         self._parts.clear()
-        self._above.clear()
+        self._complete.clear()
 
     def replaced(self) -> None:
         """Another drive has replaced it. If it sends messages again, its robot is decided anew."""

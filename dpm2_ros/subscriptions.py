@@ -63,8 +63,8 @@ class Inputs:
             UsageError: a second sensor with the topic of the first.
         """
         self._node, self._ros = node, ros
-        given = _with_defaults(settings)
-        self.calibration = known or _named(node, given)
+        unresolved = _with_defaults(settings)
+        self.calibration = known or _make_calibration(node, unresolved)
         self.imu = ImuBuffer() if settings.imu else None
         self.imu_received = 0
         self.imu_last: float | None = None
@@ -72,49 +72,49 @@ class Inputs:
         self.gnss_last: tuple[int, float] | None = None
         self._image_shift = round(settings.image_time_offset * 1e9)
         self._arrived = threading.Condition()
-        beside = [camera.topic for camera in self.calibration.cameras]
-        beside += filter(None, [self.calibration.second_topic])
-        self.synchronizer = Synchronizer(beside, ros.queue_depth, ros.sync_timeout, settings.image_tolerance)
+        topics = [camera.topic for camera in self.calibration.cameras]
+        topics += filter(None, [self.calibration.second_topic])
+        self.synchronizer = Synchronizer(topics, ros.queue_depth, ros.sync_timeout, settings.image_tolerance)
         self.losses = Losses()
         """Clouds that were sent and never arrived."""
-        self._frame: str | None = None  # of the clouds
-        self._times: deque[tuple[int, int]] = deque(maxlen=5)
-        others = self._others(given)
+        self._cloud_frame: str | None = None  # of the clouds
+        self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=5)
+        others = self._subscribe_others(unresolved)
         self._static_topic, self._static_messages = node.resolve_topic_name(naming.TF_STATIC), 0
         if TFMessage is not None:  # else extrinsics come from parameters only
             node.create_subscription(TFMessage, naming.TF_STATIC, self._on_static, LATCHED)
         self._correction_topic = node.resolve_topic_name(naming.VERTICAL_ANGLE_CORRECTION)
         node.create_subscription(Float64, naming.VERTICAL_ANGLE_CORRECTION, self._on_correction, LATCHED)
         # Announced last: a publisher that waits for this subscription has found the others by then.
-        self.subscriptions = [self._subscribed(PointCloud2, given.points_topic, self._on_cloud), *others]
+        self.subscriptions = [self._subscribe(PointCloud2, unresolved.points_topic, self._on_cloud), *others]
         node.create_timer(0.1, self._refresh)
 
-    def _others(self, given: InputSettings) -> list[MatchedSubscription]:
-        """The subscriptions to all topics but that of the clouds; `given` has their names before remapping."""
+    def _subscribe_others(self, unresolved: InputSettings) -> list[MatchedSubscription]:
+        """The subscriptions to all topics but that of the clouds; `unresolved` has their names before remapping."""
         known, out = self.calibration, list[MatchedSubscription]()
         if known.camera is not None:
-            out += self._images(known.camera, given.image_topic, given.camera_info_topic)
+            out += self._subscribe_images(known.camera, unresolved.image_topic, unresolved.camera_info_topic)
         if known.second_camera is not None:
-            out += self._images(known.second_camera, given.second_image_topic, "")
-        if given.second_points_topic:
-            out.append(self._subscribed(PointCloud2, given.second_points_topic, self._on_second))
-        if given.imu:
-            out.append(self._subscribed(Imu, given.imu_topic, self._on_imu))
-        if given.gnss_topic:
-            out.append(self._subscribed(NavSatFix, given.gnss_topic, self._on_fix))
+            out += self._subscribe_images(known.second_camera, unresolved.second_image_topic, "")
+        if unresolved.second_points_topic:
+            out.append(self._subscribe(PointCloud2, unresolved.second_points_topic, self._on_second_cloud))
+        if unresolved.imu:
+            out.append(self._subscribe(Imu, unresolved.imu_topic, self._on_imu))
+        if unresolved.gnss_topic:
+            out.append(self._subscribe(NavSatFix, unresolved.gnss_topic, self._on_fix))
         return out
 
-    def _images(self, camera: CameraTopic, topic: str, info_topic: str) -> list[MatchedSubscription]:
+    def _subscribe_images(self, camera: CameraTopic, topic: str, info_topic: str) -> list[MatchedSubscription]:
         """The subscriptions to a camera's images and CameraInfo."""
         kind = CompressedImage if camera.topic.endswith("/compressed") else Image
         return [
-            self._subscribed(kind, topic, partial(self._on_image, camera)),
-            self._subscribed(
-                CameraInfo, info_topic or _camera_info_beside(self._node, topic), partial(self._on_camera_info, camera)
+            self._subscribe(kind, topic, partial(self._on_image, camera)),
+            self._subscribe(
+                CameraInfo, info_topic or _camera_info_topic(self._node, topic), partial(self._on_camera_info, camera)
             ),
         ]
 
-    def _subscribed(self, kind: type, topic: str, callback: Callable[..., None]) -> MatchedSubscription:
+    def _subscribe(self, kind: type, topic: str, callback: Callable[..., None]) -> MatchedSubscription:
         return MatchedSubscription(self._node, kind, topic, callback, self._ros)
 
     def take(self, timeout: float) -> Bundle | None:
@@ -146,7 +146,7 @@ class Inputs:
 
         Of the last five the pair with the median difference: /clock and clouds may arrive in another order.
         """
-        times = sorted(self._times, key=lambda pair: pair[1] - pair[0])
+        times = sorted(self._clock_pairs, key=lambda pair: pair[1] - pair[0])
         return times[len(times) // 2] if len(times) >= 3 else None
 
     def candidates(self) -> list[str]:
@@ -160,7 +160,7 @@ class Inputs:
             if set(CLOUDS).intersection(kinds) and topic not in own and self._node.count_publishers(topic)
         )
 
-    def _of_the_drive(self, message: PointCloud2 | bytes) -> PointCloud2:
+    def _check_cloud(self, message: PointCloud2 | bytes) -> PointCloud2:
         """The cloud, if it is of this drive. An unreadable one is accepted, as a failed scan, if a cloud was due.
 
         Raises:
@@ -168,27 +168,31 @@ class Inputs:
         """
         cloud, problem = checked_cloud(message)
         now, frame, last = time.monotonic(), cloud.header.frame_id, self.synchronizer.last_arrival
-        if self._frame not in (None, frame) and last is not None and now - last < OTHER_FRAME:
-            raise RejectedError("another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._frame!r}")
-        if problem and not (frame == self._frame and self.synchronizer.due(stamp_ns(cloud.header), now, self._clock)):
+        if self._cloud_frame not in (None, frame) and last is not None and now - last < OTHER_FRAME:
+            raise RejectedError(
+                "another frame", f"a cloud in frame {frame[:80]!r}; the drive's is {self._cloud_frame!r}"
+            )
+        if problem and not (
+            frame == self._cloud_frame and self.synchronizer.due(stamp_ns(cloud.header), now, self._clock)
+        ):
             raise RejectedError("unreadable", problem)
-        self._frame = frame
+        self._cloud_frame = frame
         return cloud
 
     def _on_cloud(self, message: PointCloud2 | bytes, info: Mapping[str, Any]) -> None:
         cloud, *others = self.subscriptions
-        self._take_clock()
+        self._process_clock()
         for other in reversed(others):  # messages sent before the cloud are added before it; calibration first
             other.take()
         # With several publishers, each has its own numbers.
         number = info.get("publication_sequence_number") if self._node.count_publishers(cloud.topic) < 2 else None
         try:
-            message = self._of_the_drive(message)
+            message = self._check_cloud(message)
         except UsageError:
             self.losses.skip(number)
             raise
-        if stamped := stamp_ns(message.header):
-            self._times.append((stamped, self._node.get_clock().now().nanoseconds))
+        if header_stamp := stamp_ns(message.header):
+            self._clock_pairs.append((header_stamp, self._node.get_clock().now().nanoseconds))
         stamp = self._stamp(message)
         for topic, sensor in self.synchronizer.sensors.items():  # without the lock, for which the worker would wait
             sensor.present = bool(self._node.count_publishers(topic))
@@ -200,13 +204,13 @@ class Inputs:
             self._node.get_logger().warning(
                 f"{lost} clouds before that at {stamp / 1e9:.3f} s were lost on the way", throttle_duration_sec=5
             )
-        said = f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}"
+        text = f"cloud at {stamp_ns(message.header) / 1e9:.3f} s: {check}"
         if check is StampCheck.SET_BACK:  # not throttled: it follows the warnings on clouds out of order
-            self._node.get_logger().warning(said)
+            self._node.get_logger().warning(text)
         elif check is not StampCheck.ACCEPTED:
-            self._node.get_logger().warning(said, throttle_duration_sec=5)
+            self._node.get_logger().warning(text, throttle_duration_sec=5)
 
-    def _take_clock(self) -> None:
+    def _process_clock(self) -> None:
         """Process the /clock messages that have arrived: in lockstep, the last one has the time of the cloud."""
         if self._node.get_clock().ros_time_is_active:
             for subscription in list(self._node.subscriptions):
@@ -220,7 +224,7 @@ class Inputs:
         self.calibration.check_sensor(camera.topic, message.header.frame_id, stamp)
         self._add(camera.topic, stamp + self._image_shift, message)
 
-    def _on_second(self, message: PointCloud2 | bytes) -> None:
+    def _on_second_cloud(self, message: PointCloud2 | bytes) -> None:
         cloud, problem = checked_cloud(message)
         if problem:
             raise RejectedError("unreadable", problem)
@@ -261,7 +265,7 @@ class Inputs:
     def _on_camera_info(self, camera: CameraTopic, message: CameraInfo) -> None:
         check_header(message.header)
         info = info_of(camera.topic, message)
-        if _usable(camera.info):
+        if _is_usable(camera.info):
             decode_camera(info, np.eye(4), "camera")  # raises if it is invalid: the known one stays
             frame, known, images = info.header.frame_id, camera.info.header.frame_id, self.calibration.frame_of(camera)
             if images and frame_name(frame) not in (images, frame_name(known)):
@@ -289,31 +293,31 @@ class Inputs:
 
 def _with_defaults(settings: InputSettings) -> InputSettings:
     """The settings, with the default topic for each one that is empty."""
-    usual = {"points_topic": naming.POINTS, "image_topic": naming.IMAGE, "imu_topic": naming.IMU.lstrip("/")}
-    return settings.model_copy(update={key: getattr(settings, key) or topic for key, topic in usual.items()})
+    defaults = {"points_topic": naming.POINTS, "image_topic": naming.IMAGE, "imu_topic": naming.IMU.lstrip("/")}
+    return settings.model_copy(update={key: getattr(settings, key) or topic for key, topic in defaults.items()})
 
 
-def _named(node: Node, given: InputSettings) -> Calibration:
+def _make_calibration(node: Node, unresolved: InputSettings) -> Calibration:
     """A calibration with the full names of the topics, after remapping; it contains no values yet."""
-    known = Calibration(node.resolve_topic_name(given.points_topic))
-    if given.second_points_topic:
-        known.second_topic = node.resolve_topic_name(given.second_points_topic)
+    known = Calibration(node.resolve_topic_name(unresolved.points_topic))
+    if unresolved.second_points_topic:
+        known.second_topic = node.resolve_topic_name(unresolved.second_points_topic)
         if known.second_topic == known.points_topic:
             raise UsageError(f"input.second_points_topic: {known.points_topic} is that of the first LiDAR")
-    if given.imu:
-        known.imu_topic = node.resolve_topic_name(given.imu_topic)
-    if given.gnss_topic:
-        known.gnss_topic = node.resolve_topic_name(given.gnss_topic)
-    if given.images:
-        known.camera = CameraTopic(node.resolve_topic_name(given.image_topic))
-    if given.images and given.second_image_topic:
-        known.second_camera = CameraTopic(node.resolve_topic_name(given.second_image_topic))
+    if unresolved.imu:
+        known.imu_topic = node.resolve_topic_name(unresolved.imu_topic)
+    if unresolved.gnss_topic:
+        known.gnss_topic = node.resolve_topic_name(unresolved.gnss_topic)
+    if unresolved.images:
+        known.camera = CameraTopic(node.resolve_topic_name(unresolved.image_topic))
+    if unresolved.images and unresolved.second_image_topic:
+        known.second_camera = CameraTopic(node.resolve_topic_name(unresolved.second_image_topic))
         if known.second_camera.topic == known.cameras[0].topic:
             raise UsageError(f"input.second_image_topic: {known.second_camera.topic} is that of the first camera")
     return known
 
 
-def _usable(info: Any) -> bool:
+def _is_usable(info: Any) -> bool:
     """Whether it is a usable CameraInfo."""
     if info is None:
         return False
@@ -324,9 +328,9 @@ def _usable(info: Any) -> bool:
     return True
 
 
-def _camera_info_beside(node: Node, image_topic: str) -> str:
+def _camera_info_topic(node: Node, image_topic: str) -> str:
     """The camera_info topic next to that of the images after remapping, unless it has its own remapping."""
-    usual = info_topic_beside(image_topic)
-    if node.resolve_topic_name(usual) != node.resolve_topic_name(usual, only_expand=True):
-        return usual
+    default = info_topic_beside(image_topic)
+    if node.resolve_topic_name(default) != node.resolve_topic_name(default, only_expand=True):
+        return default
     return info_topic_beside(node.resolve_topic_name(image_topic))

@@ -121,8 +121,8 @@ class Synchronizer:
         self.last_arrival: float | None = None
         self._timeout = timeout
         self._queue: deque[Bundle] = deque()
-        self._depth = self._room = depth  # limit of the queue in general, and at present
-        self._moves = False  # whether a cloud was released since the last drop: the worker is slow, but not blocked
+        self._depth = self._current_depth = depth  # limit of the queue in general, and at present
+        self._released_since_drop = False  # if a cloud was: the worker is slow, but not blocked
         self._newest: Bundle | None = None  # the last accepted cloud
         self._period = JUMP  # ns, between the last two accepted clouds
         self._jumped: Bundle | None = None
@@ -147,7 +147,7 @@ class Synchronizer:
         self.last_arrival = now
         bundle = Bundle(stamp, cloud, now, clock, restarted=False)
         if self._jumped is not None and self._newest is not None:
-            self._settle(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp), bundle)
+            self._decide_jump(abs(stamp - self._jumped.stamp) < abs(stamp - self._newest.stamp), bundle)
         check = self._check(bundle)
         if check is StampCheck.JUMPED:
             self._jumped = bundle
@@ -155,8 +155,8 @@ class Synchronizer:
         self.counts[check] += 1
         late = list[Bundle]()
         if check is StampCheck.ACCEPTED:
-            before = self._set_back.end()
-            late = before if before and self._came_in_time(before[0], bundle) else []
+            earlier = self._set_back.end()
+            late = earlier if earlier and self._was_set_back(earlier[0], bundle) else []
         elif check is StampCheck.OUT_OF_ORDER:
             late = self._set_back.add(stamp, bundle)
         self.counts[StampCheck.OUT_OF_ORDER] -= len(late)
@@ -165,26 +165,26 @@ class Synchronizer:
             self._accept(one)
         return StampCheck.SET_BACK if late else check
 
-    def _came_in_time(self, late: Bundle, bundle: Bundle) -> bool:
+    def _was_set_back(self, late: Bundle, bundle: Bundle) -> bool:
         """Whether the sensor's clock was set back. Then the clouds from the out-of-order `late` to `bundle` arrived at
         the pace of their stamps, and since the last cloud in order more time has passed than the stamps show. Clouds
         that were delayed on the way do not arrive like this."""
-        return self._on_pace(bundle, late) and self._ahead(bundle, self._newest) < -self._period / 2
+        return self._is_on_pace(bundle, late) and self._stamp_lead(bundle, self._newest) < -self._period / 2
 
-    def _came_at_once(self, bundle: Bundle, following: Bundle | None) -> bool:
+    def _was_set_forward(self, bundle: Bundle, following: Bundle | None) -> bool:
         """Whether the sensor's clock was set forward before this cloud. Then it arrived one period after the last, and
         the `following` one at the pace of the stamps; if clouds were lost or delayed, one of the two is false. If none
         follows, as in lockstep, only /clock can show it."""
         last = self._newest
         if last is None or bundle.stamp < last.stamp:
             return False
-        passed = bundle.clock - last.clock if last.clock else bundle.arrival - last.arrival
-        told = bool(last.clock) if following is None else self._on_pace(following, bundle)
-        return told and is_due(passed * 1e9, self._period)
+        elapsed = bundle.clock - last.clock if last.clock else bundle.arrival - last.arrival
+        is_known = bool(last.clock) if following is None else self._is_on_pace(following, bundle)
+        return is_known and is_due(elapsed * 1e9, self._period)
 
-    def _on_pace(self, bundle: Bundle, last: Bundle) -> bool:
+    def _is_on_pace(self, bundle: Bundle, last: Bundle) -> bool:
         """Whether the stamps have advanced since that cloud by as much as the time."""
-        return abs(self._ahead(bundle, last)) < self._period / 3
+        return abs(self._stamp_lead(bundle, last)) < self._period / 3
 
     def due(self, stamp: int, now: float, clock: float = 0.0) -> bool:
         """Whether a cloud of that stamp (ns) would be accepted as the next one of the drive."""
@@ -209,15 +209,15 @@ class Synchronizer:
     def pop(self, now: float) -> Bundle | None:
         """The next cloud that has its messages or has waited long enough; None if there is none yet."""
         if self._jumped is not None and now >= self._jumped.arrival + HOLD:
-            self._settle(true=True)
-        ready = self._ready(now)
+            self._decide_jump(is_valid=True)
+        ready = self._pop_ready(now)
         if ready is None:  # the consumer keeps up
-            self._room = self._depth
+            self._current_depth = self._depth
         else:
-            self.left, self._moves = ready, True
+            self.left, self._released_since_drop = ready, True
         return ready
 
-    def _ready(self, now: float) -> Bundle | None:
+    def _pop_ready(self, now: float) -> Bundle | None:
         """Take the next cloud from the queue, if it need not wait."""
         if not self._queue:
             return None
@@ -246,35 +246,35 @@ class Synchronizer:
         if self._newest is None:
             return StampCheck.ACCEPTED
         step = bundle.stamp - self._newest.stamp
-        if step < -JUMP or self._ahead(bundle, self._newest) > min(AHEAD * self._period, JUMP):
+        if step < -JUMP or self._stamp_lead(bundle, self._newest) > min(AHEAD * self._period, JUMP):
             return StampCheck.JUMPED
         if step > 0:
             return StampCheck.ACCEPTED
         return StampCheck.OUT_OF_ORDER if step else StampCheck.REPEATED
 
     @staticmethod
-    def _ahead(bundle: Bundle, last: Bundle | None) -> float:
+    def _stamp_lead(bundle: Bundle, last: Bundle | None) -> float:
         """By how much more (ns) the stamps have advanced since that cloud than the time.
 
         In a recording that is played faster, more time passes than for the receiver; /clock shows how much.
         """
         if last is None:
             return 0.0
-        passed = max(bundle.arrival - last.arrival, bundle.clock - last.clock if last.clock else 0.0)
-        return bundle.stamp - last.stamp - passed * 1e9
+        elapsed = max(bundle.arrival - last.arrival, bundle.clock - last.clock if last.clock else 0.0)
+        return bundle.stamp - last.stamp - elapsed * 1e9
 
-    def _settle(self, true: bool, following: Bundle | None = None) -> None:
+    def _decide_jump(self, is_valid: bool, following: Bundle | None = None) -> None:
         """Accept or reject the cloud whose stamp jumped; `following`: the next one, if it has arrived."""
         bundle, self._jumped = self._jumped, None
         if bundle is None or self._newest is None:
             return
-        bundle.restarted = true and bundle.stamp < self._newest.stamp
-        ahead = self._ahead(bundle, self._newest)
-        bundle.stepped = true and (ahead > JUMP or self._came_at_once(bundle, following))
+        bundle.restarted = is_valid and bundle.stamp < self._newest.stamp
+        lead = self._stamp_lead(bundle, self._newest)
+        bundle.stepped = is_valid and (lead > JUMP or self._was_set_forward(bundle, following))
         self.counts[
-            StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if true else StampCheck.STRAY
+            StampCheck.RESTARTED if bundle.restarted else StampCheck.ACCEPTED if is_valid else StampCheck.STRAY
         ] += 1
-        if true:
+        if is_valid:
             self._accept(bundle)
 
     def _accept(self, bundle: Bundle) -> None:
@@ -282,9 +282,9 @@ class Synchronizer:
             self._period = bundle.stamp - self._newest.stamp
         self._newest = bundle
         self._queue.append(bundle)
-        if len(self._queue) > self._room and self._moves:
-            self._room, self._moves = max(self._room - 1, min(FEW, self._depth)), False
-        while len(self._queue) > self._room:
+        if len(self._queue) > self._current_depth and self._released_since_drop:
+            self._current_depth, self._released_since_drop = max(self._current_depth - 1, min(FEW, self._depth)), False
+        while len(self._queue) > self._current_depth:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # kept, although the cloud that had it is dropped
             self._queue[0].stepped |= oldest.stepped

@@ -12,5 +12,5 @@ TFMessage: Any = None
 with suppress(ImportError):
     from tf2_msgs.msg import TFMessage as TFMessage  # type: ignore[no-redef]
 
-MOST_TRANSFORMS = 500
+MAX_TRANSFORMS = 500
 """Largest number of transforms in a message that is read."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from dpm2_core.errors import exit_code
 from dpm2_ros.runtime import end_ros, ros_context
 
-_OF_RCLPY = ("/parameter_events", "/rosout", "/clock")
+_RCLPY_TOPICS = ("/parameter_events", "/rosout", "/clock")
 _HEAD = """# Topics and services
 
 <!-- Written by `make topics` from running nodes; a test keeps it up to date. -->
@@ -37,11 +37,11 @@ def endpoints(node: Any) -> Iterator[Endpoint]:
     """Publishers, then subscriptions, then services of a node, each kind by name."""
     for role, found in (("publishes", node.publishers), ("subscribes", node.subscriptions)):
         for one in sorted(found, key=lambda one: str(one.topic_name)):
-            if one.topic_name not in _OF_RCLPY:
-                yield Endpoint(one.topic_name, _type(one.msg_type), role, _qos(one.qos_profile))
+            if one.topic_name not in _RCLPY_TOPICS:
+                yield Endpoint(one.topic_name, _type_name(one.msg_type), role, _qos(one.qos_profile))
     for service in sorted(node.services, key=lambda service: str(service.srv_name)):
         if service.srv_type.__module__.split(".")[0] not in ("rcl_interfaces", "type_description_interfaces"):
-            yield Endpoint(service.srv_name, _type(service.srv_type), "serves", "")
+            yield Endpoint(service.srv_name, _type_name(service.srv_type), "serves", "")
 
 
 def describe() -> dict[str, list[Endpoint]]:
@@ -84,7 +84,7 @@ def main() -> int:
     return exit_code(work)
 
 
-def _type(kind: Any) -> str:
+def _type_name(kind: Any) -> str:
     return f"{kind.__module__.split('.')[0]}/{kind.__name__}"
 
 

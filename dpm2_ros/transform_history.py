@@ -22,10 +22,10 @@ from dpm2_ros.checks import checked_pose
 
 GAP = 500_000_000
 """ns: no pose is interpolated between samples that are farther apart."""
-_KEPT = 20_000_000_000  # ns
-_MOST_SAMPLES = 4000  # of a frame
-_MOST_FRAMES = 200
-_DEEPEST = 20  # parents in a chain of frames
+_MAX_HISTORY = 20_000_000_000  # ns
+_MAX_SAMPLES = 4000  # of a frame
+_MAX_FRAMES = 200
+_MAX_DEPTH = 20  # parents in a chain of frames
 
 
 @dataclass(eq=False)
@@ -49,10 +49,10 @@ class _Track:
             self.samples.clear()
         self.stamps += [at for at, _ in new]
         self.samples += [sample for _, sample in new]
-        old = bisect_left(self.stamps, stamp - _KEPT)
-        if old > 100 or len(self.stamps) > _MOST_SAMPLES:  # now and then: it moves the whole list
-            old = max(old, len(self.stamps) - _MOST_SAMPLES // 2)
-            del self.stamps[:old], self.samples[:old]
+        n_old = bisect_left(self.stamps, stamp - _MAX_HISTORY)
+        if n_old > 100 or len(self.stamps) > _MAX_SAMPLES:  # now and then: it moves the whole list
+            n_old = max(n_old, len(self.stamps) - _MAX_SAMPLES // 2)
+            del self.stamps[:n_old], self.samples[:n_old]
 
     def at(self, stamp: int, child: str) -> tuple[Array, Array | None]:
         """(4, 4), and the covariance (6, 6) of the nearest sample.
@@ -65,16 +65,16 @@ class _Track:
             return _matrix(self.samples[after][0], child), self.samples[after][1]
         link = f"{self.parent} -> {child}"
         if after in (0, len(self.stamps)):
-            begins, nearest = after == 0, self.stamps[-1 if after else 0]
-            seconds, side = abs(stamp - nearest) * 1e-9, "after" if begins else "before"
-            raise UsageError(f"{link} {'begins' if begins else 'ends'} {seconds:.2f} s {side} the cloud")
+            is_before_start, nearest = after == 0, self.stamps[-1 if after else 0]
+            seconds, side = abs(stamp - nearest) * 1e-9, "after" if is_before_start else "before"
+            raise UsageError(f"{link} {'begins' if is_before_start else 'ends'} {seconds:.2f} s {side} the cloud")
         begin, end = self.stamps[after - 1], self.stamps[after]
         if end - begin > GAP:
             raise UsageError(f"{link} has a gap of {(end - begin) * 1e-9:.2f} s")
-        (pose, before), (later, then) = self.samples[after - 1 : after + 1]
-        part = (stamp - begin) / (end - begin)
-        T = se3.interpolated(_matrix(pose, child), _matrix(later, child), part)
-        return T, before if part < 0.5 else then
+        (pose_before, covariance_before), (pose_after, covariance_after) = self.samples[after - 1 : after + 1]
+        fraction = (stamp - begin) / (end - begin)
+        T = se3.interpolated(_matrix(pose_before, child), _matrix(pose_after, child), fraction)
+        return T, covariance_before if fraction < 0.5 else covariance_after
 
 
 class TransformHistory:
@@ -94,8 +94,8 @@ class TransformHistory:
             RejectedError: there are too many frames.
         """
         track = self._tracks.get(child)
-        if track is None and len(self._tracks) >= _MOST_FRAMES:
-            raise RejectedError("frame", f"more than {_MOST_FRAMES} moving frames")
+        if track is None and len(self._tracks) >= _MAX_FRAMES:
+            raise RejectedError("frame", f"more than {_MAX_FRAMES} moving frames")
         if track is None or track.parent != parent:
             track = self._tracks[child] = _Track(parent)
         track.add(stamp, pose, covariance)
@@ -110,14 +110,14 @@ class TransformHistory:
             UsageError: why it is not known, in words.
         """
         T, covariance, frame = np.eye(4), None, source
-        for _ in range(_DEEPEST):
+        for _ in range(_MAX_DEPTH):
             if frame == target:
                 return T, covariance
             if (track := self._tracks.get(frame)) is not None:
                 T_parent, covariance = track.at(stamp, frame)
                 frame, T = track.parent, T_parent @ T
-            elif (up := static.parent(frame)) is not None:
-                frame, T = up[0], up[1] @ T
+            elif (static_link := static.parent(frame)) is not None:
+                frame, T = static_link[0], static_link[1] @ T
             else:
                 break
         raise UsageError(f"no transform from {source!r} to {target!r}: {frame!r} has no parent")

@@ -17,7 +17,7 @@ _SUFFIX = ".unsent"
 _TABLES = """
 CREATE TABLE keyframe (id INTEGER PRIMARY KEY, pose BLOB NOT NULL, descriptors BLOB NOT NULL, cloud BLOB NOT NULL)
 """
-_LARGEST = 200_000  # bytes of a message: twice what a keyframe may have
+_MAX_MESSAGE_SIZE = 200_000  # bytes of a message: twice what a keyframe may have
 
 
 class KeyframeFile:
@@ -38,18 +38,18 @@ class KeyframeFile:
         """`path`: created if it does not exist; None: nothing is to outlive the process."""
         self.path = path
         self.stored, self.problem = 0, ""
-        self._others: list[list[int]] = []  # keyframes after those: their numbers in `_spill`
+        self._spilled: list[list[int]] = []  # keyframes after those: their numbers in `_spill`
         self._spill = SpillFile()
         self._connection: Connection | None = None
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._connection, self.stored = _opened(path, "rwc")
+            self._connection, self.stored = _open(path, "rwc")
 
-    def _connected(self) -> Connection:
+    def _connect(self) -> Connection:
         """The connection to the file, which is opened again if necessary."""
         if self._connection is None:
             assert self.path is not None
-            connection, stored = _opened(self.path, "rw")
+            connection, stored = _open(self.path, "rw")
             if stored != self.stored:
                 connection.close()
                 raise sqlite3.DatabaseError(f"{stored} keyframes, {self.stored} before: another process has written")
@@ -57,22 +57,22 @@ class KeyframeFile:
         return self._connection
 
     def __len__(self) -> int:
-        return self.stored + len(self._others)
+        return self.stored + len(self._spilled)
 
     def append(self, parts: Sequence[bytes]) -> None:
         """Add the next keyframe: its pose, its descriptors, its cloud, each serialized."""
         if not self.catch_up(parts):
-            self._others.append([self._spill.append(part) for part in parts])
+            self._spilled.append([self._spill.append(part) for part in parts])
 
     def catch_up(self, parts: Sequence[bytes] | None = None) -> bool:
         """Write the keyframes of the `SpillFile`, then `parts`; returns whether all are in the file. See `problem`."""
         if self.path is None:
             return False
         try:
-            while self._others:  # in order: a file has no gap
-                self._insert([self._spill.read(number) for number in self._others[0]])
-                del self._others[0]
-                if not self._others:
+            while self._spilled:  # in order: a file has no gap
+                self._insert([self._spill.read(number) for number in self._spilled[0]])
+                del self._spilled[0]
+                if not self._spilled:
                     self._spill = SpillFile()
             if parts is not None:
                 self._insert(parts)
@@ -82,7 +82,7 @@ class KeyframeFile:
         return not self.problem
 
     def _insert(self, parts: Sequence[bytes]) -> None:
-        self._connected().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
+        self._connect().execute("INSERT INTO keyframe VALUES (?, ?, ?, ?)", (self.stored, *parts))
         self.stored += 1
 
     def read(self, id: int) -> list[bytes]:
@@ -92,9 +92,9 @@ class KeyframeFile:
             sqlite3.DatabaseError: it is damaged.
         """
         if id >= self.stored:
-            return [self._spill.read(number) for number in self._others[id - self.stored]]
+            return [self._spill.read(number) for number in self._spilled[id - self.stored]]
         query = "SELECT pose, descriptors, cloud FROM keyframe WHERE id = ?"
-        parts: tuple[object, ...] | None = self._connected().execute(query, (id,)).fetchone()
+        parts: tuple[object, ...] | None = self._connect().execute(query, (id,)).fetchone()
         found = [part for part in parts or () if isinstance(part, bytes)]
         if len(found) != 3:
             raise sqlite3.DatabaseError(f"keyframe {id} is damaged")
@@ -117,7 +117,7 @@ class KeyframeFile:
                 self.path.parent.rmdir()
 
 
-def _opened(path: Path, mode: str) -> tuple[Connection, int]:
+def _open(path: Path, mode: str) -> tuple[Connection, int]:
     """The opened file, and the number of keyframes in it; `mode`: see `connect`.
 
     Raises:
@@ -136,7 +136,7 @@ def _opened(path: Path, mode: str) -> tuple[Connection, int]:
         check_schema(connection, statements(_TABLES))
         query = "SELECT count(*), max(id), max(max(length(pose), length(descriptors), length(cloud))) FROM keyframe"
         count, last, largest = connection.execute(query).fetchone()
-        if count and (last != count - 1 or largest > _LARGEST):
+        if count and (last != count - 1 or largest > _MAX_MESSAGE_SIZE):
             raise sqlite3.DatabaseError("malformed: not the keyframes of a drive")
     except BaseException:
         connection.close()

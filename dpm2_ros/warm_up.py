@@ -14,10 +14,10 @@ from dpm2_core.slam.build import make_slam
 from dpm2_core.slam.settings import SlamSettings
 from dpm2_ros.runtime import STOP
 
-_FRAMES = 3  # the first begins the map, the second measures the speed, the third is like all others
+_FRAME_COUNT = 3  # the first begins the map, the second measures the speed, the third is like all others
 _PERIOD = 100_000_000  # ns
-_SPEED = 1.0  # m per frame
-_SIZE = 640, 192  # pixels
+_STEP = 1.0  # m per frame
+_IMAGE_SIZE = 640, 192  # pixels
 
 
 @functools.cache
@@ -28,11 +28,11 @@ def warm_up(settings: SlamSettings) -> None:
         UsageError: a network has no weights.
     """
     slam = make_slam(settings)
-    for n in range(_FRAMES):
+    for n in range(_FRAME_COUNT):
         if STOP.is_set():
             return
         slam.odometry.request_keyframe()  # so that the network and the map process each frame
-        frame = Frame(n * _PERIOD, _street(n * _SPEED), images=_image() if slam.uses_images else (), index=n)
+        frame = Frame(n * _PERIOD, _street(n * _STEP), images=_image() if slam.uses_images else (), index=n)
         slam.process(frame)
     slam.mapper.finish()
 
@@ -52,8 +52,8 @@ def _street(x: float) -> Points:
 
 def _image() -> tuple[Image, ...]:
     """An image of noise, from a camera that looks along the street."""
-    width, height = _SIZE
+    width, height = _IMAGE_SIZE
     K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
     T_lidar_cam = se3.make(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.3, 0.0, -0.1])
     pixels = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)
-    return (Image(pixels, Camera(K, T_lidar_cam, _SIZE)),)
+    return (Image(pixels, Camera(K, T_lidar_cam, _IMAGE_SIZE)),)
