@@ -28,11 +28,11 @@ def average(files: Sequence[Path]) -> DeepPointMap2:
         UsageError: a file is not readable weights, or none of its weights fit.
     """
     model = DeepPointMap2(preset(network_settings(files[-1]).preset))
-    states, partly = [], set[str]()
+    states, not_fitting = [], set[str]()
     for file in files:
-        partly.update(load_fitting(model, file))
+        not_fitting.update(load_fitting(model, file))
         states.append({name: tensor.double() for name, tensor in model.state_dict().items()})
-    mean = {name: torch.stack([state[name] for state in states]).mean(0) for name in states[-1].keys() - partly}
+    mean = {name: torch.stack([state[name] for state in states]).mean(0) for name in states[-1].keys() - not_fitting}
     model.load_state_dict(states[-1] | mean)
     return model
 

@@ -155,9 +155,11 @@ def _check_poses(
         summary["rpe_trans_m"], summary["rpe_rot_deg"] = metrics.rpe_trans_m, metrics.rpe_rot_deg
         if metrics.ape_rmse_m is not None and metrics.path_length_m is not None:
             checks["the trajectory is right to 1 % of its length"] = metrics.ape_rmse_m < 0.01 * metrics.path_length_m
-    seen = None if truth is None else truth[rows]
+    true_poses = None if truth is None else truth[rows]
     try:
-        trajectory_png(out / "trajectory.png", est[rows], seen, result.map, title=f"{source.name}: {len(found)} frames")
+        trajectory_png(
+            out / "trajectory.png", est[rows], true_poses, result.map, title=f"{source.name}: {len(found)} frames"
+        )
     except MissingPackageError as error:
         typer.echo(f"no trajectory.png: {error}", err=True)
 
@@ -169,8 +171,8 @@ def map_poses(source: BagSource, result: Replay, found: list[int]) -> Array:
         keyframes = read_trajectory(result.saved / "trajectory.tum")
         position = {stamp: n for n, stamp in enumerate(found)}
         known = [n for n, stamp in enumerate(keyframes.keys.tolist()) if stamp in position]
-        at = np.array([position[keyframes.keys[n]] for n in known], np.intp)
-        T_odom_base = corrected(T_odom_base, at, keyframes.poses[known] @ se3.inverse(T_odom_base[at]))
+        indices = np.array([position[keyframes.keys[n]] for n in known], np.intp)
+        T_odom_base = corrected(T_odom_base, indices, keyframes.poses[known] @ se3.inverse(T_odom_base[indices]))
     if result.base_frame == source.lidar_frame:
         return T_odom_base
     T_base_lidar = source.transforms.lookup(result.base_frame, source.lidar_frame)
@@ -183,7 +185,7 @@ def _table(source: BagSource, result: Replay, evaluation: Evaluation, out: Path)
     table = FigureTable(title, names=["what"], figures=["value"], text=["how"], header=False)
     table.add_row("clouds in", str(s["frames_in"]), f"{source.points_topic}")
     table.add_row("poses out", str(s["frames_out"]), "/dpm2/odom, of the same stamp")
-    table.add_row("dropped", str(s["dropped"]), f"queue of {QUEUE}; the node counts {_said(result, 'dropped')}")
+    table.add_row("dropped", str(s["dropped"]), f"queue of {QUEUE}; the node counts {_diagnostic(result, 'dropped')}")
     table.add_row("latency p50", _value(s["latency_p50_ms"], "ms", 1), "cloud published to odometry received")
     table.add_row("latency p95", _value(s["latency_p95_ms"], "ms", 1), "")
     table.add_row("APE rmse", _value(s["ape_rmse_m"], "m", 3), "positions after SE(3) alignment, LiDAR frame")
@@ -198,7 +200,7 @@ def _table(source: BagSource, result: Replay, evaluation: Evaluation, out: Path)
     return table
 
 
-def _said(result: Replay, key: str) -> str:
+def _diagnostic(result: Replay, key: str) -> str:
     return next((value for name, value in result.diagnostics.items() if name.startswith(key)), "-")
 
 

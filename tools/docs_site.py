@@ -20,33 +20,33 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the files that the pages link to, and the files that those link to."""
     with needs("docs", "the site"):
         from mkdocs.structure.files import File
-    wanted = [page.src_uri for page in files.documentation_pages()]
-    while wanted:
-        page = wanted.pop()
+    pending = [page.src_uri for page in files.documentation_pages()]
+    while pending:
+        page = pending.pop()
         for target in _linked(page):
             uri = f"{PLACE}/{target}"
             if not target.startswith("docs/") and (ROOT / target).is_file() and files.get_file_from_path(uri) is None:
                 files.append(File.generated(config, uri, abs_src_path=str(ROOT / target)))
                 if uri.endswith(".md"):
-                    wanted.append(uri)
+                    pending.append(uri)
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Replace the links of a page by the targets' paths in the site."""
-    here = page.file.src_uri
+    source = page.file.src_uri
 
-    def there(match: re.Match[str]) -> str:
-        target = _in_repository(here, match["target"])
+    def site_link(match: re.Match[str]) -> str:
+        target = _in_repository(source, match["target"])
         if target is None:
             return match[0]
         if (ROOT / target).is_dir():  # a site cannot show a folder
             return match["text"]
         uri = target.removeprefix("docs/") if target.startswith("docs/") else f"{PLACE}/{target}"
-        relative = posixpath.relpath(uri, posixpath.dirname(here) or ".")
+        relative = posixpath.relpath(uri, posixpath.dirname(source) or ".")
         return f"[{match['text']}]({relative}{match['anchor']})"
 
-    return _LINK.sub(there, markdown)
+    return _LINK.sub(site_link, markdown)
 
 
 def _linked(page: str) -> list[str]:
@@ -59,5 +59,5 @@ def _in_repository(page: str, link: str) -> str | None:
     """Path, relative to the root, of the target of a page's link; None for an address elsewhere."""
     if "://" in link or link.startswith("mailto:"):
         return None
-    own = page.removeprefix(f"{PLACE}/") if page.startswith(f"{PLACE}/") else f"docs/{page}"
-    return posixpath.normpath(posixpath.join(posixpath.dirname(own), link))
+    path = page.removeprefix(f"{PLACE}/") if page.startswith(f"{PLACE}/") else f"docs/{page}"
+    return posixpath.normpath(posixpath.join(posixpath.dirname(path), link))

@@ -98,10 +98,10 @@ def replaced(text: str, drawn: Mapping[str, str]) -> str:
         UsageError: the document has no place for a diagram.
     """
     for name, mermaid in drawn.items():
-        place = re.search(rf"(?<=<!-- imports: {name} -->\n).*?(?=<!-- end -->)", text, re.DOTALL)
-        if place is None:
+        section = re.search(rf"(?<=<!-- imports: {name} -->\n).*?(?=<!-- end -->)", text, re.DOTALL)
+        if section is None:
             raise UsageError(f"no <!-- imports: {name} --> with an <!-- end --> to draw between")
-        text = f"{text[: place.start()]}```mermaid\n{mermaid}```\n{text[place.end() :]}"
+        text = f"{text[: section.start()]}```mermaid\n{mermaid}```\n{text[section.end() :]}"
     return text
 
 

@@ -31,10 +31,11 @@ SIZE = (420, 320)
 """Width and height of each drive's part, pixels."""
 MOMENTS = 44
 """Number of images in the animation."""
-MOST = 3_000_000
+MAX_SIZE = 3_000_000
 """Largest size of the file, bytes."""
-_MARGIN, _SPACING, _HOLD = 25.0, 0.35, 2000  # m around the trajectory, m between points, ms of the last image
-_INK, _GROUND = (16, 21, 26), (0.0, 5.0)  # background; heights between which colors change, m above the lowest points
+# m around the trajectory, m between points, ms of the last image.
+_MARGIN, _SPACING, _LAST_IMAGE_DURATION = 25.0, 0.35, 2000
+_BACKGROUND, _HEIGHT_RANGE = (16, 21, 26), (0.0, 5.0)  # RGB; m above the lowest points, between which colors change
 
 Picture = NDArray[np.uint8]
 
@@ -52,32 +53,32 @@ def moments(drive: Path, title: str) -> list[Picture]:
         clouds.append(se3.transform(result.T_odom_lidar, near)[:, :3].astype(np.float64))
     if len(poses) < 2:
         raise UsageError(f"{drive}: want a drive of two frames or more")
-    way = np.array([T[:3, 3] for T in poses])
-    view = _View(way)
-    shown = [int(n) for n in np.linspace(1, len(poses), MOMENTS)]
+    positions = np.array([T[:3, 3] for T in poses])
+    view = _View(positions)
+    counts = [int(n) for n in np.linspace(1, len(poses), MOMENTS)]
     images, before = [], 0
-    for until in shown:
-        for cloud in clouds[before:until]:
+    for count in counts:
+        for cloud in clouds[before:count]:
             view.add(cloud)
-        before = until
-        images.append(view.draw(way[:until], f"{title}: {until} of {len(poses)} scans"))
+        before = count
+        images.append(view.draw(positions[:count], f"{title}: {count} of {len(poses)} scans"))
     return images
 
 
 class _View:
     """A map from above, rotated so that its longer side is along the longer side of the image."""
 
-    def __init__(self, way: NDArray[np.float64]) -> None:
-        middle = way[:, :2].mean(0)
-        axes = np.linalg.svd(way[:, :2] - middle)[2]
+    def __init__(self, positions: NDArray[np.float64]) -> None:
+        middle = positions[:, :2].mean(0)
+        axes = np.linalg.svd(positions[:, :2] - middle)[2]
         if np.linalg.det(axes) < 0:
             axes[1] *= -1
-        local = (way[:, :2] - middle) @ axes.T
+        local = (positions[:, :2] - middle) @ axes.T
         low, high = local.min(0) - _MARGIN, local.max(0) + _MARGIN
         self._axes, self._middle = axes, middle + (low + high) / 2 @ axes
         self._scale = float(min(np.array(SIZE) / (high - low)))
         self._height = np.full(SIZE[::-1], -np.inf, np.float32)
-        self._floor = float(way[:, 2].min()) - 2.0
+        self._floor = float(positions[:, 2].min()) - 2.0
 
     def pixels(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) column and row."""
@@ -86,18 +87,20 @@ class _View:
 
     def add(self, points: NDArray[np.float64]) -> None:
         """Add points (N, 3) to the map: each pixel keeps the highest."""
-        at = np.floor(self.pixels(points[:, :2])).astype(int)
-        inside = ((at >= 0) & (at < SIZE)).all(1)
-        np.maximum.at(self._height, (at[inside, 1], at[inside, 0]), points[inside, 2].astype(np.float32) - self._floor)
+        pixel = np.floor(self.pixels(points[:, :2])).astype(int)
+        inside = ((pixel >= 0) & (pixel < SIZE)).all(1)
+        np.maximum.at(
+            self._height, (pixel[inside, 1], pixel[inside, 0]), points[inside, 2].astype(np.float32) - self._floor
+        )
 
-    def draw(self, way: NDArray[np.float64], text: str) -> Picture:
+    def draw(self, positions: NDArray[np.float64], text: str) -> Picture:
         """The image, RGB."""
-        level = np.clip((self._height - _GROUND[0]) / (_GROUND[1] - _GROUND[0]), 0, 1)
-        level = np.round(np.where(np.isfinite(level), level, 0) * 12) / 12  # few colors: a small file
-        seen = np.isfinite(self._height)[..., None]
-        color = np.array([60, 85, 115]) * (1 - level[..., None]) + np.array([240, 225, 190]) * level[..., None]
-        image = np.ascontiguousarray(np.where(seen, color, _INK).astype(np.uint8))
-        line = np.round(self.pixels(way[:, :2])).astype(np.int32)
+        height = np.clip((self._height - _HEIGHT_RANGE[0]) / (_HEIGHT_RANGE[1] - _HEIGHT_RANGE[0]), 0, 1)
+        height = np.round(np.where(np.isfinite(height), height, 0) * 12) / 12  # few colors: a small file
+        is_seen = np.isfinite(self._height)[..., None]
+        color = np.array([60, 85, 115]) * (1 - height[..., None]) + np.array([240, 225, 190]) * height[..., None]
+        image = np.ascontiguousarray(np.where(is_seen, color, _BACKGROUND).astype(np.uint8))
+        line = np.round(self.pixels(positions[:, :2])).astype(np.int32)
         cv2.polylines(image, [line], False, (255, 150, 40), 2)
         cv2.circle(image, [int(v) for v in line[-1]], 4, (255, 255, 255), -1)
         cv2.putText(image, text, (8, SIZE[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1)
@@ -105,7 +108,7 @@ class _View:
 
 
 def write_apng(path: Path, images: list[Picture]) -> None:
-    """Write all images in sequence, the last one shown longer; at most `MOST` bytes.
+    """Write all images in sequence, the last one shown longer; at most `MAX_SIZE` bytes.
 
     Raises:
         Dpm2Error: it is larger, or could not be written.
@@ -114,12 +117,12 @@ def write_apng(path: Path, images: list[Picture]) -> None:
         from PIL import Image
 
     reduced = [Image.fromarray(image).quantize(48, dither=Image.Dither.NONE) for image in images]
-    durations = [110] * (len(reduced) - 1) + [_HOLD]
+    durations = [110] * (len(reduced) - 1) + [_LAST_IMAGE_DURATION]
     with atomic_write(path, "wb") as file:
         first, *others = reduced
         first.save(file, "PNG", save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
-        if file.tell() > MOST:
-            raise Dpm2Error(f"{path}: {file.tell() / 1e6:.1f} MB, more than {MOST / 1e6:g}")
+        if file.tell() > MAX_SIZE:
+            raise Dpm2Error(f"{path}: {file.tell() / 1e6:.1f} MB, more than {MAX_SIZE / 1e6:g}")
 
 
 def make_picture(

@@ -110,8 +110,8 @@ def replay(
     """
     environment = ros_environment()
     os.environ.update(environment)  # the subscriber in this process reads it when rclpy starts
-    given = {"use_sim_time": True, "input.points_topic": source.points_topic, "ros.map_directory": str(out / "map")}
-    pairs = [f"{name}:={_yaml(value)}" for name, value in (given | dict(parameters or {})).items()]
+    defaults = {"use_sim_time": True, "input.points_topic": source.points_topic, "ros.map_directory": str(out / "map")}
+    pairs = [f"{name}:={_yaml(value)}" for name, value in (defaults | dict(parameters or {})).items()]
     arguments = ["--ros-args", *(part for pair in pairs for part in ("-p", pair))]
     times = out / "published.csv"
     slam = start("slam_node", arguments, environment, out / "slam_node.log")
@@ -124,8 +124,8 @@ def replay(
                 listener.spin(0.1)
             if watched:
                 listener.watch_all()
-            playing = [str(source.path), "--rate", str(rate), "--wait", "60", "--log", str(times)]
-            player = start("bag_player", playing, environment, out / "bag_player.log")
+            player_arguments = [str(source.path), "--rate", str(rate), "--wait", "60", "--log", str(times)]
+            player = start("bag_player", player_arguments, environment, out / "bag_player.log")
             while player.poll() is None:
                 _check_alive(slam, out)
                 listener.spin(0.2)
@@ -151,10 +151,10 @@ def _check_alive(slam: subprocess.Popen[bytes], out: Path) -> None:
 
 def _drain(listener: _Listener, result: Replay) -> None:
     """Spin until all published clouds have a pose, or no more poses arrive; then until the last map has arrived."""
-    before, quiet = -1, 0.0
-    while len(result.poses) < len(result.published) and quiet < 3.0:
-        quiet = 0.0 if len(result.poses) > before else quiet + 0.2
-        before = len(result.poses)
+    previous_count, idle_time = -1, 0.0
+    while len(result.poses) < len(result.published) and idle_time < 3.0:
+        idle_time = 0.0 if len(result.poses) > previous_count else idle_time + 0.2
+        previous_count = len(result.poses)
         listener.spin(0.2)
     end = time.monotonic() + 15.0
     while not (listener.map_is_complete() and result.diagnostics) and time.monotonic() < end:
@@ -177,8 +177,8 @@ class SpunNode:
     def spin(self, seconds: float) -> None:
         """Process messages that arrive during that time."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        while (remaining := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=remaining)
 
     def close(self) -> None:
         """Destroy the node, and shut down ROS in this process."""
@@ -214,9 +214,9 @@ class _Listener(SpunNode):
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         profile = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-        heard = {subscription.topic_name for subscription in self._node.subscriptions}
+        subscribed = {subscription.topic_name for subscription in self._node.subscriptions}
         for topic, (kind, *_) in self._node.get_publisher_names_and_types_by_node("slam_node", "/"):
-            if topic in heard:
+            if topic in subscribed:
                 continue
             package, _, name = kind.split("/")
             message = getattr(import_module(f"{package}.msg"), name)
