@@ -50,8 +50,8 @@ def bench_covariance(options: Options) -> Report:
     with processors(options.threads), progress_bar() as progress:
         for part in requested(options, PARTS):
             with drives(options) if part == "real" else _simulated(options) as sources:
-                named = progress.track(sources.items(), description=part)
-                results[part] = {name: _of_drive(source, options) for name, source in named}
+                tracked_sources = progress.track(sources.items(), description=part)
+                results[part] = {name: _evaluate_drive(source, options) for name, source in tracked_sources}
     return Report(results, Group(*(_table(part, rows) for part, rows in results.items())))
 
 
@@ -67,19 +67,22 @@ def _simulated(options: Options) -> Iterator[dict[str, Source]]:
     yield sources
 
 
-def _of_drive(source: Source, options: Options) -> dict[str, Any]:
+def _evaluate_drive(source: Source, options: Options) -> dict[str, Any]:
     poses, frames = truth_of(source), list(source.frames())
     out: dict[str, Any] = {}
     for kind, pairs in pairs_of(poses, options.pairs).items():
-        found = {method: _registered(method, frames, poses, pairs, options) for method in METHODS}
-        out[kind] = {method: {"pairs": len(pairs), **calibration(list(f.values()))} for method, f in found.items()}
-        both = found["geometric"].keys() & found["neural"].keys()
-        between = [(found["geometric"][pair][1].T_target_source, found["neural"][pair][1]) for pair in both]
-        out[kind]["between the two"] = {name: calibration(between)[name] for name in ("median_m", "median_deg")}
+        found = {method: _register_pairs(method, frames, poses, pairs, options) for method in METHODS}
+        out[kind] = {
+            method: {"pairs": len(pairs), **calibration(list(registered.values()))}
+            for method, registered in found.items()
+        }
+        common = found["geometric"].keys() & found["neural"].keys()
+        differences = [(found["geometric"][pair][1].T_target_source, found["neural"][pair][1]) for pair in common]
+        out[kind]["between the two"] = {name: calibration(differences)[name] for name in ("median_m", "median_deg")}
     return out
 
 
-def _registered(
+def _register_pairs(
     method: str, frames: Sequence[Frame], poses: Array, pairs: Sequence[tuple[int, int]], options: Options
 ) -> Found:
     """Pairs registered to a map of one scan.
@@ -118,8 +121,8 @@ def calibration(rows: Sequence[tuple[Array, Registration]]) -> dict[str, Any]:
         part = xi[:, span, None]
         squared = np.swapaxes(part, 1, 2) @ np.linalg.solve(S[:, span, span], part)
         ratio[name] = rounded(float(np.median(squared) / chdtri(part.shape[1], 0.5)))
-    turn, way = np.median(np.linalg.norm(xi.reshape(-1, 2, 3), axis=2), axis=0)
-    errors = {"median_m": rounded(float(way)), "median_deg": rounded(float(np.degrees(turn)))}
+    rotation, translation = np.median(np.linalg.norm(xi.reshape(-1, 2, 3), axis=2), axis=0)
+    errors = {"median_m": rounded(float(translation)), "median_deg": rounded(float(np.degrees(rotation)))}
     return {"registered": len(rows), **errors, "chi2_ratio": ratio}
 
 

@@ -11,7 +11,7 @@ import torch
 from rich.console import Group
 from torch import Tensor
 
-from benchmarks.diffslam_pypose import beside_pypose
+from benchmarks.diffslam_pypose import compare_with_pypose
 from benchmarks.harness import Options, Report, processors, rounded, torch_threads
 from dpm2_core.config import load_settings
 from dpm2_core.diffslam.clouds import window
@@ -26,8 +26,8 @@ from dpm2_core.tables import FigureTable
 SCANS, POINTS = 8, 2048
 MOTION = se3.exp(np.array([0.002, -0.003, np.radians(1.2), 0.8, 0.1, 0.02]))
 """T_target_source of the known motion: 0.81 m, 1.2 deg."""
-_CONVERGED = 60  # iterations, after which nothing changes
-_STEP = 1e-4  # m, of the finite difference
+_CONVERGED_ITERATIONS = 60  # iterations, after which nothing changes
+_DIFFERENCE_STEP = 1e-4  # m, of the finite difference
 _RANKS = (0, 1, 10, 100, 1000)  # ranks, by gradient length, of the points that are moved for it
 _NOISE = 0.01  # m, difference of a predicted scan from its target
 
@@ -44,7 +44,7 @@ def bench_diffslam(options: Options) -> Report:
             "gates": gates(points, truth, settings),
             "gradients": gradients(points, settings),
             "cost": {"cpu": cost(points, settings, max(options.repetitions, 5))},
-            "pypose": beside_pypose(points[0], torch.from_numpy(MOTION), settings),
+            "pypose": compare_with_pypose(points[0], torch.from_numpy(MOTION), settings),
         }
         if torch.cuda.is_available():
             device = torch.cuda.get_device_name()
@@ -87,7 +87,9 @@ def known_motion(scan: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
 
 def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
     """Independent scans (T, N, 3): distance of the trajectory and its gradient from those at convergence."""
-    end, slope = _by_points(points, truth, with_solver(settings, iterations=_CONVERGED, gate="none"))
+    converged, converged_gradient = _point_gradient(
+        points, truth, with_solver(settings, iterations=_CONVERGED_ITERATIONS, gate="none")
+    )
     rows: dict[str, dict[str, Any]] = {}
     variants: dict[str, dict[str, Any]] = {
         "soft": {"gate": "soft"},
@@ -98,12 +100,14 @@ def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str
     }
     for name, changes in variants.items():
         for gradient in ("unrolled", "implicit"):
-            poses, g = _by_points(points, truth, with_solver(settings, gradient=gradient, **changes))
+            poses, g = _point_gradient(points, truth, with_solver(settings, gradient=gradient, **changes))
             rows.setdefault(name, {})[gradient] = {
-                "to_converged_mm": rounded(1e3 * float((poses - end)[1:, :3, 3].norm(dim=1).mean())),
-                "gradient_cosine": rounded(float((g * slope).sum() / (g.norm() * slope.norm()).clamp(min=1e-300))),
+                "to_converged_mm": rounded(1e3 * float((poses - converged)[1:, :3, 3].norm(dim=1).mean())),
+                "gradient_cosine": rounded(
+                    float((g * converged_gradient).sum() / (g.norm() * converged_gradient.norm()).clamp(min=1e-300))
+                ),
             }
-    steps, true_steps = (se3.inverse(T[:-1].numpy()) @ T[1:].numpy() for T in (end, truth))
+    steps, true_steps = (se3.inverse(T[:-1].numpy()) @ T[1:].numpy() for T in (converged, truth))
     error = se3.inverse(true_steps) @ steps
     return {
         "iterations": settings.icp.solver.iterations,
@@ -115,7 +119,7 @@ def gates(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> dict[str
     }
 
 
-def _by_points(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> tuple[Tensor, Tensor]:
+def _point_gradient(points: Tensor, truth: Tensor, settings: SlamLossSettings) -> tuple[Tensor, Tensor]:
     """Trajectory, and the gradient of its error with respect to all points."""
     leaf = points.clone().requires_grad_()
     poses = odometry(leaf, settings=settings)
@@ -127,25 +131,25 @@ def gradients(points: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
     """Gradients of the loss of noisy scans against clean ones: single points against finite differences; both kinds."""
     noisy = points + _NOISE * torch.randn(points.shape, generator=torch.Generator().manual_seed(0), dtype=points.dtype)
     frames = [("drive", t) for t in range(len(points))]
-    out: dict[str, Any] = {"iterations": _CONVERGED, "rank_of_slope": list(_RANKS)}
+    out: dict[str, Any] = {"iterations": _CONVERGED_ITERATIONS, "rank_of_slope": list(_RANKS)}
     found = {}
     for gradient in ("unrolled", "implicit"):
-        loss = SlamLoss(with_solver(settings, gradient=gradient, iterations=_CONVERGED))
+        loss = SlamLoss(with_solver(settings, gradient=gradient, iterations=_CONVERGED_ITERATIONS))
         leaf = noisy.clone().requires_grad_()
-        (slope,) = torch.autograd.grad(loss(leaf, points, frames=frames), leaf)
-        found[gradient] = slope
-        order = slope.norm(dim=-1).flatten().argsort(descending=True)
+        (point_gradients,) = torch.autograd.grad(loss(leaf, points, frames=frames), leaf)
+        found[gradient] = point_gradients
+        order = point_gradients.norm(dim=-1).flatten().argsort(descending=True)
         errors = []
-        for place in order[list(_RANKS)].tolist():
-            t, i = divmod(place, slope.shape[1])
-            length = float(slope[t, i].norm())
+        for index in order[list(_RANKS)].tolist():
+            t, i = divmod(index, point_gradients.shape[1])
+            length = float(point_gradients[t, i].norm())
             values = []
-            for step in (_STEP, -_STEP):
+            for step in (_DIFFERENCE_STEP, -_DIFFERENCE_STEP):
                 moved = noisy.clone()
-                moved[t, i] += step * slope[t, i] / length
+                moved[t, i] += step * point_gradients[t, i] / length
                 with torch.no_grad():
                     values.append(float(loss(moved, points, frames=frames)))
-            errors.append(rounded(abs((values[0] - values[1]) / (2 * _STEP) / length - 1)))
+            errors.append(rounded(abs((values[0] - values[1]) / (2 * _DIFFERENCE_STEP) / length - 1)))
         out[gradient] = {"relative_errors": errors, "median": rounded(float(np.median(errors))), "worst": max(errors)}
     a, b = found["unrolled"], found["implicit"]
     out["implicit_against_unrolled"] = rounded(float((a - b).norm() / a.norm()))
@@ -161,17 +165,17 @@ def cost(points: Tensor, settings: SlamLossSettings, repetitions: int) -> dict[s
         frames = [("drive", t) for t in range(len(points))]
         leaf = (points + _NOISE * noise).requires_grad_()
         row: dict[str, Any] = {}
-        for name, named in (("reference_anew", None), ("reference_cached", frames)):
-            loss(leaf, points, frames=named)  # warm-up, and fills the cache
+        for name, frame_names in (("reference_anew", None), ("reference_cached", frames)):
+            loss(leaf, points, frames=frame_names)  # warm-up, and fills the cache
             forward, backward = [], []
             for _ in range(repetitions):
-                _wait(points)
+                _synchronize(points)
                 begin = time.perf_counter()
-                value = loss(leaf, points, frames=named)
-                _wait(points)
+                value = loss(leaf, points, frames=frame_names)
+                _synchronize(points)
                 middle = time.perf_counter()
                 value.backward()
-                _wait(points)
+                _synchronize(points)
                 forward.append(middle - begin)
                 backward.append(time.perf_counter() - middle)
             row[name] = {
@@ -179,12 +183,12 @@ def cost(points: Tensor, settings: SlamLossSettings, repetitions: int) -> dict[s
                 "backward_ms": rounded(1e3 * float(np.median(backward))),
                 "both_ms": rounded(1e3 * float(np.median(np.add(forward, backward)))),
             }
-        row["graph_mb"] = rounded(_held(loss, leaf, points) / 1e6)
+        row["graph_mb"] = rounded(_graph_bytes(loss, leaf, points) / 1e6)
         rows[gradient] = row
     return {"scans": len(points), "points": points.shape[1], "repetitions": repetitions, **rows}
 
 
-def _held(loss: SlamLoss, leaf: Tensor, points: Tensor) -> int:
+def _graph_bytes(loss: SlamLoss, leaf: Tensor, points: Tensor) -> int:
     """Bytes that autograd keeps for the backward pass."""
     storages: dict[int, int] = {}
 
@@ -199,7 +203,7 @@ def _held(loss: SlamLoss, leaf: Tensor, points: Tensor) -> int:
     return total
 
 
-def _wait(points: Tensor) -> None:
+def _synchronize(points: Tensor) -> None:
     if points.is_cuda:
         torch.cuda.synchronize()
 

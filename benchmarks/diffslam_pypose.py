@@ -19,7 +19,7 @@ from dpm2_core.geometry import se3, se3_torch
 _REPETITIONS = 3
 
 
-def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
+def compare_with_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSettings) -> dict[str, Any]:
     """Error and time of each for a scan (N, 3) registered to itself, moved by T_target_source (4, 4), from identity.
 
     pypose's ICP is point-to-point with all distances at once; its LM uses our matches and residuals. Neither has point
@@ -41,14 +41,14 @@ def beside_pypose(scan: Tensor, T_target_source: Tensor, settings: SlamLossSetti
         return pypose.module.ICP(stepper=stepper)(source, scan).matrix()
 
     def lm() -> Tensor:
-        return _by_optimizer(pypose, source, scan, iterations)
+        return _register_with_lm(pypose, source, scan, iterations)
 
-    timed: dict[str, Callable[[], Tensor]] = {"dpm2": ours, "pypose_icp": icp, "pypose_lm": lm}
-    rows = {name: _row(run, T_target_source.numpy()) for name, run in timed.items()}
+    methods: dict[str, Callable[[], Tensor]] = {"dpm2": ours, "pypose_icp": icp, "pypose_lm": lm}
+    rows = {name: _measure(run, T_target_source.numpy()) for name, run in methods.items()}
     return {"version": pypose.__version__, "iterations": iterations, **rows}
 
 
-def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
+def _measure(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
     seconds = []
     for _ in range(_REPETITIONS):
         begin = time.perf_counter()
@@ -58,7 +58,7 @@ def _row(run: Callable[[], Tensor], requested: np.ndarray) -> dict[str, float]:
     return {"mm": rounded(1e3 * meters), "deg": rounded(degrees), "ms": rounded(1e3 * float(np.median(seconds)))}
 
 
-def _by_optimizer(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
+def _register_with_lm(pypose: Any, source: Tensor, target: Tensor, iterations: int) -> Tensor:
     """Point-to-plane with `pypose.optim.LM`: its adaptive damping (up 2, down 0.5), new matches at each step."""
     cloud = Cloud(target[None])
 

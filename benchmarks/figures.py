@@ -86,10 +86,10 @@ def bars_png(path: Path | str, groups: Mapping[str, Mapping[str, float]], title:
     figure = new_figure(figsize=(9, 0.4 * len(groups) * len(names) / 2 + 1.6), dpi=100)
     axes = figure.add_subplot()
     for k, name in enumerate(names):
-        at = np.arange(len(groups)) + (k - (len(names) - 1) / 2) * 0.8 / len(names)
-        known = {y: row[name] for y, row in zip(at, groups.values(), strict=True) if name in row}
-        axes.barh(list(known), list(known.values()), 0.8 / len(names), label=name)
-        for y, length in known.items():
+        positions = np.arange(len(groups)) + (k - (len(names) - 1) / 2) * 0.8 / len(names)
+        lengths = {y: row[name] for y, row in zip(positions, groups.values(), strict=True) if name in row}
+        axes.barh(list(lengths), list(lengths.values()), 0.8 / len(names), label=name)
+        for y, length in lengths.items():
             axes.text(length, y, f" {length:.2f}", va="center", fontsize=8)
     axes.set_yticks(range(len(groups)), list(groups))
     axes.invert_yaxis()

@@ -60,27 +60,27 @@ def bench_finetune(options: Options) -> Report:
 
     `--only` names one of the variants.
     """
-    wanted = trainings(options)
+    requested_trainings = trainings(options)
     path, folder = options.out / "finetune.json", options.cache / "finetune"
     with torch_threads(options.threads):
-        chosen = load_settings(FinetuneSettings, None, [STEPS, *options.overrides])
-        weights = weights_path(chosen.weights)
+        base_settings = load_settings(FinetuneSettings, None, [STEPS, *options.overrides])
+        weights = weights_path(base_settings.weights)
         network, digest = load_model(weights), file_digest(weights)
-        _prepare(folder, chosen, options)
+        _prepare(folder, base_settings, options)
         validations = {name: PairSet(folder / name, 2 * options.pairs, network.settings, False) for name in UNSEEN}
-        same = {"settings": chosen.model_dump(mode="json"), "weights_sha256": digest, "pairs": options.pairs}
+        same = {"settings": base_settings.model_dump(mode="json"), "weights_sha256": digest, "pairs": options.pairs}
         before = earlier(path, "before", **same)
         before = before or {name: errors(pairs, network) for name, pairs in validations.items()}
         runs = earlier(path, "runs", **same)
-        for variant, seed in wanted:
-            of_variant = runs.setdefault(variant, {})
-            if str(seed) in of_variant:
+        for variant, seed in requested_trainings:
+            variant_runs = runs.setdefault(variant, {})
+            if str(seed) in variant_runs:
                 continue
             overrides = [STEPS, *options.overrides, *VARIANTS[variant], f"optimiser.seed={seed}"]
             settings = load_settings(FinetuneSettings, None, overrides)
             out = folder / f"{variant}_{seed}_{digest[:8]}"
             run = _run(settings, folder / "data", out, validations)
-            of_variant[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
+            variant_runs[str(seed)] = {**run, "ratio": _ratio(run["after"], before)}
             write_report(path, report(same, before, runs), options)
     return report(same, before, runs)
 
@@ -96,13 +96,13 @@ def _prepare(folder: Path, settings: FinetuneSettings, options: Options) -> None
     """Create drives, their references, the rehearsal and the unseen worlds; existing ones are kept."""
     sources = []
     for k, preset in enumerate(DRIVES):
-        at = folder / "recorded" / preset
+        drive_folder = folder / "recorded" / preset
         simulate(
-            at,
+            drive_folder,
             DriveConfig(frames=DRIVE_FRAMES, seed=950_000 + k, road="random", preset=preset, images=False, lidar=LIDAR),
             workers=options.threads,
         )
-        sources.append(open_source(at, InputSettings(images=False)))
+        sources.append(open_source(drive_folder, InputSettings(images=False)))
     network = load_model(weights_path(settings.weights)).settings
     prepare(sources, settings, network, SlamSettings(threads=options.threads), folder / "data")
     for name, worlds in UNSEEN.items():
@@ -128,14 +128,14 @@ def errors(pairs: PairSet, model: Any) -> dict[str, float]:
     """Median errors of translation, m, and rotation, deg, and the success rate."""
     rows = pairs.errors(model)
     near = rows[:, 0] <= NEAR
-    good = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
+    succeeded = (rows[:, 2] < SUCCESS[0]) & (rows[:, 3] < SUCCESS[1])
     return {
         "pairs": len(rows),
         "near_m": float(np.median(rows[near, 2])),
         "far_m": float(np.median(rows[~near, 2])),
         "all_m": float(np.median(rows[:, 2])),
         "all_deg": float(np.median(rows[:, 3])),
-        "success": float(good.mean()),
+        "success": float(succeeded.mean()),
     }
 
 

@@ -50,8 +50,8 @@ METERS, LENGTH, SHARED = 150.0, 110.0, 40.0
 DRIVES = 12
 PLACES, QUERIES, FOUND = 200_000, 500, 8
 KILLS = 20
-_SAME = ("trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "loops.csv")
-_FAST = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.threads=1")
+_COMPARED_FILES = ("trajectory_kitti.txt", "trajectory.tum", "map.ply", "pose_graph.g2o", "loops.csv")
+_FAST_SETTINGS = ("slam.registration=geometric", "slam.loops.descriptors=false", "slam.threads=1")
 
 
 def bench_fleet(options: Options) -> Report:
@@ -85,19 +85,19 @@ def bench_town(folder: Path, options: Options) -> dict[str, Any]:
     with Cluster(workers=2) as cluster:
         cluster.start()
         for number, (name, poses) in enumerate(truth.items()):
-            kept = options.cache / "fleet" / f"{name}_{_key(poses)}"
-            if not kept.exists():
-                write_drive(kept, world, poses, number)
-            shutil.copytree(kept, folder / "fleet" / name)
+            cached = options.cache / "fleet" / f"{name}_{_key(poses)}"
+            if not cached.exists():
+                write_drive(cached, world, poses, number)
+            shutil.copytree(cached, folder / "fleet" / name)
             before = time.perf_counter()
             merged = merge(folder / "fleet", out, SlamSettings(), Cluster())
             added.append({"drive": name, "keyframes": len(poses), "s": time.perf_counter() - before})
             print(f"{name}: {added[-1]}", file=sys.stderr)
-        grown = _errors(folder / "fleet", out, truth, merged.drives)
-        whole = merge(folder / "fleet", folder / "anew.dpm2map", SlamSettings(), Cluster())
+        map_errors = _errors(folder / "fleet", out, truth, merged.drives)
+        whole_map = merge(folder / "fleet", folder / "anew.dpm2map", SlamSettings(), Cluster())
     joined = {tuple(row["drives"]) for row in merged.joins if row["accepted"] >= ENOUGH}
-    true = {(a, b) for a, b in combinations(truth, 2) if _meet(truth[a], truth[b])}
-    way = poses_of(world, (0.0, spans[-1][1]), DRIVES)
+    true = {(a, b) for a, b in combinations(truth, 2) if _overlap(truth[a], truth[b])}
+    path_poses = poses_of(world, (0.0, spans[-1][1]), DRIVES)
     return {
         "drives": len(truth),
         "keyframes": sum(map(len, truth.values())),
@@ -106,11 +106,11 @@ def bench_town(folder: Path, options: Options) -> dict[str, Any]:
         "joined": len(joined & true),
         "wrong": len(joined - true),
         "ape_m": {
-            "one_drive_of_the_whole_way": float(ape_rmse(way, odometry_of(way))),
-            "map": grown.pop("map"),
-            "map_made_at_once": _errors(folder / "fleet", folder / "anew.dpm2map", truth, whole.drives)["map"],
+            "one_drive_of_the_whole_way": float(ape_rmse(path_poses, odometry_of(path_poses))),
+            "map": map_errors.pop("map"),
+            "map_made_at_once": _errors(folder / "fleet", folder / "anew.dpm2map", truth, whole_map.drives)["map"],
         },
-        "ape_of_each_drive_m": grown,
+        "ape_of_each_drive_m": map_errors,
         "rejected": merged.rejected,
         "added": added,
         "peak_mb": peak_mb(),
@@ -123,10 +123,10 @@ def _key(poses: Array) -> str:
     return hashlib.sha256(poses.round(6).tobytes() + weights.encode()).hexdigest()[:12]
 
 
-def _meet(one: Array, other: Array) -> bool:
+def _overlap(one: Array, other: Array) -> bool:
     """Whether enough keyframes of two drives are within one step of each other: they saw the same place."""
-    apart = np.linalg.norm(one[:, None, :2, 3] - other[None, :, :2, 3], axis=-1).min(0)
-    return int((apart <= STEP).sum()) >= ENOUGH
+    distance = np.linalg.norm(one[:, None, :2, 3] - other[None, :, :2, 3], axis=-1).min(0)
+    return int((distance <= STEP).sum()) >= ENOUGH
 
 
 def _errors(fleet: Path, out: Path, truth: Mapping[str, Array], sizes: Mapping[str, int]) -> dict[str, Any]:
@@ -149,18 +149,18 @@ def bench_index(folder: Path, options: Options) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     scale = 0.8 ** np.arange(24)
     axes = np.linalg.qr(rng.normal(size=(WIDTH, 24)))[0].T
-    ways = np.concatenate([_way(rng, 400) * scale for _ in range(PLACES // 400)])
-    places = (ways @ axes + 0.03 * rng.normal(size=(PLACES, WIDTH))).astype(np.float32)
-    asked = ways[rng.integers(0, PLACES, QUERIES)] @ axes + 0.03 * rng.normal(size=(QUERIES, WIDTH))
-    queries = asked.astype(np.float32)
+    paths = np.concatenate([_random_path(rng, 400) * scale for _ in range(PLACES // 400)])
+    places = (paths @ axes + 0.03 * rng.normal(size=(PLACES, WIDTH))).astype(np.float32)
+    noisy = paths[rng.integers(0, PLACES, QUERIES)] @ axes + 0.03 * rng.normal(size=(QUERIES, WIDTH))
+    queries = noisy.astype(np.float32)
     index = FleetIndex(folder)
     build, _ = _timed(lambda: index.add("all", [0], places))
     search, found = _timed(lambda: index.similar(queries, FOUND))
     centered = places - places.mean(0)
     centered /= np.linalg.norm(centered, axis=1, keepdims=True)
-    wanted = queries - places.mean(0)
-    brute, nearest = _timed(lambda: [_best(rows @ centered.T) for rows in np.array_split(wanted, 10)])
-    single, _ = _timed(lambda: [_best(row @ centered.T) for row in wanted[:50]])
+    centered_queries = queries - places.mean(0)
+    brute, nearest = _timed(lambda: [_best_matches(rows @ centered.T) for rows in np.array_split(centered_queries, 10)])
+    single, _ = _timed(lambda: [_best_matches(row @ centered.T) for row in centered_queries[:50]])
     recall = [len(set(a) & set(b)) / FOUND for a, b in zip(found, np.concatenate(nearest), strict=True)]
     index.save()
     return {
@@ -176,14 +176,14 @@ def bench_index(folder: Path, options: Options) -> dict[str, Any]:
     }
 
 
-def _way(rng: np.random.Generator, count: int) -> Array:
+def _random_path(rng: np.random.Generator, count: int) -> Array:
     steps, out = rng.normal(size=(count, 24)), np.zeros((count, 24))
     for i in range(1, count):
         out[i] = 0.97 * out[i - 1] + 0.243 * steps[i]
     return out
 
 
-def _best(cosines: Array) -> Array:
+def _best_matches(cosines: Array) -> Array:
     return np.asarray(np.argpartition(-cosines, FOUND, axis=-1)[..., :FOUND])
 
 
@@ -225,7 +225,7 @@ def _drives(folder: Path, count: int, frames: int) -> list[Part]:
     for seed in range(count):
         lidar = LidarConfig(columns=900)
         simulate(folder / f"drive{seed}", DriveConfig(frames=frames, seed=seed, images=False, lidar=lidar))
-    return parts_of(read_drives([folder / f"drive{seed}" for seed in range(count)]), None, _FAST)
+    return parts_of(read_drives([folder / f"drive{seed}" for seed in range(count)]), None, _FAST_SETTINGS)
 
 
 def bench_kills(folder: Path, options: Options) -> dict[str, Any]:
@@ -242,14 +242,14 @@ def bench_kills(folder: Path, options: Options) -> dict[str, Any]:
                 calls += 1
                 if all(outcome.figures is not None for outcome in carry_out(parts, out, Cluster(), killer)):
                     break
-            equal += sum(_equal(out / part.name, folder / "alone" / part.name) for part in parts)
-            if left := [path.name for path in out.iterdir() if path.name.startswith(".")]:
-                raise Dpm2Error(f"{out}: left behind: {left}")
+            equal += sum(_are_equal(out / part.name, folder / "alone" / part.name) for part in parts)
+            if leftovers := [path.name for path in out.iterdir() if path.name.startswith(".")]:
+                raise Dpm2Error(f"{out}: left behind: {leftovers}")
     return {"kills": killer.kills, "drives": fleets * len(parts), "calls": calls, "equal": equal}
 
 
-def _equal(one: Path, other: Path) -> bool:
-    return all((one / name).read_bytes() == (other / name).read_bytes() for name in _SAME)
+def _are_equal(one: Path, other: Path) -> bool:
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in _COMPARED_FILES)
 
 
 def bench_workers(folder: Path, options: Options) -> dict[str, Any]:
@@ -260,8 +260,8 @@ def bench_workers(folder: Path, options: Options) -> dict[str, Any]:
     for workers in (1, 2):
         with Cluster(workers=workers) as cluster:
             cluster.start()
-            warm = [Part(f"w{n}", four[0].work, four[0].arguments, (), True, 1) for n in range(workers)]
-            list(_seconds(carry_out(warm, folder / f"warm{workers}", Cluster())))  # imports, compiled functions
+            warm_up = [Part(f"w{n}", four[0].work, four[0].arguments, (), True, 1) for n in range(workers)]
+            list(_seconds(carry_out(warm_up, folder / f"warm{workers}", Cluster())))  # imports, compiled functions
             began = time.perf_counter()
             seconds = list(_seconds(carry_out(four, folder / f"by{workers}", Cluster())))
             out[f"wall_s_{workers}"] = time.perf_counter() - began

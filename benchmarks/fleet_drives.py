@@ -29,26 +29,26 @@ STEP = 5.0
 """m between two keyframes."""
 _DRIFT = np.array([0, 0, 3e-4, 0.01, 0.006, 0.0])  # of the odometry, per keyframe, rad and m
 _COVARIANCE = isotropic(1e-3, 0.03)
-_TRAFFIC = 100.0  # s between two drives, so that the traffic differs
+_DRIVE_INTERVAL = 100.0  # s between two drives, so that the traffic differs
 
 
 def chained(files: Sequence[Path], meters: float, out: Path) -> None:
     """Write the first `meters` of each file of KITTI poses as one path; each road begins where the last one ends."""
-    parts, T_way_road = [], np.eye(4)
+    parts, T_path_road = [], np.eye(4)
     for file in files:
         poses = read_trajectory(file).poses
-        far = arc_lengths(poses[:, :3, 3])
-        part = T_way_road @ se3.inverse(poses[0]) @ poses[far < meters]
+        distance = arc_lengths(poses[:, :3, 3])
+        part = T_path_road @ se3.inverse(poses[0]) @ poses[distance < meters]
         parts.append(part[:-1])
-        T_way_road = part[-1]
+        T_path_road = part[-1]
     write_kitti(out, np.concatenate(parts))
 
 
 def poses_of(world: World, span: tuple[float, float], seed: int) -> Array:
     """(N, 4, 4) true keyframe poses of a drive, slightly off the lane; `span`: m of the path, `seed`: of the offset."""
     rng = np.random.default_rng(seed)
-    aside = se3.exp(np.append(rng.normal(size=3) * [0, 0, 0.02], rng.normal(size=3) * [0, 0.3, 0]))
-    return np.array([world.pose_at(float(s)) for s in np.arange(*span, STEP)]) @ aside
+    T_lane_drive = se3.exp(np.append(rng.normal(size=3) * [0, 0, 0.02], rng.normal(size=3) * [0, 0.3, 0]))
+    return np.array([world.pose_at(float(s)) for s in np.arange(*span, STEP)]) @ T_lane_drive
 
 
 def odometry_of(poses: Array) -> Array:
@@ -70,7 +70,7 @@ def write_drive(folder: Path, world: World, poses: Array, seed: int) -> None:
         store.begin_session("", weights_id(settings.neural.weights))
         mapper, edge = make_mapper(settings, store), None
         for number, T_world_kf in enumerate(poses):
-            scan = lidar.scan(world, T_world_kf, _TRAFFIC * seed + number / 2, rng)
+            scan = lidar.scan(world, T_world_kf, _DRIVE_INTERVAL * seed + number / 2, rng)
             if number:
                 T = se3.inverse(odometry[number - 1]) @ odometry[number]
                 edge = Registration(T, _COVARIANCE, 0.9, 0.05, "simulated")

@@ -47,41 +47,43 @@ def bench_growth(folder: Path) -> dict[str, Any]:
     """
     rng = np.random.default_rng(0)
     count = (KEYFRAMES - SHARED) * DRIVES + SHARED
-    way = _way(count)
-    looks = rng.normal(size=(count, WIDTH)).astype(np.float32)
+    path_poses = _circle(count)
+    place_vectors = rng.normal(size=(count, WIDTH)).astype(np.float32)
     index, sizes, rows = FleetIndex(folder), dict[str, int](), []
     with MapStore.create(folder / "town.dpm2map") as store:
         for number in range(DRIVES):
-            at = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
-            name, data = f"d{number:02d}", _drive(way[at], rng)
-            vectors = looks[at] + 0.1 * rng.normal(size=(KEYFRAMES, WIDTH)).astype(np.float32)
-            joins = _joins(f"d{number - 1:02d}", name, way, at) if number else []
-            rows.append({"map": sum(sizes.values()), **_added(store, index, sizes, (name, data, vectors), joins)})
+            indices = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
+            name, data = f"d{number:02d}", _drive(path_poses[indices], rng)
+            vectors = place_vectors[indices] + 0.1 * rng.normal(size=(KEYFRAMES, WIDTH)).astype(np.float32)
+            joins = _joins(f"d{number - 1:02d}", name, path_poses, indices) if number else []
+            rows.append(
+                {"map": sum(sizes.values()), **_measure_addition(store, index, sizes, (name, data, vectors), joins)}
+            )
             sizes[name] = KEYFRAMES
-    few, many = (_median(rows[last - _WINDOW : last]) for last in (5 + _WINDOW // 2 + 1, DRIVES))
+    at_5_drives, at_50_drives = (_median(rows[last - _WINDOW : last]) for last in (5 + _WINDOW // 2 + 1, DRIVES))
     return {
         "keyframes": KEYFRAMES * DRIVES,
-        "cpu_ms_at_5_drives": few,
-        "cpu_ms_at_50_drives": many,
-        "ratio": {part: many[part] / few[part] for part in few},
+        "cpu_ms_at_5_drives": at_5_drives,
+        "cpu_ms_at_50_drives": at_50_drives,
+        "ratio": {part: at_50_drives[part] / at_5_drives[part] for part in at_5_drives},
     }
 
 
 def bench_whole(folder: Path) -> dict[str, Any]:
     """Drives like those of `bench_growth`, 20,000 keyframes, into a new map, in a separate process: its memory."""
     rng = np.random.default_rng(1)
-    way = _way((KEYFRAMES - SHARED) * AT_ONCE + SHARED)
+    path_poses = _circle((KEYFRAMES - SHARED) * AT_ONCE + SHARED)
     joins: list[Join] = []
     for number in range(AT_ONCE):
-        at = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
-        save_as(_drive(way[at], rng), folder / f"d{number:03d}.dpm2map")
+        indices = np.arange(KEYFRAMES) + number * (KEYFRAMES - SHARED)
+        save_as(_drive(path_poses[indices], rng), folder / f"d{number:03d}.dpm2map")
         if number:
-            joins += _joins(f"d{number - 1:03d}", f"d{number:03d}", way, at)
+            joins += _joins(f"d{number - 1:03d}", f"d{number:03d}", path_poses, indices)
     with ProcessPoolExecutor(1, get_context("spawn")) as process:  # a forked one would include this one's memory
-        return process.submit(_at_once, folder, joins).result()
+        return process.submit(_create_whole, folder, joins).result()
 
 
-def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
+def _create_whole(folder: Path, joins: list[Join]) -> dict[str, Any]:
     """As in `merge`: the graph of all drives, then their maps into one file."""
     start, began = peak_mb(), time.process_time()
     with ExitStack() as stack:
@@ -102,12 +104,12 @@ def _at_once(folder: Path, joins: list[Join]) -> dict[str, Any]:
     }
 
 
-def _way(count: int) -> Array:
+def _circle(count: int) -> Array:
     """(N, 4, 4) true poses, 5 m apart, in a wide circle."""
     return np.asarray(se3.exp(np.arange(count)[:, None] * np.array([0, 0, 0.01, 5.0, 0, 0])))
 
 
-def _added(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tuple[str, MapData, Any],
+def _measure_addition(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tuple[str, MapData, Any],
            joins: list[Join]) -> dict[str, float]:  # fmt: skip
     """Processor time, ms, of each part of an addition."""
     name, data, vectors = drive
@@ -118,8 +120,8 @@ def _added(store: MapStore, index: FleetIndex, sizes: dict[str, int], drive: tup
     indexed = time.process_time()
     growth: Growth | None = Growth({name: data})
     if joins:
-        ties = list(zip(list(sizes), list(sizes)[1:], strict=False))
-        growth = grown(Standing(store, sizes, ties, RobustSettings(), LARGEST), {name: data}, joins)
+        links = list(zip(list(sizes), list(sizes)[1:], strict=False))
+        growth = grown(Standing(store, sizes, links, RobustSettings(), LARGEST), {name: data}, joins)
     assert growth is not None
     assert all(join.loop.ok for join in growth.joins)
     solved = time.process_time()
@@ -136,24 +138,24 @@ def _median(rows: list[dict[str, float]]) -> dict[str, float]:
 
 def _drive(poses: Array, rng: np.random.Generator) -> MapData:
     """The map of a drive in the frame of its first keyframe."""
-    clouds, own, edges = CloudStore(), [np.eye(4)], []
+    clouds, odometry, edges = CloudStore(), [np.eye(4)], []
     for number in range(len(poses)):
         clouds.append(pack_cloud(rng.uniform(-40, 40, (_POINTS, 4)).astype(np.float32)))
         if number:
             T = se3.inverse(poses[number - 1]) @ poses[number] @ se3.exp(rng.normal(size=6) * np.sqrt(np.diag(_NOISE)))
-            own.append(own[-1] @ T)
+            odometry.append(odometry[-1] @ T)
             edges.append(Edge("odometry", number - 1, number, Registration(T, _NOISE)))
-    keyframes = [Keyframe(i, i * 10**9, i, T, NO_POINTS, session=1) for i, T in enumerate(own)]
+    keyframes = [Keyframe(i, i * 10**9, i, T, NO_POINTS, session=1) for i, T in enumerate(odometry)]
     sessions = [Session(1, "0", "2026-01-01T00:00:00Z", "", "")]
-    return MapData(keyframes, np.array(own), edges, [], sessions, clouds)
+    return MapData(keyframes, np.array(odometry), edges, [], sessions, clouds)
 
 
-def _joins(one: str, other: str, way: Array, at: Any) -> list[Join]:
+def _joins(one: str, other: str, path_poses: Array, indices: Any) -> list[Join]:
     """Loops between the last keyframes of a drive and the first of the next, and to the neighbors of these."""
     pairs = [(a, b) for b in range(SHARED) for a in range(max(b - 2, 0), min(b + 3, SHARED))]
     first = KEYFRAMES - SHARED
     return [
         Join(one, other, Edge("loop", first + a, b,
-                              Registration(se3.inverse(way[at[a]]) @ way[at[b]], _NOISE)))
+                              Registration(se3.inverse(path_poses[indices[a]]) @ path_poses[indices[b]], _NOISE)))
         for a, b in pairs
     ]  # fmt: skip

@@ -22,10 +22,10 @@ from dpm2_core.slam.settings import SlamSettings
 from dpm2_core.tables import FigureTable, record_table
 
 _SECONDS = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
-_PLACES = 5
-_BEFORE, _WARM, _AFTER = 10, 40, 30  # frames: least number before a gap, largest number before and after it
-_WRONG = 1.0  # m, across the gap
-_CHI2 = 14.16  # for 3 degrees of freedom: 3 sigma
+_GAPS_PER_LENGTH = 5
+_MIN_BEFORE, _MAX_BEFORE, _MAX_AFTER = 10, 40, 30  # numbers of frames before and after a gap
+_WRONG_ERROR = 1.0  # m, across the gap
+_MAX_CHI2 = 14.16  # for 3 degrees of freedom: 3 sigma
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def gaps(stamps: Sequence[int]) -> Iterator[Gap]:
     period = frame_period(stamps)
     for seconds in _SECONDS:
         missing = round(seconds / period)
-        for place in evenly(len(stamps) - 2 * _BEFORE - missing + 1, _PLACES).tolist():
-            yield Gap(_BEFORE + place, _BEFORE + place + missing, seconds)
+        for place in evenly(len(stamps) - 2 * _MIN_BEFORE - missing + 1, _GAPS_PER_LENGTH).tolist():
+            yield Gap(_MIN_BEFORE + place, _MIN_BEFORE + place + missing, seconds)
 
 
 def bench_gaps(options: Options) -> Report:
@@ -66,29 +66,29 @@ def bench_gaps(options: Options) -> Report:
                     rows.append(evaluated(frames, truth, gap, settings))
                     progress.advance(task)
                 results[name][method] = {"summary": summary(rows), "gaps": rows}
-    return Report({"wrong_m": _WRONG, "drives": results}, _table(results))
+    return Report({"wrong_m": _WRONG_ERROR, "drives": results}, _table(results))
 
 
 def evaluated(
-    frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings, warm: int = _WARM
+    frames: Sequence[Frame], truth: Array, gap: Gap, settings: SlamSettings, warm: int = _MAX_BEFORE
 ) -> dict[str, Any]:
     """Results of the odometry after one gap, with at most `warm` frames before it; errors are of the motion since the
     last pose before it."""
     odometry = make_odometry(settings)
     before = [odometry.process(frame) for frame in frames[max(gap.first - warm, 0) : gap.first]][-1]
     last, base, errors, states, uncovered = before, np.zeros((6, 6)), [], [], 0
-    for i in range(gap.stop, min(gap.stop + _AFTER, len(frames))):
+    for i in range(gap.stop, min(gap.stop + _MAX_AFTER, len(frames))):
         tracked = odometry.process(measured_on(frames[gap.first : i + 1]) if i == gap.stop else frames[i])
         T_true = se3.inverse(truth[gap.first - 1]) @ truth[i]
         error = se3.log(se3.inverse(T_true) @ se3.inverse(before.T_odom_lidar) @ tracked.T_odom_lidar)[3:]
         errors.append(float(np.linalg.norm(error)))
         states.append(tracked.state)
-        covariance = _since(last, base, tracked)
-        uncovered += int(errors[-1] > _WRONG and error @ np.linalg.solve(covariance[3:, 3:], error) > _CHI2)
+        covariance = _accumulated_covariance(last, base, tracked)
+        uncovered += int(errors[-1] > _WRONG_ERROR and error @ np.linalg.solve(covariance[3:, 3:], error) > _MAX_CHI2)
         if tracked.registration.ok:
             last, base = tracked, covariance
     tracking = [i for i, state in enumerate(states) if state is State.TRACKING]
-    wrong = sum(errors[i] > _WRONG for i in tracking)
+    wrong = sum(errors[i] > _WRONG_ERROR for i in tracking)
     meters, degrees = se3.apart(truth[gap.first - 1], truth[gap.stop])
     return {
         "first": gap.first,
@@ -109,7 +109,7 @@ def measured_on(frames: Sequence[Frame]) -> Frame:
     return replace(frames[-1], imu=reduce(Inertial.then, imus) if imus else None)
 
 
-def _since(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:
+def _accumulated_covariance(last: OdometryResult, base: Array, tracked: OdometryResult) -> Array:
     """Covariance (6, 6) of a pose from `base`, that of the last registered pose; accumulated as in the ROS node."""
     A = se3.adjoint(se3.inverse(tracked.T_odom_lidar) @ last.T_odom_lidar)
     return np.asarray(A @ base @ A.T + tracked.covariance)
@@ -134,5 +134,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def _table(results: dict[str, Any]) -> FigureTable:
     columns = {"number": "{gaps}", "silently wrong": "{silently_wrong}", "beyond 3 sigma": "{uncovered}",
                "bridged": "{bridged}", "broken": "{broken}"}  # fmt: skip
-    rows = {drive: {name: method["summary"] for name, method in of.items()} for drive, of in results.items()}
+    rows = {drive: {name: method["summary"] for name, method in methods.items()} for drive, methods in results.items()}
     return record_table("After a gap in the stream", ["drive", "method", "gap"], columns, rows)

@@ -88,13 +88,13 @@ def kiss_icp(options: Options) -> Method:
     Raises:
         MissingPackageError: it is not installed.
     """
-    wanted = settings_of(options).preprocess.deskew
+    deskew_requested = settings_of(options).preprocess.deskew
     configs = {deskew: kiss_icp_config(options.threads, deskew) for deskew in (False, True)}
     from kiss_icp.kiss_icp import KissICP
 
     def run(frames: Sequence[Frame]) -> Trial:
         sweeps = [cloud_and_times(frame) for frame in frames]
-        deskew = wanted and any(frame.time_offset is not None for frame in frames)
+        deskew = deskew_requested and any(frame.time_offset is not None for frame in frames)
         odometry = KissICP(configs[deskew])
         poses, seconds = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
         cpu = process_time()
@@ -136,19 +136,19 @@ def bench_geometric(options: Options) -> Report:
             del frames
     notes = [] if BASELINE in methods else ["kiss-icp is not installed (pip install 'dpm2_ros[bench]'): no comparison."]
     for methods_of_drive in results.values():
-        _compare(methods_of_drive)
+        _add_ratios(methods_of_drive)
     shown = Group(view(results), *notes)
     return Report({"segment_lengths_m": LENGTHS, "truth": truth, "drives": results}, shown)
 
 
 def summary(truth: Array, trials: Sequence[Trial]) -> dict[str, Any]:
     """Medians of errors and speed over the repetitions, and the spread of the speed."""
-    checked = [evaluate(truth, trial.poses, LENGTHS, failed_frames=trial.failed) for trial in trials]
+    metrics = [evaluate(truth, trial.poses, LENGTHS, failed_frames=trial.failed) for trial in trials]
     fps = np.array([len(trial.seconds) / trial.seconds.sum() for trial in trials])
     seconds = np.concatenate([trial.seconds for trial in trials])
     stages = {stage: np.concatenate([trial.stages[stage] for trial in trials]) for stage in trials[0].stages}
     return {
-        **_median(checked),
+        **_median(metrics),
         "ape_rmse_m_of_thirds": _thirds(truth, trials[0].poses),
         "fps": float(np.median(fps)),
         "fps_of_repetitions": fps.round(4).tolist(),
@@ -164,16 +164,16 @@ def _thirds(truth: Array, poses: Array) -> list[float | None]:
     return [evaluate(truth[a:b], poses[a:b]).ape_rmse_m if b - a > 1 else None for a, b in pairwise(edges.tolist())]
 
 
-def _median(checked: Sequence[Metrics]) -> dict[str, Any]:
+def _median(runs: Sequence[Metrics]) -> dict[str, Any]:
     """The median of each figure; multi-threaded sums may differ in the last digits between runs."""
-    medians: dict[str, Any] = {name: getattr(checked[0], name) for name in ("frames", "path_length_m", "segments")}
+    medians: dict[str, Any] = {name: getattr(runs[0], name) for name in ("frames", "path_length_m", "segments")}
     for name in ("failed_frames", *_ERRORS):
-        values = [getattr(metrics, name) for metrics in checked]
+        values = [getattr(metrics, name) for metrics in runs]
         medians[name] = None if None in values else float(np.median(values))
     return medians
 
 
-def _compare(methods: dict[str, Any]) -> None:
+def _add_ratios(methods: dict[str, Any]) -> None:
     """Add the ratios of our figures to the baseline's; frame rates pairwise, since conditions vary over time."""
     if BASELINE not in methods:
         return

@@ -22,9 +22,9 @@ from dpm2_core.sim.simulated_drive import SimulatedDrive
 from dpm2_core.tables import FigureTable, record_table
 
 REGISTRATIONS = ("adaptive", "refined", "neural", "geometric")
-_BLIND = "slam.visual.enabled=false"
+_NO_IMAGES = "slam.visual.enabled=false"
 _SYNTHETIC_FRAMES = 80
-_RATES = tuple(f"every {every}" for every in EVERY)
+_RATE_CASES = tuple(f"every {every}" for every in EVERY)
 _SYNTHETIC: tuple[tuple[str, PresetName, int], ...] = (("loop", "city", 940_000), ("random", "suburb", 940_001))
 """Worlds that were not used in training, in addition to the real drives."""
 
@@ -38,7 +38,7 @@ def bench_hard(options: Options) -> Report:
         UsageError: there is no drive, or one has no ground truth.
     """
     makers: dict[str, Callable[[], Method]] = {
-        name: partial(dpm2, options, f"slam.registration={name}", _BLIND) for name in REGISTRATIONS
+        name: partial(dpm2, options, f"slam.registration={name}", _NO_IMAGES) for name in REGISTRATIONS
     }
     makers[BASELINE] = partial(kiss_icp, options)
     methods = installed({name: makers[name] for name in requested(options, makers)})
@@ -77,7 +77,7 @@ def draw(path: Path, results: Mapping[str, Any]) -> None:
 def _figures(case: Case, trial: Trial) -> dict[str, Any]:
     states: Sequence[State | None] = trial.states or [None] * len(case.frames)
     figures = {"frames": len(case.frames), "failed_frames": trial.failed, **judged(case, trial.poses, states)}
-    if case.name in _RATES:
+    if case.name in _RATE_CASES:
         metrics = evaluate(case.truth, trial.poses, failed_frames=trial.failed)
         figures |= {key: getattr(metrics, key) for key in ("rpe_trans_m", "rpe_rot_deg", "final_drift_percent")}
     return figures
@@ -101,5 +101,5 @@ def _table(results: Mapping[str, Any]) -> FigureTable:
 def _rates(results: Mapping[str, Any]) -> FigureTable:
     columns = {"RPE m": "{rpe_trans_m:.3f}", "RPE deg": "{rpe_rot_deg:.3f}", "drift %": "{final_drift_percent:.3f}",
                "failed": "{failed_frames}"}  # fmt: skip
-    rows = {drive: {rate: hard[rate] for rate in _RATES if rate in hard} for drive, hard in results.items()}
+    rows = {drive: {rate: hard[rate] for rate in _RATE_CASES if rate in hard} for drive, hard in results.items()}
     return record_table("Few frames per second", ["drive", "frames", "method"], columns, rows)

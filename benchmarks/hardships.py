@@ -21,12 +21,12 @@ EVERY = (1, 3, 6, 10)
 GAPS, BLIND = (1.0, 2.0, 3.0, 5.0), (1.0, 2.0, 3.0)  # s
 FOG = {"fog 40 m": (0.4, 40.0), "fog 20 m": (0.6, 20.0)}
 """Fraction of pulses that return from the fog, and visibility, m."""
-_BEFORE, _AFTER = 14, 14  # frames around a gap or a blind sensor
-_START = 18  # frames of a drive that starts in motion
-_AWAY = 2.0  # s, duration of a kidnapping
-_RIGHT = 0.5, 0.02  # m, and fraction of the distance: the largest error that is right
-_STILL = 3.0  # m/s: least speed of a start in motion
-_TURNING = 0.1  # rad/s: least rate of a start in a curve
+_FRAMES_BEFORE, _FRAMES_AFTER = 14, 14  # frames around a gap or a blind sensor
+_START_FRAMES = 18  # frames of a drive that starts in motion
+_KIDNAPPING_TIME = 2.0  # s, duration of a kidnapping
+_MAX_ERROR = 0.5, 0.02  # m, and fraction of the distance: the largest error that is right
+_MIN_SPEED = 3.0  # m/s: least speed of a start in motion
+_MIN_TURN_RATE = 0.1  # rad/s: least rate of a start in a curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,12 @@ def cases(frames: Sequence[Frame], truth: Array) -> Iterator[Case]:
         for seconds in lengths:
             missing = round(seconds / period)
             first = (count - missing) // 2
-            if min(first, count - first - missing) >= _AFTER // 2:
+            if min(first, count - first - missing) >= _FRAMES_AFTER // 2:
                 yield _interrupted(f"{kind} {seconds:g} s", frames, truth, first, missing)
     yield from _starts(frames, truth, period)
-    if count >= 3 * _AFTER // 2:
-        for name, (dust, sight) in FOG.items():
-            yield Case(name, [_foggy(frame, dust, sight) for frame in frames], truth)
+    if count >= 3 * _FRAMES_AFTER // 2:
+        for name, (dust, visibility) in FOG.items():
+            yield Case(name, [_foggy(frame, dust, visibility) for frame in frames], truth)
         yield _kidnapped(frames, truth)
 
 
@@ -82,7 +82,7 @@ def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str
         T_true, T = se3.inverse(case.truth[base]) @ case.truth[i], se3.inverse(poses[base]) @ poses[i]
         error = float(np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]))
         worst = max(worst, error)
-        if error > _RIGHT[0] + _RIGHT[1] * steps[base:i].sum():
+        if error > _MAX_ERROR[0] + _MAX_ERROR[1] * steps[base:i].sum():
             claimed = states[i] in (None, State.TRACKING)
             verdict = "silent" if claimed or verdict == "silent" else "said"
     return {"error_m": round(worst, 3), "verdict": verdict}
@@ -90,11 +90,11 @@ def judged(case: Case, poses: Array, states: Sequence[State | None]) -> dict[str
 
 def _interrupted(name: str, frames: Sequence[Frame], truth: Array, first: int, missing: int) -> Case:
     """Without some frames, or, for `blind`, with frames that contain only dirt on the window."""
-    start, stop = max(first - _BEFORE, 0), min(first + missing + _AFTER, len(frames))
-    between = range(first, first + missing) if name.startswith("blind") else range(0)
-    indices = [*range(start, first), *between, *range(first + missing, stop)]
-    seen = [_dirty(frames[i]) if i in between else frames[i] for i in indices]
-    return Case(name, seen, truth[indices], first - start + len(between), first - start - 1)
+    start, stop = max(first - _FRAMES_BEFORE, 0), min(first + missing + _FRAMES_AFTER, len(frames))
+    blind = range(first, first + missing) if name.startswith("blind") else range(0)
+    indices = [*range(start, first), *blind, *range(first + missing, stop)]
+    inputs = [_dirty(frames[i]) if i in blind else frames[i] for i in indices]
+    return Case(name, inputs, truth[indices], first - start + len(blind), first - start - 1)
 
 
 def _dirty(frame: Frame) -> Frame:
@@ -104,30 +104,30 @@ def _dirty(frame: Frame) -> Frame:
     return Frame(frame.stamp, points, index=frame.index)
 
 
-def _foggy(frame: Frame, dust: float, sight: float) -> Frame:
-    points, seen = in_fog(frame.points, dust, sight, np.random.default_rng(frame.index))
+def _foggy(frame: Frame, dust: float, visibility: float) -> Frame:
+    points, seen = in_fog(frame.points, dust, visibility, np.random.default_rng(frame.index))
     offset = None if frame.time_offset is None else frame.time_offset[seen]
     return replace(frame, points=points[seen], time_offset=offset)
 
 
 def _starts(frames: Sequence[Frame], truth: Array, period: float) -> Iterator[Case]:
     """Starts where the vehicle is fastest, and where it rotates fastest."""
-    room = len(frames) - _START
-    if room < 1:
+    n_starts = len(frames) - _START_FRAMES
+    if n_starts < 1:
         return
     motion = np.array([se3.way(a, b) / period for a, b in pairwise(truth)])
-    fast, turning = np.linalg.norm(motion[:room, 3:], axis=1), np.abs(motion[:room, 2])
-    for name, rate, least in (("start at speed", fast, _STILL), ("start in a curve", turning, _TURNING)):
+    fast, turning = np.linalg.norm(motion[:n_starts, 3:], axis=1), np.abs(motion[:n_starts, 2])
+    for name, rate, minimum in (("start at speed", fast, _MIN_SPEED), ("start in a curve", turning, _MIN_TURN_RATE)):
         i = int(rate.argmax())
-        if rate[i] >= least:
-            yield Case(name, list(frames[i : i + _START]), truth[i : i + _START])
+        if rate[i] >= minimum:
+            yield Case(name, list(frames[i : i + _START_FRAMES]), truth[i : i + _START_FRAMES])
 
 
 def _kidnapped(frames: Sequence[Frame], truth: Array) -> Case:
     """Moved back to an earlier position, 2 s later: the stamps continue."""
     half = len(frames) // 2
-    back = half // 4
-    again = range(back, min(back + _AFTER, half))
-    late = frames[half - 1].stamp + round(_AWAY * 1e9) - frames[back].stamp
-    seen = [*frames[:half], *(replace(frames[i], stamp=frames[i].stamp + late) for i in again)]
-    return Case("kidnapped", seen, truth[[*range(half), *again]], half, half - 1)
+    start = half // 4
+    revisited = range(start, min(start + _FRAMES_AFTER, half))
+    delay = frames[half - 1].stamp + round(_KIDNAPPING_TIME * 1e9) - frames[start].stamp
+    inputs = [*frames[:half], *(replace(frames[i], stamp=frames[i].stamp + delay) for i in revisited)]
+    return Case("kidnapped", inputs, truth[[*range(half), *revisited]], half, half - 1)

@@ -37,7 +37,7 @@ FRAMES = 200
 LIDAR = LidarConfig(beams=16, columns=1024, height=0.8, car_body=False, min_range=0.4)
 LENGTHS = (5.0, 10.0)
 """Lengths of the KITTI metric's segments, m."""
-WAYS: dict[str, Callable[[Frame], Frame]] = {
+VARIANTS: dict[str, Callable[[Frame], Frame]] = {
     "without": lambda frame: replace(frame, imu=None),
     "with": lambda frame: frame,
     "stops": lambda frame: frame if frame.index < FRAMES // 2 else replace(frame, imu=None),
@@ -46,7 +46,7 @@ WAYS: dict[str, Callable[[Frame], Frame]] = {
 CAR_FRAMES = 260
 CAR_LIDAR = LidarConfig()
 CAR = Ride(10.0, slows=0.8)  # accelerations of up to 2 m/s2
-_OF_PAUSES = ("without", "with")
+_PAUSE_VARIANTS = ("without", "with")
 
 
 def bench_imu(options: Options) -> Report:
@@ -58,19 +58,22 @@ def bench_imu(options: Options) -> Report:
             world = build_world("loop", preset, seed)
             robot = TurningRobot(world, FRAMES, Ride(speed, swings), real_sensor(LIDAR), imu)
             frames = list(progress.track(robot.frames(), total=FRAMES, description=name))
-            rates = _rates(robot.poses)
+            rates = _angular_rates(robot.poses)
             results[name] = {
                 "frames": FRAMES,
                 "path_length_m": path_length(robot.poses),
                 "fastest_turn_deg_s": float(rates.max()),
                 "frames_above_50_deg_s": int((rates > 50).sum()),
-                **{way: _drive(map(given, frames), robot.poses, settings) for way, given in WAYS.items()},
+                **{variant: _drive(map(change, frames), robot.poses, settings) for variant, change in VARIANTS.items()},
             }
             results[name]["ratio"] = results[name]["with"]["ape_rmse_m"] / results[name]["without"]["ape_rmse_m"]
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
         car = TurningRobot(build_world("loop", "suburb", 3), CAR_FRAMES, CAR, CAR_LIDAR, imu)
         frames = list(progress.track(car.frames(), total=CAR_FRAMES, description="car"))
-        pauses = {way: _pauses([WAYS[way](frame) for frame in frames], car.poses, settings) for way in _OF_PAUSES}
+        pauses = {
+            variant: _pauses([VARIANTS[variant](frame) for frame in frames], car.poses, settings)
+            for variant in _PAUSE_VARIANTS
+        }
     known = {"beams": LIDAR.beams, "imu": imu.model_dump(), "lengths_m": LENGTHS}
     return Report({**known, "worlds": results, "pauses": pauses}, Group(_table(results), _table_of_pauses(pauses)))
 
@@ -90,18 +93,18 @@ def _pauses(frames: Sequence[Frame], truth: Array, settings: SlamSettings) -> di
 def _drive(frames: Iterable[Frame], truth: Array, settings: SlamSettings) -> dict[str, Any]:
     tracked = list(map(make_odometry(settings).process, frames))
     poses = np.array([one.T_odom_lidar for one in tracked])
-    found = evaluate(truth, poses, LENGTHS)
+    metrics = evaluate(truth, poses, LENGTHS)
     return {
         "failed_frames": sum(not one.registration.ok for one in tracked),
         "frames_with_imu": sum(one.imu == "" for one in tracked),
-        "ape_rmse_m": found.ape_rmse_m,
-        "t_err_percent": found.t_err_percent,
-        "rpe_rot_deg": found.rpe_rot_deg,
+        "ape_rmse_m": metrics.ape_rmse_m,
+        "t_err_percent": metrics.t_err_percent,
+        "rpe_rot_deg": metrics.rpe_rot_deg,
         "worst_tilt_deg": float(_tilt(poses, truth).max()),
     }
 
 
-def _rates(poses: Array) -> NDArray[np.float64]:
+def _angular_rates(poses: Array) -> NDArray[np.float64]:
     """Angular rate of each step, deg/s."""
     return np.degrees(se3.angle(se3.inverse(poses[:-1]) @ poses[1:])) / FRAME_PERIOD
 
@@ -113,8 +116,8 @@ def _tilt(poses: Array, truth: Array) -> NDArray[np.float64]:
 
 
 def _table(worlds: dict[str, Any]) -> FigureTable:
-    columns = {f"APE m, {way}": f"{{{way}[ape_rmse_m]:.3f}}" for way in WAYS}
-    columns |= {f"worst tilt deg, {way}": f"{{{way}[worst_tilt_deg]:.3f}}" for way in WAYS}
+    columns = {f"APE m, {variant}": f"{{{variant}[ape_rmse_m]:.3f}}" for variant in VARIANTS}
+    columns |= {f"worst tilt deg, {variant}": f"{{{variant}[worst_tilt_deg]:.3f}}" for variant in VARIANTS}
     columns |= {"with / without": "{ratio:.2f}"}
     return record_table(f"{LIDAR.beams} beams, rotations of 100 deg/s", ["world"], columns, worlds)
 

@@ -62,13 +62,13 @@ def bench_indoor(options: Options) -> Report:
             simulate(Path(folder) / str(seed), config)
             results[name], mappers[name] = _drive(Path(folder) / str(seed), settings, progress, name)
             progress.console.print(f"{name}: {results[name]}", soft_wrap=True)
-            suited = settings.indoors() if results[name]["preset"] == "indoor" else settings
-            visits[name], dusty[name] = visits_to(config, suited)
+            visit_settings = settings.indoors() if results[name]["preset"] == "indoor" else settings
+            visits[name], dusty[name] = visits_to(config, visit_settings)
             results[name]["joins"] = joins(Path(folder) / str(seed), settings)
         for name, mapper in mappers.items():
             results[name]["relocalisation"] = found = relocalised(settings, mapper, visits, name)
-            results[name]["relocalisation_in_dust"] = beside = relocalised(settings, mapper, dusty, name)
-            progress.console.print(f"{name}: {found}, in dust {beside}", soft_wrap=True)
+            results[name]["relocalisation_in_dust"] = found_in_dust = relocalised(settings, mapper, dusty, name)
+            progress.console.print(f"{name}: {found}, in dust {found_in_dust}", soft_wrap=True)
     title = "relocalization from one scan, without a prior"
     clean = relocalise_table(results, "relocalisation", title)
     in_dust = relocalise_table(results, "relocalisation_in_dust", f"{title}, dust in {DUST:.0%} of the pulses")

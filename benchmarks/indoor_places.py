@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.loops import error_of
-from benchmarks.relocalise_visits import kept, looked_for, measured, success_rates
+from benchmarks.relocalise_visits import evaluate_visit, keyframe_cloud, preprocessed, success_rates
 from dpm2_core.data.corrupt import in_dust
 from dpm2_core.data.kitti import KittiSource
 from dpm2_core.data.settings import InputSettings
@@ -52,24 +52,24 @@ def visits_to(config: DriveConfig, settings: SlamSettings) -> tuple[list[Visit],
     """Random visits to the world of a drive, whose map begins where the drive does; and the same scans in dust."""
     world = build_world(config.road, config.preset, config.seed, fitting_length(config))
     lidar, rng = Lidar(config.lidar), np.random.default_rng(VISITS_SEED)
-    T_map_world, clear, dusty = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit](), list[Visit]()
+    T_map_world, clean, dusty = se3.inverse(world.drive_pose(0.0, HEIGHT)), list[Visit](), list[Visit]()
     for i in range(VISITS):
         T, time = world.sample_pose(rng, height=HEIGHT, sway=config.lidar.real.sway)
         T = T @ se3.exp(np.array([0, 0, rng.uniform(-np.pi, np.pi), 0, 0, 0]))
         scan = lidar.scan(world, T, time, rng).points
-        for visits, points in ((clear, scan), (dusty, in_dust(scan, DUST, np.random.default_rng(i)))):
-            cloud = kept(measured(Frame(0, points), settings), settings)
+        for visits, points in ((clean, scan), (dusty, in_dust(scan, DUST, np.random.default_rng(i)))):
+            cloud = keyframe_cloud(preprocessed(Frame(0, points), settings), settings)
             visits.append(Visit(Keyframe(i, 0, i, np.eye(4), cloud), T_map_world @ T))
-    return clear, dusty
+    return clean, dusty
 
 
 def relocalised(settings: SlamSettings, mapper: Mapper, visits: dict[str, list[Visit]], home: str) -> dict[str, Any]:
     """Visits to the world of the map, and how many visits to other worlds are wrongly located in the map."""
     localizer, rows, mistaken = make_localizer(settings, mapper), [], 0
-    for name, of_world in visits.items():
-        for visit in of_world:
+    for name, world_visits in visits.items():
+        for visit in world_visits:
             localizer.restart()
-            row = looked_for(lambda keyframe: localizer.add(keyframe).registration, visit.keyframe, visit.truth)
+            row = evaluate_visit(lambda keyframe: localizer.add(keyframe).registration, visit.keyframe, visit.truth)
             if name == home:
                 rows.append(row)
             else:
@@ -90,17 +90,17 @@ def joins(drive: Path, settings: SlamSettings) -> dict[str, int]:
                 run.run()
             with OfflineRun(drive, config, frames=second, map_file=file, map_mode="extend") as run:
                 run.run()
-                found[_joined(run.slam.mapper, source.poses)] += 1
+                found[_join_verdict(run.slam.mapper, source.poses)] += 1
     return {kind: found[kind] for kind in ("right", "apart", "wrong")}
 
 
-def _joined(mapper: Mapper, truth: Array) -> str:
+def _join_verdict(mapper: Mapper, truth: Array) -> str:
     start = mapper.session_start
     truth = truth[[keyframe.index for keyframe in mapper.keyframes]]
-    between = [loop for loop in mapper.loops if loop.ok and (loop.from_node < start) != (loop.to_node < start)]
-    if not between:
+    joining_loops = [loop for loop in mapper.loops if loop.ok and (loop.from_node < start) != (loop.to_node < start)]
+    if not joining_loops:
         return "apart"
-    return "wrong" if any(is_wrong(truth, loop) for loop in between) else "right"
+    return "wrong" if any(is_wrong(truth, loop) for loop in joining_loops) else "right"
 
 
 def is_wrong(truth: Array, loop: Edge) -> bool:

@@ -38,11 +38,12 @@ def bench_loop_cost(options: Options) -> Report:
     poses = np.tile(np.eye(4), (max(SIZES) + _MEASURED, 1, 1))
     poses[:, 0, 3] = 5.0 * np.arange(len(poses))  # a straight road of 100 km
     parts = np.zeros(len(poses), np.intp)  # all are connected
-    few = SIZES[0]
-    keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[:few])]
-    make_loops(settings).close(keyframes, [cloud] * few, poses[:few], parts[:few])  # lets torch allocate its memory
+    smallest = SIZES[0]
+    keyframes = [_keyframe(node, T, rng) for node, T in enumerate(poses[:smallest])]
+    # Lets torch allocate its memory.
+    make_loops(settings).close(keyframes, [cloud] * smallest, poses[:smallest], parts[:smallest])
     empty = resident_mb()
-    for node in tracked(range(few, len(poses)), "map"):
+    for node in tracked(range(smallest, len(poses)), "map"):
         keyframes.append(_keyframe(node, poses[node], rng))
     for size in SIZES:
         clouds = [cloud] * len(keyframes)
@@ -55,8 +56,8 @@ def bench_loop_cost(options: Options) -> Report:
         cost[str(size)] = round(1e3 * float(np.median(seconds)), 1)
     results: dict[str, Any] = {
         "cpu_ms": cost,
-        "ratio": round(cost[str(SIZES[-1])] / cost[str(few)], 2),
-        "rss_kb_a_keyframe": round(1e3 * (resident_mb() - empty) / (len(keyframes) - few), 1),
+        "ratio": round(cost[str(SIZES[-1])] / cost[str(smallest)], 2),
+        "rss_kb_a_keyframe": round(1e3 * (resident_mb() - empty) / (len(keyframes) - smallest), 1),
     }
     return Report(results, Group(str(results)))
 

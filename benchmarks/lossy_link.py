@@ -15,7 +15,7 @@ from dpm2_core.errors import UsageError
 
 LOSS = 0.01
 """Fraction of the packets dropped on arrival at either end of the link."""
-_INSIDE = "DPM2_OWN_NETWORK"
+_NAMESPACE_VARIABLE = "DPM2_OWN_NETWORK"
 _ROBOTS, _MAPPER = ("robots0", "10.73.0.1/24"), ("mapper0", "10.73.0.2/24")
 _RULES = """
 nft add table inet link
@@ -26,7 +26,7 @@ nft add rule inet link arriving iifname {name} numgen random mod 10000 '<' {shar
 
 def inside() -> bool:
     """Whether this process runs in the namespace created by `own_network`."""
-    return _INSIDE in os.environ
+    return _NAMESPACE_VARIABLE in os.environ
 
 
 def own_network(module: str) -> int:
@@ -39,7 +39,7 @@ def own_network(module: str) -> int:
     if os.geteuid() != 0 or missing:
         raise UsageError(f"a network namespace needs root and util-linux, iproute2, nftables; missing: {missing}")
     command = ["unshare", "--net", sys.executable, "-m", module, *sys.argv[1:]]
-    return subprocess.call(command, env=os.environ | {_INSIDE: "1"})
+    return subprocess.call(command, env=os.environ | {_NAMESPACE_VARIABLE: "1"})
 
 
 def make_link() -> None:

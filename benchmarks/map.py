@@ -52,7 +52,7 @@ _FRAMES = 120
 _DRIFT = np.array([0, 0, 2e-4, 0.01, 0.005, 0.0])  # of the odometry, per keyframe, rad and m
 
 # `dpm2 run` that reports on a pipe when the mapper has added a keyframe, which must then be in the file.
-_CHILD = """
+_CHILD_CODE = """
 import os, sys
 from dpm2_core.cli import main
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -98,11 +98,11 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
     truth = truth_of(source)
     command += [str(drive)]
     command += [word for setting in options.overrides for word in ("--set", setting)]
-    alone = folder / "alone.dpm2map"
+    uninterrupted = folder / "alone.dpm2map"
     started = time.perf_counter()
-    _run([*command, "--map", str(alone)], None)
+    _run([*command, "--map", str(uninterrupted)], None)
     duration = time.perf_counter() - started  # from the imports to the last image
-    rng, kills, finals = np.random.default_rng(0), [], []
+    rng, kills, finished_paths = np.random.default_rng(0), [], []
     path = folder / "killed0.dpm2map"
     for _ in tracked(range(kills_wanted), "kills"):
         before = _keyframes(path)
@@ -110,24 +110,24 @@ def crashes(folder: Path, options: Options, drive: Path | None = None) -> dict[s
             added = _run([*command, "--map", str(path), "--resume"], float(rng.uniform(0, 0.4 * duration)))
             if added is not None:
                 break
-            finals.append(path)  # it ended before the kill: start the next drive
-            path = folder / f"killed{len(finals)}.dpm2map"
+            finished_paths.append(path)  # it ended before the kill: start the next drive
+            path = folder / f"killed{len(finished_paths)}.dpm2map"
             before = 0
         result = check_map(path) if path.exists() else None
         after = _keyframes(path)
         kills.append({"opens": result is None or not result.problems, "lost": before + added - after})
     _run([*command, "--map", str(path), "--resume"], None)
-    finals.append(path)
-    ape = [_ape(final, truth) for final in (alone, *finals)]
+    finished_paths.append(path)
+    ape = [_ape(final, truth) for final in (uninterrupted, *finished_paths)]
     return {
         "frames": len(source),
-        "keyframes": _keyframes(alone),
+        "keyframes": _keyframes(uninterrupted),
         "kills": len(kills),
         "maps_that_open": sum(kill["opens"] for kill in kills),
         # Of the keyframes that the mapper had added; one that was being added is not counted, but may be in the file.
         "most_keyframes_lost": max(max(kill["lost"], 0) for kill in kills),
         "keyframes_in_flight_saved": sum(kill["lost"] < 0 for kill in kills),
-        "drives": len(finals),
+        "drives": len(finished_paths),
         "ape_m": {"uninterrupted": ape[0], "killed": ape[1:]},
         "seconds_uninterrupted": duration,
     }
@@ -142,7 +142,7 @@ def _run(arguments: list[str], kill_after: float | None) -> int | None:
     read, write = os.pipe()
     environment = os.environ | {"MPLBACKEND": "Agg"}
     child = subprocess.Popen(
-        [sys.executable, "-c", _CHILD, str(write), *arguments],
+        [sys.executable, "-c", _CHILD_CODE, str(write), *arguments],
         pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     os.close(write)
@@ -209,15 +209,15 @@ def bench_laps(folder: Path, options: Options) -> dict[str, Any]:
 def _lap(world: World, lap: int, previous: Keyframe | None) -> Iterator[tuple[Keyframe, Mask]]:
     """Keyframes every 5 m with drifting odometry, and which of their points move (M,)."""
     lidar, rng = Lidar(LidarConfig(columns=1024)), np.random.default_rng(lap)
-    at = np.arange(0.0, world.road.drive.length, 5.0)
-    for number, s in enumerate(tracked(at, f"lap {lap + 1}")):
+    distances = np.arange(0.0, world.road.drive.length, 5.0)
+    for number, s in enumerate(tracked(distances, f"lap {lap + 1}")):
         T_world_kf = world.pose_at(float(s))
         scan = lidar.scan(world, T_world_kf, 100.0 * lap + s / 8, rng)
         near = voxel_first(scan.points, 0.3, far=60.0)
-        node = lap * len(at) + number
+        node = lap * len(distances) + number
         edge, T_odom_kf = None, T_world_kf
         if previous is not None:
-            T = se3.inverse(world.pose_at(float(at[number - 1]))) @ T_world_kf @ se3.exp(_DRIFT)
+            T = se3.inverse(world.pose_at(float(distances[number - 1]))) @ T_world_kf @ se3.exp(_DRIFT)
             edge = Registration(T, isotropic(1e-3, 0.03), 0.9, 0.05, "simulated")
             T_odom_kf = previous.T_odom_kf @ T
         previous = Keyframe(node, node * 10**8, node, T_odom_kf, scan.points[near], edge)
@@ -240,8 +240,8 @@ def _moving(data: MapData, labels: list[Mask], settings: SlamSettings) -> dict[s
     removed = np.concatenate([masks[node] for node in own])
     points = np.concatenate([se3.transform(data.poses[node], data.clouds.whole(node)) for node in own])
     before = voxel_first(points, settings.map.voxel)
-    left = np.flatnonzero(~removed)
-    after = left[voxel_first(points[left], settings.map.voxel)]
+    remaining = np.flatnonzero(~removed)
+    after = remaining[voxel_first(points[remaining], settings.map.voxel)]
     return {
         "share_before": float(moving[before].mean()),
         "share_after": float(moving[after].mean()),

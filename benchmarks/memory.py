@@ -14,7 +14,7 @@ from dpm2_core.errors import UsageError
 from dpm2_core.slam.build import make_slam
 from dpm2_core.tables import FigureTable, record_table
 
-_EVERY = 50  # frames between two samples
+_SAMPLE_PERIOD = 50  # frames between two samples
 
 
 def bench_memory(options: Options) -> Report:
@@ -33,7 +33,7 @@ def bench_memory(options: Options) -> Report:
             samples = [(0, resident_mb())]
             for count, frame in enumerate(tracked(source.frames(), f"{name}: memory", len(source)), 1):
                 slam.process(frame)
-                if count % _EVERY == 0:
+                if count % _SAMPLE_PERIOD == 0:
                     samples.append((count, resident_mb()))
             results[name] = levelling(samples) | {"keyframes": len(slam.mapper.keyframes)}
     return Report({"drives": results}, _table(results))

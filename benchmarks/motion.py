@@ -33,7 +33,7 @@ WORLDS: dict[str, tuple[PresetName, int, int, tuple[str, ...]]] = {
 """Type of environment, seed, beams, and the rides through it."""
 FRAMES = 150
 OURS, BASELINE = ("dpm2", "dpm2 geometric"), "kiss-icp"
-_MOVING = 20  # frames, after which all shakes have begun
+_FIRST_EVALUATED = 20  # frames, after which all shakes have begun
 
 
 def bench_motion(options: Options) -> Report:
@@ -48,7 +48,7 @@ def bench_motion(options: Options) -> Report:
                 robot = TurningRobot(world, FRAMES, RIDES[name], real_sensor(lidar))
                 task = f"{place}, {name}"
                 frames = list(progress.track(robot.frames(), total=FRAMES, description=task))
-                results[task] = {way: _ours(frames, robot, s) for way, s in zip(OURS, settings, strict=True)}
+                results[task] = {variant: _ours(frames, robot, s) for variant, s in zip(OURS, settings, strict=True)}
                 results[task] |= installed({BASELINE: partial(_kiss, frames, robot, options.threads)})
                 progress.console.print(f"{task}: {results[task]}", soft_wrap=True)
     return Report({"frames": FRAMES, "rides": results}, _table(results))
@@ -76,8 +76,8 @@ def _kiss(frames: Iterable[Frame], robot: TurningRobot, threads: int) -> dict[st
 def _errors(poses: Array, truth: Array) -> dict[str, float]:
     """Errors of the steps from scan to scan: root mean square, and largest."""
     steps, true = (se3.inverse(T[:-1]) @ T[1:] for T in (poses, truth))
-    off = np.array([se3.magnitude(T) for T in (se3.inverse(true) @ steps)[_MOVING:]])
-    rms, worst = np.sqrt((off**2).mean(0)), off.max(0)
+    differences = np.array([se3.magnitude(T) for T in (se3.inverse(true) @ steps)[_FIRST_EVALUATED:]])
+    rms, worst = np.sqrt((differences**2).mean(0)), differences.max(0)
     return dict(zip(("rpe_m", "rpe_deg", "worst_m", "worst_deg"), [*rms.tolist(), *worst.tolist()], strict=True))
 
 

@@ -116,7 +116,7 @@ def _weights(name: str) -> dict[str, Any]:
     return {"name": name, "bytes": path.stat().st_size, "sha256": file_digest(path), **about}
 
 
-def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any]) -> Part:
+def _for_each_drive(evaluate: Callable[[Array, list[Frame], DeepPointMap2, Options], Any]) -> Part:
     """A part that runs the same function on every drive."""
 
     def part(network: DeepPointMap2, options: Options) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _of_drives(one: Callable[[Array, list[Frame], DeepPointMap2, Options], Any])
                 poses, frames = truth_of(source), list(source.frames())
                 if network.encoder.image is None:
                     frames = [replace(frame, images=()) for frame in frames]
-                found[name], truth[name] = one(poses, frames, network, options), source.truth
+                found[name], truth[name] = evaluate(poses, frames, network, options), source.truth
         return {"drives": found, "truth": truth}
 
     return part
@@ -171,15 +171,15 @@ def speed(poses: Array, frames: list[Frame], network: DeepPointMap2, options: Op
     peers, rounds = installed({BASELINE: partial(kiss_icp, options)}), []
     for _ in range(options.repetitions):
         rounds.append((stage_times(network, frames), {name: run(frames).seconds[1:] for name, run in peers.items()}))
-    best, beside = min(rounds, key=lambda r: r[0]["stages_ms"]["total"]["median"])
-    out: dict[str, Any] = {**best, **{name: quantiles_ms(seconds) for name, seconds in beside.items()}}
+    best, peer_seconds = min(rounds, key=lambda r: r[0]["stages_ms"]["total"]["median"])
+    out: dict[str, Any] = {**best, **{name: quantiles_ms(seconds) for name, seconds in peer_seconds.items()}}
     if BASELINE in out:
         out["ratio"] = round(best["stages_ms"]["total"]["median"] / out[BASELINE]["median"], 3)
     if network.encoder.image is None:
         out["with the camera"] = "not answered: these weights have no camera"
     else:
-        blind = stage_times(network, [replace(frame, images=()) for frame in frames])
-        out["without_camera_ms"] = blind["stages_ms"]["total"]
+        without_camera = stage_times(network, [replace(frame, images=()) for frame in frames])
+        out["without_camera_ms"] = without_camera["stages_ms"]["total"]
     return out
 
 
@@ -210,13 +210,13 @@ def stage_times(network: DeepPointMap2, frames: Sequence[Frame]) -> dict[str, An
 
 PARTS: Mapping[str, Part] = {
     "synthetic": synthetic,
-    "real": _of_drives(real_pairs),
-    "odometry": _of_drives(odometry),
+    "real": _for_each_drive(real_pairs),
+    "odometry": _for_each_drive(odometry),
     "corruption": corruption,
     "image": image_matters,
     "sensors": other_sensors,
     "overlap": overlap,
     "reference": repeated,
-    "speed": _of_drives(speed),
+    "speed": _for_each_drive(speed),
 }
 """Parts by name, as in `--only` and the JSON."""

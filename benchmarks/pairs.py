@@ -30,7 +30,7 @@ PairMethod = Callable[[Frame, Frame], Array | None]
 Pairs = Sequence[tuple[int, int]]
 FITTED = "neural, against fitted poses"
 """The errors of `neural` against poses corrected with the scans: see `fitted_poses`."""
-_MOVED = 1.0, 3.0  # m, deg: a larger correction is a wrong match
+_MAX_CORRECTION = 1.0, 3.0  # m, deg: a larger correction is a wrong match
 
 
 def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
@@ -39,7 +39,7 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
     Args:
         poses: (N, 4, 4) truth; pairs with an unknown pose are left out.
     """
-    n, at = len(poses), poses[:, :3, 3]
+    n, positions = len(poses), poses[:, :3, 3]
     kinds: dict[str, list[tuple[int, int]]] = {
         "consecutive": [(i, i + 1) for i in range(n - 1)],
         "8 apart": [(i, i + 8) for i in range(n - 8)],
@@ -47,10 +47,10 @@ def pairs_of(poses: Array, most: int) -> dict[str, list[tuple[int, int]]]:
     for kind, (low, high) in APART.items():
         rng, kinds[kind] = np.random.default_rng(0), []
         for i in range(n):
-            distance = np.linalg.norm(at[i + 1 :] - at[i], axis=1)
-            reach = np.flatnonzero((distance >= low) & (distance <= high))
-            if len(reach):
-                kinds[kind].append((i, i + 1 + int(rng.choice(reach))))
+            distance = np.linalg.norm(positions[i + 1 :] - positions[i], axis=1)
+            candidates = np.flatnonzero((distance >= low) & (distance <= high))
+            if len(candidates):
+                kinds[kind].append((i, i + 1 + int(rng.choice(candidates))))
     known: NDArray[np.bool_] = np.isfinite(poses.sum((1, 2)))
     out = {}
     for kind, pairs in kinds.items():
@@ -126,8 +126,8 @@ def fitted_poses(registration: ScanRegistration, frames: Sequence[Frame], pairs:
     for a, b in pairs:
         T = se3.inverse(poses[a]) @ poses[b]
         found = register(frames[a], frames[b], T)
-        near = found is not None and bool((np.array(se3.apart(T, found)) < _MOVED).all())
-        out.append(found if found is not None and near else T)
+        is_near = found is not None and bool((np.array(se3.apart(T, found)) < _MAX_CORRECTION).all())
+        out.append(found if found is not None and is_near else T)
     return out
 
 
@@ -145,9 +145,9 @@ def summarized(errors: Array) -> dict[str, float | int | None]:
     if not len(errors):
         return {"pairs": 0, "median_m": None, "median_deg": None, "success": None}
     median = np.median(errors, axis=0)
-    good = (errors < SUCCESS).all(1)
+    succeeded = (errors < SUCCESS).all(1)
     m, deg = (float(value) if np.isfinite(value) else None for value in median)
-    return {"pairs": len(errors), "median_m": m, "median_deg": deg, "success": float(good.mean())}
+    return {"pairs": len(errors), "median_m": m, "median_deg": deg, "success": float(succeeded.mean())}
 
 
 def all_pairs(

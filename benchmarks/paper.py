@@ -55,22 +55,22 @@ def bench_paper(options: Options) -> Report:
         for name, source in sources.items():
             frames = list(source.frames())
             truth, results[name] = truth_of(source), {}
-            for way in progress.track(requested(options, WAYS), description=name):
-                results[name][way] = _driven(settings_of(options, *WAYS[way]), frames, truth)
+            for variant in progress.track(requested(options, WAYS), description=name):
+                results[name][variant] = _evaluate_drive(settings_of(options, *WAYS[variant]), frames, truth)
     return Report({"settings": WAYS, "drives": results}, _table(results))
 
 
 def lap() -> SimulatedDrive:
     """A drive around a block, continuing into the street where it began."""
     drive = SimulatedDrive("loop", "suburb", 950_000, "suburb")
-    way = arc_lengths(drive.poses[:, :3, 3])
-    again = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
-    end = int(np.searchsorted(way, _LAPS * way[(way > 50) & (again < 10)][0]))
+    travelled = arc_lengths(drive.poses[:, :3, 3])
+    distance_to_start = np.linalg.norm(drive.poses[:, :3, 3] - drive.poses[0, :3, 3], axis=1)
+    end = int(np.searchsorted(travelled, _LAPS * travelled[(travelled > 50) & (distance_to_start < 10)][0]))
     drive.times, drive.poses = drive.times[:end:_EVERY], drive.poses[:end:_EVERY]
     return drive
 
 
-def _driven(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> dict[str, Any]:
+def _evaluate_drive(settings: SlamSettings, frames: Sequence[Frame], truth: Array) -> dict[str, Any]:
     trial, mapper = mapped(settings, frames)
     metrics = evaluate(truth, trial.poses, failed_frames=trial.failed)
     rows = {frame.index: row for row, frame in enumerate(frames)}  # an excerpt need not begin with scan 0

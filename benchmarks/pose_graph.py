@@ -25,11 +25,11 @@ from dpm2_core.slam.graph.robust import RobustSettings, least_squares, optimize
 from dpm2_core.slam.graph.worker import GraphWorker
 from dpm2_core.tables import FigureTable, record_table
 
-_STEP = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the generated drive's odometry
-_LOOP = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
-_RIGHT = (5.0, np.radians(5.0))  # m, rad: a loop with a larger error is wrong
+_ODOMETRY_SIGMAS = np.array([4e-4, 4e-4, 2e-3, 0.02, 0.02, 0.02])  # rad, m: noise of the generated drive's odometry
+_LOOP_SIGMAS = np.array([5e-3, 5e-3, 5e-3, 0.05, 0.05, 0.05])
+_MAX_LOOP_ERROR = (5.0, np.radians(5.0))  # m, rad: a loop with a larger error is wrong
 _FRAMES = 150  # of the processing loop that a solver disturbs
-_INJECTED = (60, 120, 200, 300)
+_WRONG_LOOP_COUNTS = (60, 120, 200, 300)
 _Mask = NDArray[np.bool_]
 
 
@@ -46,11 +46,11 @@ def bench_pose_graph(options: Options) -> Report:
     kitti = {}
     for alpha in ("0.00", "0.30", "0.60"):
         graph = read_g2o(folder / f"kitti_00_alpha_{alpha}.g2o").graph
-        kitti[alpha] = _row(truth, graph, are_right(truth, graph), options.repetitions) | _beside(truth, graph)
+        kitti[alpha] = _row(truth, graph, are_right(truth, graph), options.repetitions) | _gtsam_alone(truth, graph)
     injected = {}
     truth, clean = made_drive(0)
     reference = _row(truth, clean, are_right(truth, clean), 1)["ate_m"]
-    for wrong in _INJECTED:
+    for wrong in _WRONG_LOOP_COUNTS:
         truth, graph = made_drive(wrong)
         row = _row(truth, graph, are_right(truth, graph), options.repetitions)
         injected[str(wrong)] = row | {"ate_over_clean": row["ate_m"] / reference}
@@ -62,8 +62,10 @@ def bench_pose_graph(options: Options) -> Report:
 def are_right(truth: Array, graph: GraphData) -> _Mask:
     """(E,) whether each loop is within 5 m and 5 degrees of the true poses."""
     a, b = graph.ends.T
-    off = se3.inverse(graph.T_from_to) @ se3.inverse(truth[a]) @ truth[b]
-    return np.asarray((np.linalg.norm(off[:, :3, 3], axis=1) < _RIGHT[0]) & (se3.angle(off) < _RIGHT[1]))
+    errors = se3.inverse(graph.T_from_to) @ se3.inverse(truth[a]) @ truth[b]
+    return np.asarray(
+        (np.linalg.norm(errors[:, :3, 3], axis=1) < _MAX_LOOP_ERROR[0]) & (se3.angle(errors) < _MAX_LOOP_ERROR[1])
+    )
 
 
 def made_drive(wrong: int, count: int = 5000, right: int = 200) -> tuple[Array, GraphData]:
@@ -73,28 +75,30 @@ def made_drive(wrong: int, count: int = 5000, right: int = 200) -> tuple[Array, 
     """
     rng = np.random.default_rng(0)
     u = 2 * np.pi * np.arange(count) / 1250
-    at = np.stack([250 * np.sin(u) + 60 * np.sin(2 * u), 200 * np.sin(2 * u + 0.3) + 30 * np.cos(u), 5 * np.sin(u)], 1)
-    ahead = np.gradient(at, axis=0)
-    turn = np.zeros((count, 6))
-    turn[:, 2] = np.arctan2(ahead[:, 1], ahead[:, 0])
-    truth = se3.make(se3.exp(turn)[:, :3, :3], at)
+    positions = np.stack(
+        [250 * np.sin(u) + 60 * np.sin(2 * u), 200 * np.sin(2 * u + 0.3) + 30 * np.cos(u), 5 * np.sin(u)], 1
+    )
+    direction = np.gradient(positions, axis=0)
+    headings = np.zeros((count, 6))
+    headings[:, 2] = np.arctan2(direction[:, 1], direction[:, 0])
+    truth = se3.make(se3.exp(headings)[:, :3, :3], positions)
     steps = np.tile(np.eye(4), (count, 1, 1))
-    steps[1:] = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(rng.normal(size=(count - 1, 6)) * _STEP)
-    covariances = np.tile(np.diag(_STEP**2), (count, 1, 1))
+    steps[1:] = se3.inverse(truth[:-1]) @ truth[1:] @ se3.exp(rng.normal(size=(count - 1, 6)) * _ODOMETRY_SIGMAS)
+    covariances = np.tile(np.diag(_ODOMETRY_SIGMAS**2), (count, 1, 1))
     covariances[0] = 0
-    near = np.array(sorted(cKDTree(at).query_pairs(6.0)))
+    near = np.array(sorted(cKDTree(positions).query_pairs(6.0)))
     near = near[near[:, 1] - near[:, 0] > 200]
     ends = near[rng.choice(len(near), right, replace=False)]
     a, b = ends.T
-    T = se3.inverse(truth[a]) @ truth[b] @ se3.exp(rng.normal(size=(right, 6)) * _LOOP)
+    T = se3.inverse(truth[a]) @ truth[b] @ se3.exp(rng.normal(size=(right, 6)) * _LOOP_SIGMAS)
     pairs = np.sort(rng.integers(0, count, (20 * wrong + 1, 2)), axis=1)
-    apart = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-    false = pairs[(apart > 20) & (pairs[:, 1] - pairs[:, 0] > 200)][:wrong]
-    moves = np.zeros((len(false), 6))
-    moves[:, 2] = rng.uniform(-np.pi, np.pi, len(false))
-    moves[:, 3:] = rng.uniform(-2, 2, (len(false), 3))
-    ends, T = np.concatenate([ends, false]), np.concatenate([T, se3.exp(moves)])
-    loop_covariances = np.tile(np.diag(_LOOP**2), (len(ends), 1, 1))
+    distance = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    wrong_pairs = pairs[(distance > 20) & (pairs[:, 1] - pairs[:, 0] > 200)][:wrong]
+    wrong_motions = np.zeros((len(wrong_pairs), 6))
+    wrong_motions[:, 2] = rng.uniform(-np.pi, np.pi, len(wrong_pairs))
+    wrong_motions[:, 3:] = rng.uniform(-2, 2, (len(wrong_pairs), 3))
+    ends, T = np.concatenate([ends, wrong_pairs]), np.concatenate([T, se3.exp(wrong_motions)])
+    loop_covariances = np.tile(np.diag(_LOOP_SIGMAS**2), (len(ends), 1, 1))
     graph = GraphData(truth.copy(), np.arange(count) > 0, steps, covariances, ends, T, loop_covariances)
     return truth, replace(graph, poses=integrate(graph))
 
@@ -104,7 +108,7 @@ def disturbance(graph: GraphData) -> dict[str, Any]:
     work = np.random.default_rng(0).normal(size=(40_000, 3))
 
     def loop(worker: GraphWorker | None) -> tuple[list[float], int]:
-        taken, solved = [], 0
+        durations, solved = [], 0
         for _ in range(_FRAMES):
             if worker is not None:
                 solved += worker.take() is not None
@@ -112,9 +116,9 @@ def disturbance(graph: GraphData) -> dict[str, Any]:
                     worker.submit(graph, RobustSettings())
             began = time.perf_counter()
             cKDTree(work).query(work[:8000])
-            taken.append(time.perf_counter() - began)
-            time.sleep(max(0.0, 0.1 - taken[-1]))
-        return taken, solved
+            durations.append(time.perf_counter() - began)
+            time.sleep(max(0.0, 0.1 - durations[-1]))
+        return durations, solved
 
     loop(None)  # warm-up
     alone, _ = loop(None)
@@ -122,10 +126,10 @@ def disturbance(graph: GraphData) -> dict[str, Any]:
     try:
         worker.submit(graph, RobustSettings())
         worker.take(wait=True)
-        beside, solved = loop(worker)
+        with_solver, solved = loop(worker)
     finally:
         worker.close()
-    p95 = [float(np.percentile(taken, 95)) for taken in (alone, beside)]
+    p95 = [float(np.percentile(durations, 95)) for durations in (alone, with_solver)]
     return {"p95_alone_s": p95[0], "p95_beside_solver_s": p95[1], "ratio": p95[1] / p95[0], "solved": solved}
 
 
@@ -148,7 +152,7 @@ def _row(truth: Array, graph: GraphData, right: _Mask, repetitions: int) -> dict
     }
 
 
-def _beside(truth: Array, graph: GraphData) -> dict[str, Any]:
+def _gtsam_alone(truth: Array, graph: GraphData) -> dict[str, Any]:
     """gtsam alone on the whole graph: least squares, the Cauchy kernel, and graduated non-convexity."""
     nodes = np.flatnonzero(graph.chained)
     odometry = [(int(n) - 1, int(n), graph.steps[n], graph.step_covariances[n]) for n in nodes]

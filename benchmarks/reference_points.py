@@ -29,7 +29,7 @@ WITHIN = (0.2, 0.4)
 APART = (1, 3, 8)
 """Distance between the two frames, in frames."""
 WITH_IMAGES = "salient, with images"
-_CHOSEN_BY = {"farthest points": "fps", "salient": "salient", WITH_IMAGES: "salient"}
+_METHODS = {"farthest points": "fps", "salient": "salient", WITH_IMAGES: "salient"}
 _SIMULATED: tuple[PresetName, ...] = ("city", "suburb", "rural", "highway", "tunnel", "indoor", "car_park")
 _FRAMES, _SEED = 30, 950_000
 
@@ -72,22 +72,22 @@ def shares(frames: Sequence[Frame], poses: Array, network: NetworkSettings, most
     """Shares by method of selection and frames apart: the mean over at most `most` pairs."""
     cropped = [crop(frame.points, network.points) for frame in frames]
     out: dict[str, Any] = {}
-    for name, reference in _CHOSEN_BY.items():
+    for name, reference in _METHODS.items():
         if name == WITH_IMAGES and not (network.fusion.corners and any(frame.images for frame in frames)):
             continue
         settings = network.model_copy(update={"fusion": network.fusion.model_copy(update={"reference": reference})})
         images = [frame.images if name == WITH_IMAGES else () for frame in frames]
-        chosen = [_references(*scan, settings) for scan in zip(cropped, images, strict=True)]
+        references = [_references(*scan, settings) for scan in zip(cropped, images, strict=True)]
         out[name] = {}
         for apart in APART:
             starts = evenly(len(frames) - apart, most).tolist()
             pairs = [(a, a + apart) for a in starts if np.isfinite(poses[[a, a + apart]]).all()]
             distance = [
-                cKDTree(chosen[b]).query(se3.transform(se3.inverse(poses[b]) @ poses[a], chosen[a]))[0]
+                cKDTree(references[b]).query(se3.transform(se3.inverse(poses[b]) @ poses[a], references[a]))[0]
                 for a, b in pairs
             ]
-            met = {f"{limit} m": float(np.mean([(row < limit).mean() for row in distance])) for limit in WITHIN}
-            out[name][f"{apart} apart"] = {"pairs": len(pairs), **met}
+            fractions = {f"{limit} m": float(np.mean([(row < limit).mean() for row in distance])) for limit in WITHIN}
+            out[name][f"{apart} apart"] = {"pairs": len(pairs), **fractions}
     return out
 
 

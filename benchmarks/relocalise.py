@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from benchmarks.harness import Options, Report, processors, settings_of
 from benchmarks.relocalise_open import open_roads
-from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
+from benchmarks.relocalise_visits import evaluate_visit, keyframe_cloud, preprocessed, relocalizer_in, success_rates
 from benchmarks.roads import open_road, road_files
 from dpm2_core.console import progress_bar
 from dpm2_core.estimates import Keyframe, Registration, isotropic
@@ -34,7 +34,7 @@ LATERAL = (-1.2, 3.0)
 APART = 5000.0
 """Distance between the roads in the single map of all roads, m."""
 _NO_LOOPS = 1e9  # m between two keyframes of a loop
-_EDGE = isotropic(np.radians(0.15), 0.05)
+_EDGE_COVARIANCE = isotropic(np.radians(0.15), 0.05)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def bench_relocalise(options: Options) -> Report:
             task = progress.add_task("relocalise", total=options.pairs)
             rows = []
             for cloud, truth in visits(roads, settings, options.pairs):
-                rows.append(looked_for(relocalizer.find, Keyframe(0, 0, 0, np.eye(4), cloud), truth))
+                rows.append(evaluate_visit(relocalizer.find, Keyframe(0, 0, 0, np.eye(4), cloud), truth))
                 progress.advance(task)
             results = {"keyframes": len(data), "lateral_m": LATERAL, **success_rates(rows)}
         if not options.sources:
@@ -86,8 +86,8 @@ def survey(options: Options, settings: SlamSettings, file: Path, progress: Progr
             frames = spaced(drive, 5.0)
             task = progress.add_task(f"map of {drive.name}", total=len(frames))
             for i in frames:
-                cloud = kept(measured(drive.frame(i), settings), settings)
-                edge = Registration(np.eye(4), _EDGE, 1.0, 0.1, "survey") if mapper.keyframes else None
+                cloud = keyframe_cloud(preprocessed(drive.frame(i), settings), settings)
+                edge = Registration(np.eye(4), _EDGE_COVARIANCE, 1.0, 0.1, "survey") if mapper.keyframes else None
                 T = road.T_map_world @ drive.poses[i]
                 mapper.add(Keyframe(len(mapper.keyframes), i, i, T, cloud, edge))
                 progress.advance(task)
@@ -105,11 +105,11 @@ def visits(roads: list[Road], settings: SlamSettings, count: int) -> Iterator[tu
         s = rng.uniform(5, world.road.drive.length - 5)
         T = world.pose_at(s, rng.uniform(*LATERAL), rng.uniform(-np.pi, np.pi))
         scan = lidar.scan(world, T, rng.uniform(0, world.road.times[-1]), rng)
-        points = measured(Frame(0, scan.points), settings)
-        yield kept(points, settings), road.T_map_world @ T
+        points = preprocessed(Frame(0, scan.points), settings)
+        yield keyframe_cloud(points, settings), road.T_map_world @ T
 
 
 def spaced(drive: SimulatedDrive, meters: float) -> list[int]:
     """Frames of a drive that are `meters` apart along it."""
-    driven = drive.world.road.distance(drive.times)
-    return sorted({int(np.searchsorted(driven, s)) for s in np.arange(0, driven[-1], meters)})
+    distances = drive.world.road.distance(drive.times)
+    return sorted({int(np.searchsorted(distances, s)) for s in np.arange(0, distances[-1], meters)})

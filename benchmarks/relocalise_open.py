@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.relocalise_visits import kept, looked_for, measured, relocalizer_in, success_rates
+from benchmarks.relocalise_visits import evaluate_visit, keyframe_cloud, preprocessed, relocalizer_in, success_rates
 from dpm2_core.data.thumbnail import PLACE_WIDTH, thumbnail
 from dpm2_core.estimates import Keyframe
 from dpm2_core.frame import Array, Frame, Image
@@ -27,12 +27,12 @@ WORLDS: dict[PresetName, int] = {"highway": 951, "tunnel": 952}
 LENGTH = 1000.0
 """Length of each road, m, without added curves."""
 _CAMERA = CameraConfig(width=620, height=188, focal=360.0)
-_AHEAD = 0.1
+_MAX_HEADING = 0.1
 """Largest difference in heading from the map, rad: a camera that faces back sees another image."""
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Observation:
     """A pose on the road, with a frame from there."""
 
     T_map_lidar: Array
@@ -50,16 +50,18 @@ def open_roads(
     out: dict[str, Any] = {}
     for preset, seed in WORLDS.items():
         world, rng = build_world("random", preset, seed, LENGTH), np.random.default_rng(seed)
-        stops = np.arange(spacing, world.road.drive.length - spacing, spacing)
-        times = np.interp(stops, world.road.travelled, world.road.times).tolist()
-        road = [(world.pose_at(s), time) for s, time in zip(stops, times, strict=True)]
-        there = [world.sample_pose(rng, heading=_AHEAD) for _ in range(visits)]
-        task = progress.add_task(preset, total=len(road) + len(there))
-        seen = [_Seen(T, _frame(world, T, time, rng)) for T, time in progress.track(road + there, task_id=task)]
-        known, visited = seen[: len(road)], seen[len(road) :]
+        distances = np.arange(spacing, world.road.drive.length - spacing, spacing)
+        times = np.interp(distances, world.road.travelled, world.road.times).tolist()
+        road = [(world.pose_at(s), time) for s, time in zip(distances, times, strict=True)]
+        visit_poses = [world.sample_pose(rng, heading=_MAX_HEADING) for _ in range(visits)]
+        task = progress.add_task(preset, total=len(road) + len(visit_poses))
+        observations = [
+            _Observation(T, _frame(world, T, time, rng)) for T, time in progress.track(road + visit_poses, task_id=task)
+        ]
+        known, visited = observations[: len(road)], observations[len(road) :]
         out[preset] = {"keyframes": len(road)} | {
-            word: _relocalised(settings, network, known, visited, images)
-            for word, images in (("without images", False), ("with images", True))
+            label: _relocalised(settings, network, known, visited, images)
+            for label, images in (("without images", False), ("with images", True))
         }
     return out
 
@@ -71,16 +73,24 @@ def _frame(world: World, T: Array, time: float, rng: np.random.Generator) -> Fra
 
 
 def _relocalised(
-    settings: SlamSettings, network: DeepPointMap2, known: Sequence[_Seen], visited: Sequence[_Seen], images: bool
+    settings: SlamSettings,
+    network: DeepPointMap2,
+    known: Sequence[_Observation],
+    visited: Sequence[_Observation],
+    images: bool,
 ) -> dict[str, Any]:
     def keyframe(frame: Frame) -> Keyframe:
-        points = measured(frame, settings)
+        points = preprocessed(frame, settings)
         described = network.describe(Frame(0, points, images=frame.images if images else ()))
-        picture = thumbnail(frame.images[0], PLACE_WIDTH) if images else None
-        return Keyframe(0, 0, 0, np.eye(4), kept(points, settings), descriptors=described, thumbnail=picture)
+        small_image = thumbnail(frame.images[0], PLACE_WIDTH) if images else None
+        return Keyframe(
+            0, 0, 0, np.eye(4), keyframe_cloud(points, settings), descriptors=described, thumbnail=small_image
+        )
 
-    keyframes = [keyframe(place.frame) for place in known]
-    poses = np.stack([place.T_map_lidar for place in known])
+    keyframes = [keyframe(observation.frame) for observation in known]
+    poses = np.stack([observation.T_map_lidar for observation in known])
     in_map = KnownMap(keyframes, lambda n: keyframes[n].cloud, poses, lambda n: keyframes[n].thumbnail)
     find = relocalizer_in(settings, network, in_map).find
-    return success_rates([looked_for(find, keyframe(place.frame), place.T_map_lidar) for place in visited])
+    return success_rates(
+        [evaluate_visit(find, keyframe(observation.frame), observation.T_map_lidar) for observation in visited]
+    )

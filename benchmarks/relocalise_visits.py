@@ -35,18 +35,18 @@ def success_rates(rows: list[tuple[bool, float, float, float]]) -> dict[str, Any
     """Summary of results: found or not, error in m and degrees, seconds."""
     ok, meters, degrees, seconds = (np.array(column) for column in zip(*rows, strict=True))
     right = ok & (meters <= RIGHT_M) & (degrees <= RIGHT_DEG)
-    given = meters[ok]
+    found_errors = meters[ok]
     return {
         "visits": len(rows),
         "right": round(float(right.mean()), 4),
         "no_answer": int((~ok).sum()),
         "wrong": int((ok & ~right).sum()),
-        "median_error_m": round(float(np.median(given)), 4) if len(given) else None,
+        "median_error_m": round(float(np.median(found_errors)), 4) if len(found_errors) else None,
         "seconds": {f"p{q}": round(float(np.percentile(seconds, q)), 3) for q in (50, 95)},
     }
 
 
-def looked_for(
+def evaluate_visit(
     find: Callable[[Keyframe], Registration], visit: Keyframe, truth: Array
 ) -> tuple[bool, float, float, float]:
     """The result of a visit, for `success_rates`; `truth` T_map_lidar (4, 4)."""
@@ -56,11 +56,11 @@ def looked_for(
     return result.ok, *se3.apart(result.T_target_source, truth), seconds
 
 
-def measured(frame: Frame, settings: SlamSettings) -> Points:
+def preprocessed(frame: Frame, settings: SlamSettings) -> Points:
     """The points (N, 4) of a frame at rest, preprocessed as in the SLAM."""
     return Preprocessor(settings.preprocess).measured(frame, np.zeros(6))[0]
 
 
-def kept(points: Points, settings: SlamSettings) -> Points:
+def keyframe_cloud(points: Points, settings: SlamSettings) -> Points:
     """The (M, 4) of these points that a keyframe stores."""
     return points[voxel_first(points, settings.keyframes.voxel, far=settings.keyframes.range)]

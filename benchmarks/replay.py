@@ -30,15 +30,15 @@ def bench(
     figures = ("sent", "processed", "dropped", "lost", "sum", "playing s")
     title = f"{bag}, node and player started together"
     table = FigureTable(title, names=["played"], figures=figures, text=["remarks"])
-    wrong = 0
+    unaccounted = 0
     for played in PLAYED:
         for _ in range(times):
             sent, (_, *counts), rest, seconds = together(bag, played)
-            wrong += sum(counts) != sent
+            unaccounted += sum(counts) != sent
             row = (sent, *counts, sum(counts), f"{seconds:.1f}", rest.strip(", "))
             table.add_row(" ".join(played), *map(str, row))
     Console().print(table)
-    return 1 if wrong else 0
+    return 1 if unaccounted else 0
 
 
 def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], str, float]:
@@ -53,8 +53,8 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
     """
     with tempfile.TemporaryDirectory(prefix="dpm2_replay_") as folder:
         environment, logs = ros_environment(), Path(folder)
-        quiet = ["--ros-args", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
-        node = start("slam_node", quiet, environment, logs / "slam_node")
+        node_arguments = ["--ros-args", "-p", "ros.map_directory:=''", "-p", "use_sim_time:=true"]
+        node = start("slam_node", node_arguments, environment, logs / "slam_node")
         times = logs / "times.csv"
         player = start("bag_player", [str(bag), *played, "--log", str(times)], environment, logs / "bag_player")
         try:
@@ -62,11 +62,11 @@ def together(bag: Path, played: tuple[str, ...]) -> tuple[int, tuple[int, ...], 
             time.sleep(3.0)  # for the node's queue: ten clouds
         finally:
             player.kill()
-            ended = stop(node)
+            node_code = stop(node)
         message = {name: (logs / name).read_text(errors="replace") for name in ("slam_node", "bag_player")}
         account = _ACCOUNT.search(message["slam_node"])
         sent = re.search(r"(\d+) of them clouds", message["bag_player"])
-        if code or ended or account is None or sent is None:
+        if code or node_code or account is None or sent is None:
             raise Dpm2Error("a replay failed:\n" + "\n".join(message.values()))
         published = [int(line.rsplit(",", 1)[1]) for line in times.read_text().splitlines()[1:]]
         counts = tuple(int(number) for number in account.groups()[:4])

@@ -94,9 +94,9 @@ def _summary(roads: dict[str, Any]) -> dict[str, Any]:
     for name in ("accepted", "wrong"):
         total[name] = sum(road["loops"][name] for road in roads.values())
     for kind in ("same", "reverse", "cross"):
-        there = sum(road["loops"][kind]["revisits"] for road in roads.values())
+        revisits = sum(road["loops"][kind]["revisits"] for road in roads.values())
         found = sum(road["loops"][kind]["found"] for road in roads.values())
-        total[kind] = {"revisits": there, "found": found, "recall": round(found / there, 3) if there else None}
+        total[kind] = {"revisits": revisits, "found": found, "recall": round(found / revisits, 3) if revisits else None}
     return total
 
 

@@ -47,7 +47,7 @@ OUTAGE = (60, 90)
 _START, _PERIOD = 1_000_000_000, 100_000_000  # ns: stamps; the scans were taken at 10 Hz
 
 
-class _Scans(SpunNode):
+class _ScanPublisher(SpunNode):
     """Publishes the scans of all robots, and records the keyframes that they create."""
 
     def __init__(self, source: SimulatedDrive) -> None:
@@ -68,9 +68,13 @@ class _Scans(SpunNode):
 
     def connected(self) -> bool:
         """Whether all robots and the mapper are connected."""
-        heard = [self._node.count_publishers(f"/{name}/dpm2/keyframe_odom") for name in SPANS]
-        mapper = [self._node.count_publishers(f"/{name}/dpm2/keyframes_received") for name in SPANS]
-        return all(heard) and all(mapper) and all(lidar.get_subscription_count() for lidar in self._lidars.values())
+        publisher_counts = [self._node.count_publishers(f"/{name}/dpm2/keyframe_odom") for name in SPANS]
+        mapper_counts = [self._node.count_publishers(f"/{name}/dpm2/keyframes_received") for name in SPANS]
+        return (
+            all(publisher_counts)
+            and all(mapper_counts)
+            and all(lidar.get_subscription_count() for lidar in self._lidars.values())
+        )
 
     def send(self, tick: int) -> None:
         """Publish the next scan of each robot."""
@@ -88,7 +92,7 @@ def bench(
     source = open_road(path)
     with tempfile.TemporaryDirectory(prefix="dpm2_bench_robots_") as folder:
         data, made, missed = _drive(source, Path(folder))
-    errors, alone = _errors(source, data), _alone(source)
+    errors, alone = _errors(source, data), _single_robot_error(source)
     maps = int(parts_of(data).max()) + 1
     robots = {name: _evaluated(data, name, made[name], errors) for name in SPANS}
     results = {
@@ -118,14 +122,14 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
     """
     environment, path = ros_environment() | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, root / "town.dpm2map"
     processes: list[subprocess.Popen[bytes]] = []
-    scans: _Scans | None = None
+    scans: _ScanPublisher | None = None
     try:
         os.environ.update(environment)  # rclpy in this process reads it when it starts
         make_link()
         parameters = ["--ros-args", "-p", "ros.map_directory:=''", "-p", f"ros.map_file:={path}"]
         mapper = start_mapper(parameters, environment, root / "mapper.log")
         processes.append(mapper)
-        scans = _Scans(source)
+        scans = _ScanPublisher(source)
         for name in SPANS:
             processes.append(start("slam_node", _arguments(name), environment, root / f"{name}.log"))
         _wait(scans, scans.connected, "robots and mapper to start")
@@ -151,12 +155,12 @@ def _drive(source: SimulatedDrive, root: Path) -> tuple[MapData, dict[str, set[i
 
 
 def _arguments(name: str) -> list[str]:
-    given = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
+    parameters = ["input.points_topic:=points", "input.images:=false", "ros.embed_mapper:=false",
              f"ros.odom_frame:={name}/odom", "ros.map_directory:=''"]  # fmt: skip
-    return ["--ros-args", "-r", f"__ns:=/{name}", *(part for pair in given for part in ("-p", pair))]
+    return ["--ros-args", "-r", f"__ns:=/{name}", *(part for pair in parameters for part in ("-p", pair))]
 
 
-def _wait(scans: _Scans, condition: Any, what: str, seconds: float = 120.0) -> None:
+def _wait(scans: _ScanPublisher, condition: Any, what: str, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > end:
@@ -187,7 +191,7 @@ def _evaluated(data: MapData, name: str, made: set[int], errors: Array) -> dict[
     return {"keyframes": len(made), "keyframes_missing": len(made - ids), "ape_rmse_m": _rms(errors[own])}
 
 
-def _alone(source: SimulatedDrive) -> float:
+def _single_robot_error(source: SimulatedDrive) -> float:
     """APE of the keyframes of one robot that drives the whole road in one process, without ROS, m."""
     slam = make_slam(SlamSettings())
     for n in range(0, SPANS["green"][1], EVERY):

@@ -26,7 +26,7 @@ from dpm2_core.tables import record_table
 from tools.demo import Evaluation, evaluate_replay
 from tools.replay import replay
 
-WITH: dict[str, tuple[dict[str, object], bool]] = {
+VARIANTS: dict[str, tuple[dict[str, object], bool]] = {
     "": ({"input.imu_topic": "/none"}, False),
     ", IMU and all topics": ({}, True),
     ", neural": ({"input.imu_topic": "/none", "slam.registration": "neural"}, False),
@@ -51,12 +51,12 @@ def bench(
             work.mkdir()
             convert(KittiSource(drive.path), bag)
             source = BagSource(bag, InputSettings(images=False))
-            runs: dict[str, list[Evaluation]] = {name: [] for name in WITH}
+            runs: dict[str, list[Evaluation]] = {name: [] for name in VARIANTS}
             for _ in range(repetitions):
-                for name, (parameters, watched) in WITH.items():
+                for name, (parameters, watched) in VARIANTS.items():
                     played = replay(source, work, parameters=parameters, watched=watched)
                     runs[name].append(evaluate_replay(source, played, work))
-            results |= {f"{title}{name}": _figures(of) for name, of in runs.items()}
+            results |= {f"{title}{name}": _figures(evaluations) for name, evaluations in runs.items()}
     columns = {name: f"{{{name}:.4g}}" for name in FIGURES} | {"failed checks": "{failed_checks:.4g}"}
     table = record_table("Bag -> bag_player -> slam_node -> /dpm2/odom", ["drive"], columns, results)
     write_report(out / "ros.json", Report({"drives": results}, table), options, "python -m benchmarks.ros")

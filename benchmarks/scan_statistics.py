@@ -13,15 +13,15 @@ from dpm2_core.frame import Array
 
 RANGES = (5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 75.0)
 """Edges of the bins of distance, m."""
-_START = 0.02  # rad, largest azimuth offset from 0 at which a ring may begin
-_CELL = 1.5  # m, of ground that is taken as a plane
-_STEEP = 0.05  # of the range: largest difference of neighbors on one surface
+_MAX_START_AZIMUTH = 0.02  # rad, largest azimuth offset from 0 at which a ring may begin
+_CELL_SIZE = 1.5  # m, of ground that is taken as a plane
+_MAX_RANGE_STEP = 0.05  # of the range: largest difference of neighbors on one surface
 
 
 def rings_of(points: NDArray[np.float32]) -> NDArray[np.intp]:
     """(N,) ring of each point of a scan that is stored ring by ring, each from azimuth 0 up to 2 pi."""
     azimuth = np.arctan2(points[:, 1], points[:, 0])
-    wrapped = np.diff(np.where(azimuth < -_START, azimuth + 2 * np.pi, azimuth)) < -np.pi
+    wrapped = np.diff(np.where(azimuth < -_MAX_START_AZIMUTH, azimuth + 2 * np.pi, azimuth)) < -np.pi
     return np.concatenate([[0], np.cumsum(wrapped)])
 
 
@@ -91,10 +91,12 @@ def _origin(upper: Array) -> tuple[float, float]:
 def _ring_noise(ring: NDArray[np.intp], distance: Array, bins: NDArray[np.intp]) -> list[tuple[int, Array]]:
     """Second differences of ranges along rings, scaled to one return's standard deviation, by bins of distance."""
     a, b, c = distance[:-2], distance[1:-1], distance[2:]
-    same = (ring[:-2] == ring[2:]) & (np.abs(a - c) < _STEEP * b) & (np.abs(a + c - 2 * b) < _STEEP * b)
-    second = (a + c - 2 * b)[same] / np.sqrt(6)
-    of = bins[1:-1][same]
-    return [(k, second[of == k]) for k in range(len(RANGES) - 1)]
+    same_surface = (
+        (ring[:-2] == ring[2:]) & (np.abs(a - c) < _MAX_RANGE_STEP * b) & (np.abs(a + c - 2 * b) < _MAX_RANGE_STEP * b)
+    )
+    second = (a + c - 2 * b)[same_surface] / np.sqrt(6)
+    bin_of = bins[1:-1][same_surface]
+    return [(k, second[bin_of == k]) for k in range(len(RANGES) - 1)]
 
 
 def _lost(scan: NDArray[np.float32], ring: NDArray[np.intp], distance: Array, bins: NDArray[np.intp]) -> Array:
@@ -103,7 +105,12 @@ def _lost(scan: NDArray[np.float32], ring: NDArray[np.intp], distance: Array, bi
     gap = np.diff(azimuth)
     step = np.median(gap[(ring[1:] == ring[:-1]) & (gap > 0)])
     steps = np.rint(gap / step)
-    near = (ring[1:] == ring[:-1]) & (np.abs(np.diff(distance)) < _STEEP * distance[1:]) & (steps >= 1) & (steps <= 8)
+    near = (
+        (ring[1:] == ring[:-1])
+        & (np.abs(np.diff(distance)) < _MAX_RANGE_STEP * distance[1:])
+        & (steps >= 1)
+        & (steps <= 8)
+    )
     out = np.zeros((2, len(RANGES) - 1))
     for k in range(len(RANGES) - 1):
         chosen = steps[near & (bins[1:] == k)]
@@ -115,19 +122,19 @@ def _plane_residuals(scan: NDArray[np.float32], ring: NDArray[np.intp]) -> Array
     """(M, 3) bin of distance, ring and signed distance, m, to the plane of the cell, for points on flat ground."""
     low = (scan[:, 2] < -0.8) & (np.hypot(scan[:, 0], scan[:, 1]) < RANGES[-1])
     points, rings = scan[low, :3].astype(float), ring[low]
-    _, cell, count = np.unique(np.floor(points[:, :2] / _CELL), axis=0, return_inverse=True, return_counts=True)
+    _, cell, count = np.unique(np.floor(points[:, :2] / _CELL_SIZE), axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
     mean = np.stack([np.bincount(cell, points[:, k]) for k in range(3)], -1) / count[:, None]
     centered = points - mean[cell]
     outer = np.zeros((len(count), 3, 3))
     np.add.at(outer, cell, centered[:, :, None] * centered[:, None])
     values, vectors = np.linalg.eigh(outer / count[:, None, None])
-    even = (count >= 30) & (np.abs(vectors[:, 2, 0]) > 0.98) & (values[:, 0] < 0.06**2) & (values[:, 1] > 0.25**2)
+    is_flat = (count >= 30) & (np.abs(vectors[:, 2, 0]) > 0.98) & (values[:, 0] < 0.06**2) & (values[:, 1] > 0.25**2)
     normal = vectors[:, :, 0] * np.sign(vectors[:, 2:, 0])
-    chosen = even[cell]
-    away = np.einsum("ij,ij->i", centered[chosen], normal[cell[chosen]])
+    chosen = is_flat[cell]
+    distance = np.einsum("ij,ij->i", centered[chosen], normal[cell[chosen]])
     bins = np.digitize(np.linalg.norm(points[chosen], axis=1), RANGES) - 1
-    return np.stack([bins, rings[chosen], away], -1)
+    return np.stack([bins, rings[chosen], distance], -1)
 
 
 def _ring_bias(residual: Array) -> float | None:

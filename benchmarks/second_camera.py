@@ -53,10 +53,10 @@ def bench() -> int:
     table = FigureTable("Pairs 1 to 5 m apart by descriptors alone", names=["world", "cameras"], figures=figures)
     for kind, seeds in WORLDS.items():
         rows = np.concatenate([errors(network, kind, seed) for seed in seeds], axis=1)
-        for way, errors_of_way in zip(WAYS, rows, strict=True):
-            found = summarized(errors_of_way)
+        for cameras, variant_errors in zip(WAYS, rows, strict=True):
+            found = summarized(variant_errors)
             values = (f"{found['pairs']}", *(f"{found[key]:.2f}" for key in ("median_m", "median_deg", "success")))
-            table.add_row(kind, " and ".join(way) or "none", *values)
+            table.add_row(kind, " and ".join(cameras) or "none", *values)
         table.add_section()
     Console().print(table)
     return 0
@@ -69,13 +69,15 @@ def errors(network: DeepPointMap2, kind: PresetName, seed: int) -> Array:
     for T, frame in tracked(_frames(world, network), f"{kind} {seed}", FRAMES):
         images = {image.camera.name: image for image in frame.images}
         poses.append(T)
-        described.append([network.describe(replace(frame, images=tuple(images[n] for n in way))) for way in WAYS])
+        described.append(
+            [network.describe(replace(frame, images=tuple(images[n] for n in variant))) for variant in WAYS]
+        )
     pairs = [(a, a + k) for k in APART for a in range(FRAMES - k)]
     out = np.zeros((len(WAYS), len(pairs), 2))
-    for way in range(len(WAYS)):
+    for variant in range(len(WAYS)):
         for number, (a, b) in enumerate(pairs):
-            found = network.register(described[b][way], described[a][way]).T_target_source
-            out[way, number] = se3.apart(se3.inverse(poses[a]) @ poses[b], found)
+            found = network.register(described[b][variant], described[a][variant]).T_target_source
+            out[variant, number] = se3.apart(se3.inverse(poses[a]) @ poses[b], found)
     return out
 
 
@@ -85,15 +87,15 @@ def _frames(world: World, network: DeepPointMap2) -> Iterator[tuple[Array, Frame
     config = training_camera(network.settings)
     start = float(world.road.distance(1.0))
     times = np.arange(1.0, 20.0, 0.005)
-    at = np.interp(start + STEP * np.arange(FRAMES), [float(world.road.distance(t)) for t in times], times)
-    for number, time in enumerate(at.tolist()):
+    stamps = np.interp(start + STEP * np.arange(FRAMES), [float(world.road.distance(t)) for t in times], times)
+    for number, time in enumerate(stamps.tolist()):
         T = world.drive_pose(time)
         images = []
         for name, yaw in YAWS.items():
-            ahead = calibration(config)
-            turned = se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) @ ahead.T_lidar_cam
-            pixels = render(world, config, T @ turned, time, rng)
-            images.append(Image(pixels, replace(ahead, T_lidar_cam=turned, name=name)))
+            camera = calibration(config)
+            T_lidar_cam = se3.exp([0, 0, np.radians(yaw), 0, 0, 0]) @ camera.T_lidar_cam
+            pixels = render(world, config, T @ T_lidar_cam, time, rng)
+            images.append(Image(pixels, replace(camera, T_lidar_cam=T_lidar_cam, name=name)))
         yield T, Frame(round(time * 1e9), lidar.scan(world, T, time, rng).points, images=tuple(images), index=number)
 
 

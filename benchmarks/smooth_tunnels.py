@@ -35,12 +35,14 @@ AFTER = (40, 70)
 
 def bench() -> int:
     """Errors in each tunnel."""
-    heads = [f"{way} IMU, m after {n / 10:g} s" for way in ("with", "without") for n in AFTER]
-    table = FigureTable("Smooth tunnels", names=["tunnel"], figures=heads)
+    headings = [f"{variant} IMU, m after {n / 10:g} s" for variant in ("with", "without") for n in AFTER]
+    table = FigureTable("Smooth tunnels", names=["tunnel"], figures=headings)
     for seed in tracked(SEEDS, "tunnels"):
         frames, truth = drive(seed)
-        blind = (replace(f, imu=None) for f in frames)
-        table.add_row(str(seed), *(f"{off:.2f}" for of in (frames, blind) for off in errors(of, truth)))
+        without_imu = (replace(f, imu=None) for f in frames)
+        table.add_row(
+            str(seed), *(f"{error:.2f}" for inputs in (frames, without_imu) for error in errors(inputs, truth))
+        )
     Console().print(table)
     return 0
 
@@ -50,17 +52,21 @@ def drive(seed: int) -> tuple[list[Frame], Array]:
     world = build_world("straight", "tunnel", seed=seed, length=200.0)
     lidar = LidarConfig(beams=16, columns=512)
     car = TurningRobot(world, KNOWN + max(AFTER), Ride(10.0, slows=0.8), lidar, ImuConfig())
-    dull = [replace(frame, points=frame.points * np.array([1, 1, 1, 0], np.float32)) for frame in car.frames()]
-    told = (replace(frame, guess=Guess(T)) for frame, T in zip(dull[:KNOWN], car.poses, strict=False))
-    return [*told, *dull[KNOWN:]], car.poses
+    without_intensity = [
+        replace(frame, points=frame.points * np.array([1, 1, 1, 0], np.float32)) for frame in car.frames()
+    ]
+    with_guess = (
+        replace(frame, guess=Guess(T)) for frame, T in zip(without_intensity[:KNOWN], car.poses, strict=False)
+    )
+    return [*with_guess, *without_intensity[KNOWN:]], car.poses
 
 
 def errors(frames: Iterable[Frame], truth: Array) -> list[float]:
     """Position error, m, after each of `AFTER`."""
     settings = SlamSettings.model_validate({"registration": "geometric"})
     poses = np.array([t.T_odom_lidar for t in map(make_odometry(settings).process, frames)])
-    apart = se3.inverse(se3.inverse(truth[:1]) @ truth) @ se3.inverse(poses[:1]) @ poses
-    return [float(np.linalg.norm(apart[KNOWN + n - 1, :3, 3])) for n in AFTER]
+    T_error = se3.inverse(se3.inverse(truth[:1]) @ truth) @ se3.inverse(poses[:1]) @ poses
+    return [float(np.linalg.norm(T_error[KNOWN + n - 1, :3, 3])) for n in AFTER]
 
 
 if __name__ == "__main__":

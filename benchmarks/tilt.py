@@ -27,7 +27,7 @@ TILTS = (0, 15, 30)
 APART = (1, 3, 8)
 AXES = ("level", "sensor")
 """Axes of the descriptors: level axes if the sensor is tilted, as in the SLAM, or always the sensor's axes."""
-_RANDOM = 35.0  # degrees: each scan is also tilted by up to this, about its own axis
+_MAX_RANDOM_TILT = 35.0  # degrees: each scan is also tilted by up to this, about its own axis
 
 
 def bench_tilt(options: Options) -> Report:
@@ -40,26 +40,26 @@ def bench_tilt(options: Options) -> Report:
     network = load_network(s.neural.weights, options.threads)
     with drives(options) as sources, processors(options.threads):
         named = tracked(sources.items(), "drives")
-        results = {name: _of_drive(source, network, options.pairs) for name, source in named}
+        results = {name: _evaluate_drive(source, network, options.pairs) for name, source in named}
     return Report({"drives": results}, _table(results))
 
 
-def _of_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
+def _evaluate_drive(source: Source, network: DeepPointMap2, most: int) -> dict[str, Any]:
     poses, frames = truth_of(source), list(source.frames())
     pairs = [(a, a + n) for n in APART for a in evenly(len(frames) - n, most).tolist()]
     noise = np.random.default_rng(0)
     out: dict[str, Any] = {}
-    for tilt, turned in product((*map(str, TILTS), "random"), (False, True)):
+    for tilt, is_opposite in product((*map(str, TILTS), "random"), (False, True)):
         mounts = [_mount(tilt, noise) for _ in frames]
-        others = [mount @ se3.exp([0, 0, np.pi * turned, 0, 0, 0]) for mount in mounts]
-        row = out.setdefault(tilt, {})["opposite" if turned else "same"] = {}
+        others = [mount @ se3.exp([0, 0, np.pi * is_opposite, 0, 0, 0]) for mount in mounts]
+        row = out.setdefault(tilt, {})["opposite" if is_opposite else "same"] = {}
         for axes in AXES:
-            target = _described(network, frames, mounts, {a for a, _ in pairs}, axes)
-            seen = _described(network, frames, others, {b for _, b in pairs}, axes)
+            target_descriptors = _describe(network, frames, mounts, {a for a, _ in pairs}, axes)
+            source_descriptors = _describe(network, frames, others, {b for _, b in pairs}, axes)
             errors: dict[int, list[tuple[float, float]]] = {n: [] for n in APART}
             for a, b in pairs:
                 T_true = mounts[a] @ se3.inverse(poses[a]) @ poses[b] @ se3.inverse(others[b])
-                T = network.register(seen[b], target[a]).T_target_source
+                T = network.register(source_descriptors[b], target_descriptors[a]).T_target_source
                 errors[b - a].append(se3.apart(T_true, T))
             row[axes] = {f"{n} apart": summarized(np.array(rows).reshape(-1, 2)) for n, rows in errors.items()}
     return out
@@ -69,15 +69,15 @@ def _mount(tilt: str, noise: np.random.Generator) -> Array:
     """T_tilted_level (4, 4) of a scan."""
     if tilt != "random":
         return se3.exp([0, np.radians(int(tilt)), 0, 0, 0, 0])
-    heading, angle = noise.uniform(0, 2 * np.pi), np.radians(noise.uniform(0, _RANDOM))
+    heading, angle = noise.uniform(0, 2 * np.pi), np.radians(noise.uniform(0, _MAX_RANDOM_TILT))
     return se3.exp([angle * np.cos(heading), angle * np.sin(heading), 0, 0, 0, 0])
 
 
-def _described(
-    network: DeepPointMap2, frames: Sequence[Frame], mounts: Sequence[Array], wanted: set[int], axes: str
+def _describe(
+    network: DeepPointMap2, frames: Sequence[Frame], mounts: Sequence[Array], indices: set[int], axes: str
 ) -> dict[int, Descriptors]:
     out = {}
-    for i in sorted(wanted):
+    for i in sorted(indices):
         points = se3.transform(mounts[i], frames[i].points).astype(np.float32)
         if axes == "level":
             out[i] = network.describe(Frame(i, points))

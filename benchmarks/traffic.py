@@ -124,18 +124,18 @@ def summarized(drives: dict[str, Any]) -> dict[str, Any]:
     for registration in REGISTRATIONS:
         rows = [d["runs"][registration] for d in drives.values() if registration in d["runs"]]
         for method in dict.fromkeys(m for row in rows for m in row):
-            having = [row for row in rows if method in row]
-            found, none = (_figures([row[m] for row in having if m in row]) for m in (method, "none"))
+            rows_with_method = [row for row in rows if method in row]
+            found, none = (_figures([row[m] for row in rows_with_method if m in row]) for m in (method, "none"))
             found["ratio"] = {key: found[key] / none[key] for key in found if "rpe" in key}
             out.setdefault(registration, {})[method] = found
     return out
 
 
 def _figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    rpe, turn = [run["rpe_trans_m"] for run in runs], [run["rpe_rot_deg"] for run in runs]
+    rpe, rotation = [run["rpe_trans_m"] for run in runs], [run["rpe_rot_deg"] for run in runs]
     return {
         "drives": len(runs), "rpe_m": mean(rpe), "spread_m": pstdev(rpe), "median_rpe_m": median(rpe),
-        "rpe_deg": mean(turn), "median_rpe_deg": median(turn), "diverged": sum(e > LOST for e in rpe),
+        "rpe_deg": mean(rotation), "median_rpe_deg": median(rotation), "diverged": sum(e > LOST for e in rpe),
         "cpu_ms": median(run["cpu_ms"] for run in runs),
     }  # fmt: skip
 

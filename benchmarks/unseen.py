@@ -31,7 +31,7 @@ _SEEDS = {"mixed": 910_000, "highway": 920_000, "tunnel": 930_000}
 _WORLDS = {"mixed": 8, "highway": 2, "tunnel": 2}
 _FRAMES = 24
 _NO_CAMERA = "not answered: these weights have no camera"
-_SMALLEST = 128  # least number of points that remain of an obstructed scan
+_MIN_POINTS = 128  # least number of points that remain of an obstructed scan
 
 
 def unseen_drives(network: DeepPointMap2, options: Options, kind: str = "mixed") -> Path:
@@ -41,9 +41,13 @@ def unseen_drives(network: DeepPointMap2, options: Options, kind: str = "mixed")
         return named if named.is_dir() else options.unseen
     camera = network.encoder.image is not None
     root = options.cache / f"{network.settings.preset}_{'camera' if camera else 'lidar'}" / kind
-    only: dict[PresetName, float] = {} if kind == "mixed" else {kind: 1.0}  # type: ignore[dict-item]
+    mixture: dict[PresetName, float] = {} if kind == "mixed" else {kind: 1.0}  # type: ignore[dict-item]
     settings = GenerateSettings(worlds=_WORLDS[kind], first_seed=_SEEDS[kind], frames=_FRAMES)
-    changes: dict[str, Any] = {"images": camera, "preset": network.settings.preset, "mixture": only or settings.mixture}
+    changes: dict[str, Any] = {
+        "images": camera,
+        "preset": network.settings.preset,
+        "mixture": mixture or settings.mixture,
+    }
     generate(root, settings.model_copy(update=changes), options.threads)
     return root
 
@@ -52,17 +56,19 @@ def synthetic(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     """Pairs up to 5, 20 and 50 m apart, straight and with any yaw; highways and tunnels apart, see `image_matters`."""
     pairs = _pairs(network, options, "mixed", 2 * options.pairs)
     rows = pairs.errors(network)
-    near, turned = rows[:, 0] <= NEAR, rows[:, 1] > 0
+    near, is_turned = rows[:, 0] <= NEAR, rows[:, 1] > 0
     drive_of = {i: pairs.drives[key[0]] for key, i in pairs.frames.items()}
-    shaped = np.array([drive_of[pair[0]].about.get("preset") not in ("highway", "tunnel") for pair in pairs.pairs])
+    has_structure = np.array(
+        [drive_of[pair[0]].about.get("preset") not in ("highway", "tunnel") for pair in pairs.pairs]
+    )
     kinds = {
-        "up to 5 m": near & ~turned & shaped,
-        "up to 20 m": ~turned & shaped,
-        "up to 5 m, any yaw": near & turned & shaped,
-        "up to 20 m, any yaw": turned & shaped,
-        "up to 20 m, highway and tunnel": ~shaped,
+        "up to 5 m": near & ~is_turned & has_structure,
+        "up to 20 m": ~is_turned & has_structure,
+        "up to 5 m, any yaw": near & is_turned & has_structure,
+        "up to 20 m, any yaw": is_turned & has_structure,
+        "up to 20 m, highway and tunnel": ~has_structure,
     }
-    good = rows[:, 2] < 0.6
+    is_right = rows[:, 2] < 0.6
     found = {kind: {"neural": summarized(rows[chosen, 2:4])} for kind, chosen in kinds.items()}
     for low, high in ((20, 30), (30, 50)):
         farther = _pairs(network, options, "mixed", 4 * options.pairs, high).errors(network)
@@ -70,11 +76,11 @@ def synthetic(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     return {
         "pairs": found,
         # With 6 degrees of freedom a median of 5.35 would mean that the covariance is exactly right.
-        "median_chi2": float(np.median(rows[good, 4])) if good.any() else None,
+        "median_chi2": float(np.median(rows[is_right, 4])) if is_right.any() else None,
     }
 
 
-class _Changed:
+class _ChangedDrive:
     """A packed drive whose samples are changed as they are read."""
 
     def __init__(self, drive: PackedDrive, change: Callable[[Sample, int], Sample]) -> None:
@@ -95,7 +101,7 @@ def blackened(sample: Sample, index: int) -> Sample:
 def obstructed(sample: Sample, index: int) -> Sample:
     """The sample without the points behind a box near the sensor, different for each frame."""
     hidden = hidden_by(random_box(np.random.default_rng([index, 5])), sample.cloud)
-    return sample if (~hidden).sum() < _SMALLEST else sample._replace(cloud=sample.cloud[~hidden])
+    return sample if (~hidden).sum() < _MIN_POINTS else sample._replace(cloud=sample.cloud[~hidden])
 
 
 def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
@@ -105,7 +111,7 @@ def corruption(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     changes = {"LiDAR obstruction 100 %": obstructed, **({"camera failure 100 %": blackened} if camera else {})}
     for name, change in changes.items():
         pairs = _pairs(network, options, "mixed", options.pairs)
-        pairs.drives = [_Changed(drive, change) for drive in pairs.drives]  # type: ignore[misc]
+        pairs.drives = [_ChangedDrive(drive, change) for drive in pairs.drives]  # type: ignore[misc]
         rows[name] = pairs.errors(network)
     out: dict[str, Any] = {"pairs": {name: {"neural": summarized(found[:, 2:4])} for name, found in rows.items()}}
     clean = np.median(rows["clean"][:, 2])
@@ -129,11 +135,11 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
         methods: dict[str, Array] = {}
         for images in (True, False) if camera else (False,):
             pairs.images = images
-            word = "with camera" if images else "without camera"
-            methods[f"descriptors {word}"] = pairs.errors(network)[:, [0, 2, 3]]
+            label = "with camera" if images else "without camera"
+            methods[f"descriptors {label}"] = pairs.errors(network)[:, [0, 2, 3]]
             for name in ("neural", "refined"):
                 registered = by_registration(make_registration(settings_of(options, f"slam.registration={name}")))
-                methods[f"{name} {word}"] = _near_errors(pairs, registered)
+                methods[f"{name} {label}"] = _near_errors(pairs, registered)
         methods |= {name: _near_errors(pairs, register) for name, register in peers.items()}
         near = methods["descriptors without camera"][:, 0] <= NEAR
         out["pairs"][f"{kind}, up to 5 m"] = {name: summarized(rows[near, 1:]) for name, rows in methods.items()}
@@ -144,7 +150,7 @@ def image_matters(network: DeepPointMap2, options: Options) -> dict[str, Any]:
 
 def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
     """(pairs, 3) distance m, translation error m, rotation error deg; infinite without a result and for far pairs."""
-    frames = {i: _turned(pairs, key, i) for key, i in pairs.frames.items()}
+    frames = {i: _turned_frame(pairs, key, i) for key, i in pairs.frames.items()}
     rows = []
     for source, target, T, distance in pairs.pairs:
         found = register(frames[target], frames[source]) if distance <= NEAR else None
@@ -153,12 +159,12 @@ def _near_errors(pairs: PairSet, register: PairMethod) -> Array:
     return np.array(rows)
 
 
-def _turned(pairs: PairSet, key: tuple[int, int, float], number: int) -> Frame:
+def _turned_frame(pairs: PairSet, key: tuple[int, int, float], number: int) -> Frame:
     """The frame of a pair as `PairSet` passes it to the network."""
     drive, index, yaw = key
-    turn, sample = se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index]
-    cloud = se3.transform(turn, sample.cloud)
-    images = tuple(in_encoded_axes(image, turn[:3, :3], 1.0) for image in sample.images if pairs.images)
+    T_yaw, sample = se3.exp([0, 0, yaw, 0, 0, 0]), pairs.drives[drive][index]
+    cloud = se3.transform(T_yaw, sample.cloud)
+    images = tuple(in_encoded_axes(image, T_yaw[:3, :3], 1.0) for image in sample.images if pairs.images)
     return Frame(number, np.c_[cloud, np.zeros(len(cloud))].astype(np.float32), images=images, index=number)
 
 

@@ -41,10 +41,10 @@ def other_sensors(network: DeepPointMap2, options: Options) -> dict[str, Any]:
     for name, clean in SENSORS.items():
         folder = sensor_drives(name, network, options)
         rows = PairSet(folder, MANY * options.pairs, network.settings, images=False).errors(network)
-        near, turned = rows[:, 0] <= FARTHEST, rows[:, 1] > 0
-        out[f"{name}, up to {FARTHEST:g} m"] = {"neural": summarized(rows[near & ~turned, 2:4])}
+        near, is_turned = rows[:, 0] <= FARTHEST, rows[:, 1] > 0
+        out[f"{name}, up to {FARTHEST:g} m"] = {"neural": summarized(rows[near & ~is_turned, 2:4])}
         if clean.pattern == "spinning":
-            out[f"{name}, up to {FARTHEST:g} m, any yaw"] = {"neural": summarized(rows[near & turned, 2:4])}
+            out[f"{name}, up to {FARTHEST:g} m, any yaw"] = {"neural": summarized(rows[near & is_turned, 2:4])}
     return {"pairs": out}
 
 
@@ -70,8 +70,8 @@ def drive(
     samples = list[Sample]()
     for _ in range(scans):
         T, time = world.sample_pose(noise, height=height, sway=sway)
-        own = np.random.default_rng([seed, len(samples)])
-        scan = lidar.drive_scan(world, T @ lidar.T_level_lidar, time, own)
+        scan_noise = np.random.default_rng([seed, len(samples)])
+        scan = lidar.drive_scan(world, T @ lidar.T_level_lidar, time, scan_noise)
         level = se3.transform(lidar.T_level_lidar, scan.points).astype(np.float32)
         samples.append(Sample(crop(level, network.points), T, ()))
     write_packed(folder, samples, {"source": "synthetic city", "preset": place, "seed": seed})

@@ -26,7 +26,7 @@ from tools.browser import SOFTWARE, chromium
 
 _VOXEL = 0.3
 """Voxel size of the page, m: the default of `dpm2 map export`."""
-_TURNING = """async () => {
+_ROTATE_SCRIPT = """async () => {
   const canvas = document.querySelector("canvas"), at = (type, x) =>
     canvas.dispatchEvent(new PointerEvent(type, {clientX: x, clientY: 400, button: 0, pointerId: 1, bubbles: true}));
   canvas.setPointerCapture = () => {};
@@ -53,24 +53,24 @@ def bench_views(options: Options) -> Report:
     with drives(options) as sources, processors(options.threads):
         for name, source in sources.items():
             with tempfile.TemporaryDirectory(prefix="dpm2_views_") as folder:
-                place = Path(folder)
-                row = _recorded(source, options, place)
-                page = place / "map.html"
-                with MapStore.open(place / "drive.dpm2map") as store:
+                work = Path(folder)
+                row = _measure_run(source, options, work)
+                page = work / "map.html"
+                with MapStore.open(work / "drive.dpm2map") as store:
                     data = load_map(store, descriptors=False)
                     write_map_page(page, data, _VOXEL)
                 megabytes = round(page.stat().st_size / 1e6, 2)
-                row["page"] = {"keyframes": len(data.poses), "megabytes": megabytes, **_looked_at(page)}
+                row["page"] = {"keyframes": len(data.poses), "megabytes": megabytes, **_measure_page(page)}
                 results[name] = row
     return Report({"drives": results}, _table(results))
 
 
-def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
+def _measure_run(source: Source, options: Options, work: Path) -> dict[str, Any]:
     """Seconds of a run, and the part of them that fed the view; writes `drive.dpm2map`."""
     shown = 0.0
     with (
-        OfflineRun(source, configuration_of(options), map_file=place / "drive.dpm2map") as drive,
-        LiveView(source.name, viewer=False, record=place / "run.rrd") as live,
+        OfflineRun(source, configuration_of(options), map_file=work / "drive.dpm2map") as drive,
+        LiveView(source.name, viewer=False, record=work / "run.rrd") as live,
         progress_bar() as progress,
     ):
         task = progress.add_task(source.name, total=len(drive))
@@ -90,11 +90,11 @@ def _recorded(source: Source, options: Options, place: Path) -> dict[str, Any]:
         "seconds_without_view": round(seconds - shown, 3),
         "seconds_of_view": round(shown, 3),
         "view_cost": round(shown / (seconds - shown), 4),
-        "recording_megabytes": round((place / "run.rrd").stat().st_size / 1e6, 1),
+        "recording_megabytes": round((work / "run.rrd").stat().st_size / 1e6, 1),
     }
 
 
-def _looked_at(path: Path) -> dict[str, float]:
+def _measure_page(path: Path) -> dict[str, float]:
     """Seconds until points and until all of them are drawn, and frames per second while the map is rotated."""
     program = chromium()
     if program is None:
@@ -114,7 +114,7 @@ def _looked_at(path: Path) -> dict[str, float]:
                 while not page.evaluate(f"Boolean(window.dpm2 && {drawn})"):
                     page.wait_for_timeout(10)
                 seconds.append(round(perf_counter() - begun, 2))
-            rate = float(page.evaluate(_TURNING))
+            rate = float(page.evaluate(_ROTATE_SCRIPT))
         finally:
             browser.close()
     return {"seconds_to_first": seconds[0], "seconds_to_all": seconds[1], "frames_per_second": round(rate, 1)}
