@@ -55,11 +55,11 @@ def bench(
     from benchmarks.harness import Options, write_report
 
     names = names or ["geometric"]
-    every: dict[str, Any] = {
+    all_options: dict[str, Any] = {
         "source": source, "repetitions": repetitions, "threads": threads, "set": settings,
         "unseen": unseen, "pairs": pairs, "only": only,
     }  # fmt: skip
-    given = {option: value for option, value in every.items() if value is not None}
+    given = {option: value for option, value in all_options.items() if value is not None}
     check_options(names, given)
     fields = {"source": "sources", "set": "overrides"}
     options = Options(out=out, **{fields.get(option, option): value for option, value in given.items()})

@@ -59,11 +59,11 @@ def eval_(
 
     if settings and not is_drive(gt):
         raise UsageError(f"--set {settings[0]}: applies only if --gt is a drive, and {gt} is not one")
-    chosen = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
+    segment_lengths = parse_lengths(lengths) if lengths else OFFICIAL_LENGTHS
     estimate, frame = read_trajectory(est), FRAME_AS_GIVEN
     if is_drive(gt):
         stamped = estimate.kind == "tum"
-        truth, sensor = _of_drive(gt, settings or [], stamped, lidar=stamped and calib is None)
+        truth, sensor = _drive_truth(gt, settings or [], stamped, lidar=stamped and calib is None)
         frame = FRAME_OF_DRIVE.format(sensor)
     else:
         truth = read_trajectory(gt)
@@ -71,16 +71,16 @@ def eval_(
         estimate, frame = in_camera_frame(estimate, calib), FRAME_CAMERA
     true, est_poses, keys = matched(truth, estimate)
     stamps = keys if "tum" in (truth.kind, estimate.kind) else stamps_of(keys)
-    metrics = evaluate(true, est_poses, chosen, stamps=stamps).model_copy(update={"truth": str(gt)})
+    metrics = evaluate(true, est_poses, segment_lengths, stamps=stamps).model_copy(update={"truth": str(gt)})
     figures = {"gt": str(gt), "est": str(est), "frame": frame, **metrics.model_dump()}
-    both = known(true) & known(est_poses)
-    if have_other_axes(true[both], est_poses[both]):
+    common = known(true) & known(est_poses)
+    if have_other_axes(true[common], est_poses[common]):
         note(OTHER_AXES)
     table = metrics_table(metrics, title=f"{est} against {gt}", frame=frame, failed=UNESTIMATED)
     show(table, figures, json_file)
 
 
-def _of_drive(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
+def _drive_truth(path: Path, settings: list[str], stamped: bool, lidar: bool) -> tuple[Trajectory, str]:
     """Ground truth of all frames of a drive, NaN for frames without a pose, and the name of the sensor.
 
     As in the files that `dpm2 run` writes, keys are stamps or frame numbers, and poses those of the LiDAR, or of the

@@ -96,13 +96,13 @@ def experiment(
         workers=workers,
     )
     with progress_bar() as bar:
-        parts, frame = bar.add_task(name, total=None), bar.add_task("", total=None, visible=False)
+        part_task, frame_task = bar.add_task(name, total=None), bar.add_task("", total=None, visible=False)
 
         def frames_done(part: str, done: int, total: int) -> None:
-            bar.update(frame, description=part, completed=done, total=total, visible=done < total)
+            bar.update(frame_task, description=part, completed=done, total=total, visible=done < total)
 
         def part_done(part: str, done: int, total: int) -> None:
-            bar.update(parts, completed=done, total=total)
+            bar.update(part_task, completed=done, total=total)
             bar.console.print(f"{part}: done", soft_wrap=True)
 
         findings = carry_out(name, request, Progress(frames_done, part_done))

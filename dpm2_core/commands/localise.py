@@ -49,18 +49,18 @@ class LocalizationReport:
 
     def __init__(self, localizer: Localizer) -> None:
         self._localizer = localizer
-        self._before = localizer.state
+        self._previous_state = localizer.state
         self.stamps: list[int] = []
         self.poses: list[Array] = []
         self._frames: Counter[State] = Counter()
-        self._first: int | None = None
+        self._first_located: int | None = None
         self._events: list[dict[str, Any]] = []
-        self._reason = ""  # why the last keyframe was not localized, as long as none was
+        self._not_found_reason = ""  # why the last keyframe was not localized, as long as none was
         self._unreadable = ""  # why the map could not be read, the first time
 
     def add(self, result: SlamResult) -> str:
         """Add the result of the next frame. Returns a line about its event, or an empty text if there is none."""
-        before, self._before = self._before, self._localizer.state
+        before, self._previous_state = self._previous_state, self._localizer.state
         tracked, located = result.odometry, None if result.map is None else result.map.located
         state = State.LOST if tracked.state is State.LOST else self._localizer.state
         number = self._frames.total()
@@ -70,21 +70,21 @@ class LocalizationReport:
             self.poses.append(result.T_map_lidar)
         if located is not None and located.unreadable:
             self._unreadable = self._unreadable or located.registration.reason
-        if located is not None and self._first is None and not located.registration.ok:
-            self._reason = located.registration.reason
+        if located is not None and self._first_located is None and not located.registration.ok:
+            self._not_found_reason = located.registration.reason
         if located is None or located.state is before or located.state is State.TRACKING:
             return ""
-        jumped = located.state is State.RELOCALIZED
-        kind = "kidnapped" if jumped and before.located else "found" if jumped else str(located.state)
-        if jumped and self._first is None:
-            self._first = number
+        is_relocalized = located.state is State.RELOCALIZED
+        kind = "kidnapped" if is_relocalized and before.located else "found" if is_relocalized else str(located.state)
+        if is_relocalized and self._first_located is None:
+            self._first_located = number
         event: dict[str, Any] = {
             "frame": tracked.index,
             "stamp_ns": tracked.stamp,
             "event": kind,
             "reason": located.registration.reason,
         }
-        if jumped:
+        if is_relocalized:
             event["position_m"] = located.T_map_kf[:3, 3].round(3).tolist()
         self._events.append(event)
         return f"frame {tracked.index}: {kind} {event.get('position_m', '')}{located.registration.reason}"
@@ -94,8 +94,8 @@ class LocalizationReport:
         with the reason), events, and why the map could not be read, if so."""
         return {
             "frames": self._frames.total(),
-            "frames_until_found": self._first,
-            "not_found": self._reason if self._first is None else "",
+            "frames_until_found": self._first_located,
+            "not_found": self._not_found_reason if self._first_located is None else "",
             "map_unreadable": self._unreadable,
             "frames_located": len(self.stamps),
             "frames_by_state": {str(state): count for state, count in sorted(self._frames.items())},
@@ -133,8 +133,8 @@ def run_localized(drive: OfflineRun, out: Path, hint: Array | None, config: Conf
     summary = report.summary()
     write_json(out / LOCALIZATION, summary)
     remove_results(out, *MAPPING)
-    until = summary["frames_until_found"]
-    why = f" ({summary['not_found']})" if summary["not_found"] else ""
-    found = f"not found{why}" if until is None else f"found after {until} frames"
+    frames_until_found = summary["frames_until_found"]
+    reason = f" ({summary['not_found']})" if summary["not_found"] else ""
+    found = f"not found{reason}" if frames_until_found is None else f"found after {frames_until_found} frames"
     located = f"pose known in {len(report.stamps)} of {summary['frames']} frames"
     return f"{name}: {found}, {located}; results in {out}", summary

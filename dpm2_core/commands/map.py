@@ -100,9 +100,9 @@ def prune(
     check_new(out)
     with MapStore.open(path) as store:
         data = load_map(store)
-        less = pruned(data, redundant_nodes(data, SAME, TURNED))
-        save_as(less, out)
-    note(f"{out}: {len(less)} keyframes of {len(data)}")
+        pruned_data = pruned(data, redundant_nodes(data, SAME, TURNED))
+        save_as(pruned_data, out)
+    note(f"{out}: {len(pruned_data)} keyframes of {len(data)}")
 
 
 @app.command()

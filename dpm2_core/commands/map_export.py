@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpm2_core.commands.map_figures import graph_of, say_what_is_missing, unplaced
+from dpm2_core.commands.map_figures import graph_of, note_missing_log, unplaced
 from dpm2_core.commands.options import note
 from dpm2_core.data.pcd import write_las, write_pcd
 from dpm2_core.data.ply import write_ply
@@ -66,7 +66,7 @@ def _loaded(store: MapStore) -> MapData:
     Raises:
         UsageError: it is empty.
     """
-    say_what_is_missing(store)
+    note_missing_log(store)
     data = load_map(store, descriptors=False)
     if not len(data):
         raise UsageError(f"{store.path}: the map has no keyframes")

@@ -21,7 +21,7 @@ from dpm2_core.slam.store.map_store import MapStore
 from dpm2_core.tables import FigureTable
 
 
-def say_what_is_missing(store: MapStore) -> None:
+def note_missing_log(store: MapStore) -> None:
     """Print a note if the last keyframes of a map may be in a file that is no longer next to it."""
     if missing := missing_log(store.path):
         note(f"{store.path}: {missing}")
@@ -30,7 +30,7 @@ def say_what_is_missing(store: MapStore) -> None:
 def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
     """Content of a map, as a table and as figures."""
     with MapStore.open(path) as store:
-        say_what_is_missing(store)
+        note_missing_log(store)
         data = load_map(store, descriptors=False)
         figures = figures_of(path, data, sum(row[0] or 0 for row in store.rows("payloads", "descriptors IS NOT NULL")))
     f = figures
@@ -50,13 +50,13 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
     for row in rows:
         table.add_row(*row)
     for s in figures["sessions"]:
-        tied = (
+        untied = (
             f", {s['untied']} of them not connected to the first keyframe: their poses are not known"
             if s["untied"]
             else ""
         )
         info = (
-            f"{s['keyframes']} keyframes{tied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
+            f"{s['keyframes']} keyframes{untied}, {s['started']}, dpm2 {s['program']}, weights {s['weights'] or 'none'}"
         )
         table.add_row(f"session {s['session']}", info)
     return table, figures
@@ -64,7 +64,7 @@ def info_table(path: Path) -> tuple[FigureTable, dict[str, Any]]:
 
 def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, Any]:
     loops, drives = [edge for edge in data.edges if edge.kind == "loop"], ways(data)
-    tied, session = placed(data), np.array([k.session for k in data.keyframes], np.int64)
+    connected, session = placed(data), np.array([k.session for k in data.keyframes], np.int64)
     return {
         "map": str(path),
         "keyframes": len(data),
@@ -72,9 +72,9 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
         "with_descriptors": with_descriptors,
         "with_fix": sum(keyframe.fix is not None for keyframe in data.keyframes),
         "pruned": len(data.trail),
-        "robots": sorted({way.robot for way in drives}),
-        "length_m": sum(path_length(way.poses) for way in drives),
-        "extent_m": np.ptp(data.poses[tied, :3, 3], axis=0).tolist() if len(data) else [],
+        "robots": sorted({drive.robot for drive in drives}),
+        "length_m": sum(path_length(drive.poses) for drive in drives),
+        "extent_m": np.ptp(data.poses[connected, :3, 3], axis=0).tolist() if len(data) else [],
         "loops_accepted": sum(edge.ok for edge in loops),
         "loops_tried": len(loops),
         "georeference": _georeference_figures(data),
@@ -83,7 +83,7 @@ def figures_of(path: Path, data: MapData, with_descriptors: int) -> dict[str, An
             {
                 "session": s.number,
                 "keyframes": int((session == s.number).sum()),
-                "untied": int(((session == s.number) & ~tied).sum()),
+                "untied": int(((session == s.number) & ~connected).sum()),
                 "started": s.started,
                 "program": s.program,
                 "weights": s.weights,
@@ -118,12 +118,12 @@ def _georeference_figures(data: MapData) -> dict[str, Any] | None:
 def unplaced(data: MapData) -> str:
     """Why a map has no georeference, in words; empty if it has no fixes."""
     fixes = np.array([keyframe.fix is not None for keyframe in data.keyframes], np.bool_)
-    tied = int(fixes[placed(data)].sum())
-    elsewhere = int(fixes.sum()) - tied
+    connected = int(fixes[placed(data)].sum())
+    unconnected = int(fixes.sum()) - connected
     why = "the trajectory is too short or too straight, or at least half of them are off it, as with another clock"
-    reasons = [f"{tied} fixes do not determine it: {why}"] if tied else []
-    if elsewhere:
-        reasons.append(f"{elsewhere} fixes are of keyframes that no loop connects to the first")
+    reasons = [f"{connected} fixes do not determine it: {why}"] if connected else []
+    if unconnected:
+        reasons.append(f"{unconnected} fixes are of keyframes that no loop connects to the first")
     return "; ".join(reasons)
 
 

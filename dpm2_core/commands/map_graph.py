@@ -86,8 +86,8 @@ def _warnings(figures: dict[str, Any], settled: bool, undecided: bool) -> list[s
     if not settled:
         out.append("the optimization has not converged; these are its last results")
     if figures["trajectories"] > max(1, 0.1 * figures["vertices"]):
-        untied = f"{figures['trajectories'] - 1} of {figures['vertices']} vertices"
-        out.append(f"{figures['trajectories']} trajectories: {untied} have no edge to the one before")
+        unconnected = f"{figures['trajectories'] - 1} of {figures['vertices']} vertices"
+        out.append(f"{figures['trajectories']} trajectories: {unconnected} have no edge to the one before")
     if figures["kept"] < 0.5 * figures["loops"]:
         out.append(f"only {figures['kept']} of {figures['loops']} loops agree; the others were left out")
     if undecided:

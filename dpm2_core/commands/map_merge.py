@@ -23,7 +23,8 @@ from dpm2_core.slam.store.map_data import MapData, load_map, save_as
 from dpm2_core.slam.store.map_file import check_new
 from dpm2_core.slam.store.map_store import MapStore
 
-_OFF = 30.0  # m from the GNSS position of a map: fixes err by meters, and so does its heading over its length
+# m from the GNSS position of a map: fixes err by meters, and so does its heading over its length.
+_MAX_FIX_DISTANCE = 30.0
 
 
 def merge_files(
@@ -40,43 +41,43 @@ def merge_files(
             with the others.
     """
     check_new(out)
-    given = [parse_transform(text) for text in transform or ()]
-    if len(paths) < 2 or (given and len(given) != len(paths) - 1):
+    transforms = [parse_transform(text) for text in transform or ()]
+    if len(paths) < 2 or (transforms and len(transforms) != len(paths) - 1):
         raise UsageError("merge: want two or more maps, and either no --transform or one for each map but the first")
-    if given and (config is not None or settings):
+    if transforms and (config is not None or settings):
         raise UsageError("merge: --config and --set are for finding places, and do not apply with --transform")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
         maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
-        described = {session.weights for data in maps for session in data.sessions if session.weights}
-        if not given:
-            described.add(weights_id(chosen.neural.weights))
-        if len(described) > 1:
-            raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(described))}")
+        weights_ids = {session.weights for data in maps for session in data.sessions if session.weights}
+        if not transforms:
+            weights_ids.add(weights_id(chosen.neural.weights))
+        if len(weights_ids) > 1:
+            raise UsageError(f"merge: descriptors of several weights: {', '.join(sorted(weights_ids))}")
         named = list(zip(paths, maps, strict=True))
-        _say_what_is_there_twice(named)
-        first = maps[0] if given else _joined_by_places(named, chosen)
-        for (path, other), T in zip(named[1:], given, strict=False):
-            if (off := off_by_satellites(first, other, T)) > _OFF:
-                doubt = f"{off:.0f} m from its pose by the fixes of both maps: is its --transform right?"
-                note(f"{path}: {doubt}")
+        _note_duplicate_keyframes(named)
+        first = maps[0] if transforms else _join_by_places(named, chosen)
+        for (path, other), T in zip(named[1:], transforms, strict=False):
+            if (distance := off_by_satellites(first, other, T)) > _MAX_FIX_DISTANCE:
+                text = f"{distance:.0f} m from its pose by the fixes of both maps: is its --transform right?"
+                note(f"{path}: {text}")
             first = merge_maps(first, other, T, tie_of(first, other, T))
         save_as(first, out)
     note(f"{out}: {len(first)} keyframes")
 
 
-def _say_what_is_there_twice(maps: list[tuple[Path, MapData]]) -> None:
+def _note_duplicate_keyframes(maps: list[tuple[Path, MapData]]) -> None:
     """Note keyframes that several maps contain: a file is given twice, or copies of a map were extended separately."""
     known = set[tuple[str, int, bytes]]()
     for path, data in maps:
-        own = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
-        if (count := len(own & known)) > 1:  # every drive of a simulator begins at the same time and pose
-            said = f"{count} of its {len(data)} keyframes are also in an earlier map: they will be in the new map twice"
-            note(f"{path}: {said}")
-        known |= own
+        keys = {(k.robot, k.stamp, k.T_odom_kf.tobytes()) for k in data.keyframes}
+        if (count := len(keys & known)) > 1:  # every drive of a simulator begins at the same time and pose
+            text = f"{count} of its {len(data)} keyframes are also in an earlier map: they will be in the new map twice"
+            note(f"{path}: {text}")
+        known |= keys
 
 
-def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:
+def _join_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) -> MapData:
     """Join the other maps to the first one. The next map is always one that shares places with those joined before.
 
     Raises:
@@ -84,21 +85,23 @@ def _joined_by_places(maps: list[tuple[Path, MapData]], settings: SlamSettings) 
     """
     from dpm2_core.slam.build import make_loops
 
-    (_, first), *waiting = maps
-    while waiting:
-        tried = (align(first, other, loops_by(make_loops(settings))) for _, other in waiting)
+    (_, first), *remaining = maps
+    while remaining:
+        tried = (align(first, other, loops_by(make_loops(settings))) for _, other in remaining)
         number, found = next(((i, fit) for i, fit in enumerate(tried) if fit is not None), (0, None))
         if found is None:
-            names = ", ".join(str(path) for path, _ in waiting)
+            names = ", ".join(str(path) for path, _ in remaining)
             raise Dpm2Error(f"{names}: no place of the other maps was found there; give their poses by --transform")
-        (path, other), (T, loops) = waiting.pop(number), found
+        (path, other), (T, loops) = remaining.pop(number), found
         merged = merge_maps(first, other, T, loops)
         first = optimized(merged, PoseGraph(settings.pose_graph))
         note(f"{path}: {len(loops)} loops to the maps before")
-        checked = zip(merged.edges, first.edges, strict=True)
-        if rejected := [f"{now.from_node} and {now.to_node}" for was, now in checked if was.ok and not now.ok]:
-            said = "loops that contradict the others are rejected, between the new map's keyframes"
-            note(f"{path}: {said} {', '.join(rejected)}")
+        edge_pairs = zip(merged.edges, first.edges, strict=True)
+        if rejected := [
+            f"{after.from_node} and {after.to_node}" for before, after in edge_pairs if before.ok and not after.ok
+        ]:
+            text = "loops that contradict the others are rejected, between the new map's keyframes"
+            note(f"{path}: {text} {', '.join(rejected)}")
     return first
 
 

@@ -104,8 +104,10 @@ def run(
         check_view(view, record, out)
     source: Source | Path = src
     if corruption is not None:
-        wanted = chosen.slam.registration != "geometric" or chosen.slam.visual.enabled or chosen.slam.map.thumbnail > 0
-        source = CorruptedSource(open_recording(src, chosen, wanted), corruption)
+        needs_images = (
+            chosen.slam.registration != "geometric" or chosen.slam.visual.enabled or chosen.slam.map.thumbnail > 0
+        )
+        source = CorruptedSource(open_recording(src, chosen, needs_images), corruption)
     if localise is not None:
         with OfflineRun(source, chosen, span, map_file=localise, map_mode="localize") as drive, interrupt_deferred():
             found, figures = run_localized(drive, out, T_hint, chosen)
@@ -117,38 +119,40 @@ def run(
     with OfflineRun(source, chosen, span, gt, map_file, mode) as drive:
         make_folder(out)  # --record may write into it
         if resume:
-            _keep_what_is_there(drive, out)
-        _map(drive, chosen, out, (view, record), json_file)
+            _set_results_aside(drive, out)
+        _run_mapping(drive, chosen, out, (view, record), json_file)
 
 
-def _keep_what_is_there(drive: OfflineRun, out: Path) -> None:
+def _set_results_aside(drive: OfflineRun, out: Path) -> None:
     """Move the results of the interrupted run to a subfolder, so that this run does not replace them."""
     from dpm2_core.evaluation.run_folder import TRAJECTORY, set_aside
 
     if (out / TRAJECTORY).exists():
         first = drive.slam.mapper.keyframes[-1].index if drive.slam.mapper.keyframes else 0
-        before = set_aside(out, f"before_{first}")
-        note(f"{before}: the results of the interrupted run; this run begins at frame {first}")
+        folder = set_aside(out, f"before_{first}")
+        note(f"{folder}: the results of the interrupted run; this run begins at frame {first}")
 
 
-def _map(drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path | None], json_file: Path | None) -> None:
+def _run_mapping(
+    drive: OfflineRun, config: Config, out: Path, shown: tuple[bool, Path | None], json_file: Path | None
+) -> None:
     """Run the drive and write its results; `shown`: whether in a viewer, and to which file."""
     from dpm2_core.evaluation.live_view import LiveView
     from dpm2_core.evaluation.run_folder import TRAJECTORY
     from dpm2_core.evaluation.run_result import save_config
 
-    with ExitStack() as open_things:
+    with ExitStack() as stack:
         view, record = shown
         live = None
         if view or record is not None:
-            live = open_things.enter_context(LiveView(drive.source.name, view, record))
+            live = stack.enter_context(LiveView(drive.source.name, view, record))
         if not (out / TRAJECTORY).exists():  # else keep the config.yaml of the earlier results until they are replaced
             save_config(config, out)  # before the run, so that a failed run has its configuration, too
         with interrupt_deferred():  # after the drive, too: an interrupt would lose its results
-            _report(_drive(drive, None if live is None else live.add), out, json_file)
+            _report(_run_drive(drive, None if live is None else live.add), out, json_file)
 
 
-def _drive(drive: OfflineRun, watch: Watch | None) -> Result:
+def _run_drive(drive: OfflineRun, watch: Watch | None) -> Result:
     """Run the drive with a progress bar; failures are printed immediately."""
     name, problem, seen = drive.source.name, "", ""
     with progress_bar() as bar:
@@ -185,8 +189,8 @@ def _report(result: Result, out: Path, json_file: Path | None) -> None:
         note(f"interrupted after {len(result)} frames; writing their results", "yellow")
     for text in source.notes:
         note(text, "yellow")
-    of_imu = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
-    for problem, count in (of_imu | result.problems).items():
+    imu_problems = {f"IMU: {problem}": count for problem, count in result.imu.items() if problem != "used"}
+    for problem, count in (imu_problems | result.problems).items():
         note(f"{problem} ({count} of {len(result)} frames)", "yellow")
     if not result.connected:
         note("no place of this drive was found in the map: its poses are in a frame of its own", "yellow")

@@ -44,17 +44,17 @@ def show(
 
     corruption = None if corrupt is None else parse_corruption(corrupt)
     models = {name: load_network(name, threads=2) for name in weights or ["small"]}
-    how = input_settings(settings or [])
-    images = how.images and any(model.encoder.image is not None for model in models.values())
-    source: Source = open_source(src, how.model_copy(update={"images": images}))
+    chosen = input_settings(settings or [])
+    images = chosen.images and any(model.encoder.image is not None for model in models.values())
+    source: Source = open_source(src, chosen.model_copy(update={"images": images}))
     if corruption is not None:
         source = CorruptedSource(source, corruption)
     target, moving = _frame(source, src, first), _frame(source, src, second)
     title = f"{source.name}, frame {moving.index} to frame {target.index}{f', {corrupt}' if corrupt else ''}"
     panels = []
     for name, model in models.items():
-        looked = image_attention(model, moving) if model.encoder.image is not None and moving.images else None
-        panels.append((f"{title}, {Path(name).stem}" if len(models) > 1 else title, model, looked))
+        attention = image_attention(model, moving) if model.encoder.image is not None and moving.images else None
+        panels.append((f"{title}, {Path(name).stem}" if len(models) > 1 else title, model, attention))
     compared_png(out, panels, moving, target)
     note(f"{out}: {title}")
 

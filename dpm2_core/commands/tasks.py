@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dpm2_core.commands.options import PROCESSORS, JsonFile, Workers, note, parse_names, show
-from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, say_learned, train
+from dpm2_core.commands.train import ConfigOption, OutOption, ResumeOption, SetOption, note_training_scans, train
 from dpm2_core.config import load_settings
 from dpm2_core.console import progress_bar
 from dpm2_core.errors import UsageError
@@ -106,13 +106,15 @@ def _train(name: str, settings: TaskTraining, out: Path, resume: bool, sets: tup
     data = {"task": name, "SRC": str(src.resolve()), "sequences": list(sequences), "scans": len(scans)}
     data["content"] = scans.digest()
     begin_or_resume(out, resume, settings, data=data)
-    measured = None
+    validation_scans = None
     if val is not None:
-        measured = open_scans(val[0], kind.needs, val[1])
+        validation_scans = open_scans(val[0], kind.needs, val[1])
         places = sequence_places(*val)
-        same = measured.digest() == data["content"]  # such as a copy
-        say_learned(f"--val {val[0]}: the task", places, places if same else sequence_places(src, sequences))
-    train_task(new_task(name, settings), scans, out, measured)
+        is_same_data = validation_scans.digest() == data["content"]  # such as a copy
+        note_training_scans(
+            f"--val {val[0]}: the task", places, places if is_same_data else sequence_places(src, sequences)
+        )
+    train_task(new_task(name, settings), scans, out, validation_scans)
     note(f"{out / WEIGHTS}: written")
 
 

@@ -79,13 +79,13 @@ def pack(
     left_out = []
     names = sequences_below(src)
     for name in names:
-        asked = [*overrides, f"input.sequence={name}"]
-        made_by = {**packing, **_content(src, asked)}
+        drive_overrides = [*overrides, f"input.sequence={name}"]
+        drive_packing = {**packing, **_content(src, drive_overrides)}
         if (out / name).exists():
-            check_same(out / name, made_by)
+            check_same(out / name, drive_packing)
             continue
         try:
-            _pack_one(src, out / name, made_by, asked)
+            _pack_one(src, out / name, drive_packing, drive_overrides)
         except UsageError as error:  # affects this drive only; a full disk ends the call
             typer.echo(f"{out / name}: left out: {printable(str(error))}", err=True)
             left_out.append(name)
@@ -111,8 +111,8 @@ def _pack_one(src: Path, out: Path, packing: dict[str, Any], overrides: list[str
     finally:
         for text in source.notes:  # such as an image that cannot be read
             note(text)
-    of_all = f" of {len(chosen)} frames packed; the others have no pose, cannot be read or have too few points"
-    note(f"{out}: {packed}{of_all if packed < len(chosen) else ' frames packed'}")
+    remark = f" of {len(chosen)} frames packed; the others have no pose, cannot be read or have too few points"
+    note(f"{out}: {packed}{remark if packed < len(chosen) else ' frames packed'}")
 
 
 def _content(src: Path, overrides: list[str]) -> dict[str, str]:
@@ -139,7 +139,7 @@ def image(
     from dpm2_core.learning.train_image import ImageTrainingSettings, train_image
 
     chosen = load_settings(ImageTrainingSettings, config, settings or [])
-    _begin(out, resume, chosen)
+    _begin_training(out, resume, chosen)
     train_image(chosen, out)
 
 
@@ -154,7 +154,7 @@ def phase1(
     from dpm2_core.learning.train_registration import RegistrationTrainingSettings, train_registration
 
     chosen = load_settings(RegistrationTrainingSettings, config, settings or [])
-    _begin(out, resume, chosen)
+    _begin_training(out, resume, chosen)
     train_registration(chosen, out)
 
 
@@ -169,7 +169,7 @@ def phase2(
     from dpm2_core.learning.train_overlap import OverlapTrainingSettings, train_overlap
 
     chosen = load_settings(OverlapTrainingSettings, config, settings or [])
-    _begin(out, resume, chosen)
+    _begin_training(out, resume, chosen)
     train_overlap(chosen, out)
 
 
@@ -196,7 +196,7 @@ def ablation(
     packed = chosen.training.data.packed
     learned = scans_of(drive for folder, weight in packed.items() if weight for drive in open_packed(Path(folder)))
     for name, folder in chosen.measure.items():
-        say_packed(f"measure.{name}", Path(folder), learned)
+        note_packed_training_scans(f"measure.{name}", Path(folder), learned)
     found = compare(chosen, out)
     results = {"settings": chosen.model_dump(mode="json"), "variants": found, "gains": gains(found)}
     report = out / "ablation.json"
@@ -206,7 +206,7 @@ def ablation(
     Console().print(f"written to {report}")
 
 
-def _begin(
+def _begin_training(
     out: Path, resume: bool, settings: ImageTrainingSettings | RegistrationTrainingSettings | OverlapTrainingSettings
 ) -> None:
     """Prepare `out` for a training on packed drives, see `begin_or_resume`."""
@@ -217,24 +217,24 @@ def _begin(
     drives = {folder: open_packed(Path(folder)) for folder in settings.data.packed}
     frames = {folder: sum(map(len, found)) for folder, found in drives.items()}
     content = {folder: packed_digest(found) for folder, found in drives.items()}
-    read = [weights_path(settings.start)] if settings.start else []
-    begin_or_resume(out, resume, settings, read, {"frames": frames, "content": content})
+    start_weights = [weights_path(settings.start)] if settings.start else []
+    begin_or_resume(out, resume, settings, start_weights, {"frames": frames, "content": content})
     validation = getattr(settings, "validation", "")  # the training of the image branch has none
     if validation and is_first_process():
         learned = scans_of(d for folder, found in drives.items() if settings.data.packed[folder] for d in found)
-        say_packed(f"validation {validation}", Path(validation), learned)
+        note_packed_training_scans(f"validation {validation}", Path(validation), learned)
 
 
-def say_packed(what: str, folder: Path, learned: Collection[bytes]) -> None:
+def note_packed_training_scans(what: str, folder: Path, learned: Collection[bytes]) -> None:
     """Print which packed drives below a folder contain scans that are also used for training, see `scans_of`."""
     from dpm2_core.data.packed import open_packed, scans_of
 
     measured = open_packed(folder)
     both = {drive.folder.resolve() for drive in measured if not scans_of([drive]).isdisjoint(learned)}
-    say_learned(f"{what}: the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
+    note_training_scans(f"{what}: the network", {drive.folder.resolve(): drive.name for drive in measured}, both)
 
 
-def say_learned(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:
+def note_training_scans(what: str, measured: Mapping[Path, str], learned: Collection[Path]) -> None:
     """Print which measured drives (name by folder) are also used for training: their figures are no evidence."""
     both = [name for folder, name in measured.items() if folder in learned]
     if both:
