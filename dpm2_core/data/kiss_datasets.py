@@ -19,6 +19,7 @@ from dpm2_core.data.cloud_folder import name_times
 from dpm2_core.data.point_times import TimeUnit, time_offsets
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource, note_once
+from dpm2_core.data.text import read_lines
 from dpm2_core.data.trajectory import interpolate
 from dpm2_core.errors import UsageError
 from dpm2_core.extras import needs
@@ -32,6 +33,19 @@ _T_BASE_OUSTER = se3.make(
     Rotation.from_euler("xyz", (0.0001, 0.0003, 179.6654), degrees=True).as_matrix(), np.array([1.7042, -0.021, 1.8047])
 )
 """Pose of MulRan's LiDAR on its car, from the data set's calib_base2ouster.txt."""
+_FILES = {
+    "apollo": ("pcds/*.pcd", "poses/gt_poses.txt"),
+    "boreas": ("lidar/*.bin", "applanix/lidar_poses.csv"),
+    "helipr": ("LiDAR/{sequence}/*.bin", "LiDAR_GT/global_{sequence}_gt.txt"),
+    "mulran": ("Ouster/*.bin", "global_pose.csv"),
+    "ncd": ("raw_format/ouster_scan/*.pcd", "ground_truth/registered_poses.csv"),
+    "nclt": ("velodyne_sync/*.bin", "../ground_truth/groundtruth_{drive}.csv"),
+}
+"""Scans and ground truth in the folder of a drive; the loaders need both."""
+_ONE_POSE_PER_SCAN = {"boreas": 1, "helipr": 0}
+"""Loaders whose ground truth has a line for each scan, and the number of lines before these."""
+_GRIDS = ("mulran", "ncd")  # the order of the points determines their times
+_LIDARS = ("Ouster", "Velodyne", "Avia", "Aeva")  # of HeLiPR
 _NATIVE_LOADERS = ("generic", "mcap", "ouster", "rosbag")  # dpm2 reads these itself, with times and intensities
 
 
@@ -54,7 +68,8 @@ class KissSource(IndexedSource):
         names = sorted(set(available_dataloaders()).difference(_NATIVE_LOADERS))
         if kind not in names:
             raise UsageError(f"input.dataset={kind}: there is no such loader; there are {', '.join(names)}")
-        arguments = {"data_dir": self.path, "sequence": self._settings.sequence}
+        _check_files(self.path, kind, self._settings.sequence)
+        arguments = {"data_dir": self.path.resolve(), "sequence": self._settings.sequence}
         self._loader = self._call_loader(lambda: dataset_factory(kind, **arguments))
         super().__init__(self.path.resolve().stem, int(self._call_loader(lambda: len(self._loader))))
         if not self._count:
@@ -66,18 +81,30 @@ class KissSource(IndexedSource):
     def frame(self, position: int) -> Frame:
         """See `IndexedSource`."""
         stamp = int(self.stamps[position])
+        file = self._file(position)
         try:
-            xyz, offset = self._call_loader(lambda: self._scan(position, stamp))
+            xyz, offset = self._call_loader(lambda: self._scan(position, stamp), file)
+            if not len(xyz):
+                raise UsageError(f"{file}: no points")
         except UsageError as error:
             return Frame(stamp, NO_POINTS, index=position, problem=str(error))
         points = np.zeros((len(xyz), 4), np.float32)
         points[:, :3] = np.asarray(xyz)[:, :3]
-        if offset is None:
+        if offset is None and self._settings.dataset in _GRIDS:
+            note_once(self.notes, f"{self.path}: scans of other than 64 x 1024 points: not de-skewed", f"first {file}")
+        elif offset is None:
             note_once(self.notes, f"{self.path}: no time field: not de-skewed")
         return Frame(stamp, points, offset, index=position)
 
-    def _call_loader(self, what: Any) -> Any:
-        """Result of a call of the loader, which prints, exits and asserts if something is missing."""
+    def _file(self, position: int) -> str:
+        """The file of a scan, for messages."""
+        files = getattr(self._loader, "scan_files", ())
+        # For names without a folder.
+        folder = getattr(self._loader, "scans_dir", getattr(self._loader, "scan_folder", ""))
+        return str(Path(folder, files[position])) if len(files) == self._count else f"{self.path}: scan {position}"
+
+    def _call_loader(self, what: Any, of: str = "") -> Any:
+        """Result of a call of the loader, which prints, exits and asserts if something is missing. `of`: the scan file."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -85,7 +112,7 @@ class KissSource(IndexedSource):
         except (Exception, SystemExit) as error:
             said = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
             words = " ".join(said.split()[-30:]) or type(error).__name__
-            raise UsageError(f"{self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
+            raise UsageError(f"{of or self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
         self._printed = self._printed or printed.getvalue()
         return answer
 
@@ -136,6 +163,24 @@ class KissSource(IndexedSource):
         if len(times) != len(xyz) or not len(xyz) or np.ptp(times) == 0:
             return xyz, None
         return xyz, ((times - _STAMPED_AT.get(kind, 0.0)) * _SWEEP_PERIOD).astype(np.float32)
+
+
+def _check_files(path: Path, kind: str, sequence: str) -> None:
+    """Raise UsageError if a loader's scans or ground truth are not in the folder of a drive."""
+    if kind == "helipr" and sequence not in _LIDARS:
+        raise UsageError(f"{path}: input.dataset=helipr: choose a LiDAR with input.sequence: {', '.join(_LIDARS)}")
+    wanted = [name.format(sequence=sequence, drive=path.resolve().name) for name in _FILES.get(kind, ())]
+    for name in wanted:
+        if not any(path.resolve().glob(name)):
+            below = sorted({found.relative_to(path).parts[0] for found in path.glob(f"*/{name}") if ".." not in name})
+            but = f", but in {', '.join(below)} below it" if below else ""
+            need = f"input.dataset={kind} needs {' and '.join(wanted)}"
+            raise UsageError(f"{path}: no {name} in this folder{but}; {need}")
+    if kind in _ONE_POSE_PER_SCAN:
+        scans, truth = len(list(path.glob(wanted[0]))), path / wanted[1]
+        poses = sum(bool(line.strip()) for line in read_lines(truth)) - _ONE_POSE_PER_SCAN[kind]
+        if poses != scans:
+            raise UsageError(f"{truth}: {poses} poses for {scans} scans; input.dataset={kind} needs one for each")
 
 
 def _mulran_poses(path: Path, stamps: NDArray[np.int64]) -> Array:

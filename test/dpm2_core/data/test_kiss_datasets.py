@@ -50,6 +50,31 @@ def test_a_data_set_of_kiss_icp(mulran: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(source.poses[1, :3, 3]), 1, atol=1e-3)
 
 
+def test_a_folder_that_is_no_drive(mulran: Path) -> None:
+    """The message names what is missing, and where it was found."""
+    pytest.importorskip("kiss_icp")
+    with pytest.raises(UsageError, match=r"no Ouster/\*.bin in this folder, but in KAIST01 below it; .*global_pose"):
+        open_source(mulran.parent, InputSettings(dataset="mulran"))
+    (mulran / "global_pose.csv").unlink()
+    with pytest.raises(UsageError, match=r"KAIST01: no global_pose.csv in this folder"):
+        open_source(mulran, InputSettings(dataset="mulran"))
+
+
+def test_damaged_scans_are_named(mulran: Path) -> None:
+    """An empty scan has a problem; one that is cut short is used, but not de-skewed."""
+    pytest.importorskip("kiss_icp")
+    empty, short = sorted((mulran / "Ouster").iterdir())
+    empty.write_bytes(b"")
+    short.write_bytes(short.read_bytes()[:1600])
+    source = open_source(mulran, InputSettings(dataset="mulran"))
+    first, second = source.frames()
+    assert first.problem == f"{empty}: no points"
+    assert (second.problem, second.time_offset, len(second.points)) == (None, None, 100)
+    assert source.notes == [f"{mulran}: scans of other than 64 x 1024 points: not de-skewed (first {short})"]
+    short.write_bytes(short.read_bytes()[:1500])
+    assert str(short) in (source.frame(1).problem or "")
+
+
 def test_the_truth_of_mulran_is_of_the_lidar(mulran: Path) -> None:
     """Its file has poses of the car, by the millisecond; the LiDAR on the roof faces backwards, and not quite."""
     pytest.importorskip("kiss_icp")
@@ -76,7 +101,7 @@ def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyP
     pytest.importorskip("kiss_icp")
     with pytest.raises(UsageError, match=r"input.dataset=kiti: there is no such loader; there are apollo, boreas"):
         open_source(mulran, InputSettings(dataset="kiti"))
-    with pytest.raises(UsageError, match=r"KISS-ICP's loader nclt: "):
+    with pytest.raises(UsageError, match=r"KAIST01: no velodyne_sync/\*.bin in this folder; input.dataset=nclt"):
         open_source(mulran, InputSettings(dataset="nclt"))
     monkeypatch.setitem(sys.modules, "kiss_icp.datasets", None)
     with pytest.raises(MissingPackageError, match=r"input.dataset=mulran needs the package .*dpm2_ros\[datasets\]"):
@@ -144,8 +169,14 @@ def test_velodyne_of_helipr(tmp_path: Path) -> None:
     assert (first.stamp, second.stamp, second.points[0, 0]) == (*STAMPS, 9)
     assert first.time_offset is not None
     assert source.poses[1, 0, 3] == 1
-    with pytest.raises(UsageError, match=r"KISS-ICP's loader helipr: "):
+    with pytest.raises(UsageError, match=r"no LiDAR/Ouster/\*.bin in this folder; input.dataset=helipr needs"):
         open_source(tmp_path, InputSettings(dataset="helipr", sequence="Ouster"))
+    with pytest.raises(UsageError, match=r"choose a LiDAR with input.sequence: Ouster, Velodyne, Avia, Aeva"):
+        open_source(tmp_path, InputSettings(dataset="helipr"))
+    truth = tmp_path / "LiDAR_GT" / "global_Velodyne_gt.txt"
+    truth.write_text(rows[0])
+    with pytest.raises(UsageError, match=r"global_Velodyne_gt.txt: 1 poses for 2 scans"):
+        open_source(tmp_path, InputSettings(dataset="helipr", sequence="Velodyne"))
 
 
 def test_nclt(tmp_path: Path) -> None:
@@ -211,4 +242,5 @@ def test_what_a_loader_lacks_is_said_with_the_error_that_follows(tmp_path: Path)
     (tmp_path / "ground_truth" / "registered_poses.csv").write_text("#sec,nsec,x,y,z,qx,qy,qz,qw\n" + 2 * row)
     (frame,) = open_source(tmp_path, InputSettings(dataset="ncd")).frames()
     assert frame.problem is not None
+    assert "ouster_scan/cloud_1583836591_182590976.pcd" in frame.problem
     assert "pip install pyntcloud" in frame.problem
