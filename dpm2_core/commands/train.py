@@ -76,6 +76,8 @@ def pack(
         return
     if len(given) < len(overrides):
         raise UsageError("--all: packs every drive; omit --set input.sequence=")
+    if dataset := input_settings(given).dataset:
+        raise UsageError(f"--all: cannot list the drives of input.dataset={dataset}; pack each by its own folder")
     left_out = []
     names = sequences_below(src)
     for name in names:

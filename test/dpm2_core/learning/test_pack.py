@@ -232,6 +232,8 @@ def test_all_drives_of_a_data_set_are_packed_and_a_second_run_makes_only_what_is
     assert "packs every drive" in str(one_of_all.exception)
     nothing = CliRunner().invoke(app, ["train", "pack", str(tmp_path / "all" / "03"), str(tmp_path / "x"), "--all"])
     assert "no drives below" in str(nothing.exception)
+    by_loader = CliRunner().invoke(app, [*arguments, "--set", "input.dataset=mulran"])
+    assert "cannot list the drives of input.dataset=mulran" in str(by_loader.exception)
 
 
 def test_a_drive_that_cannot_be_packed_does_not_keep_the_others_back(kitti: Path, tmp_path: Path) -> None:
