@@ -57,11 +57,11 @@ def runs_page(title: str, runs: Sequence[tuple[str, Path]], tables: Sequence[Fig
     Raises:
         UsageError: a file of a run is damaged.
     """
-    read = [(name, read_run(path)) for name, path in runs]
-    groups = _by_truth(read)
+    named_runs = [(name, read_run(path)) for name, path in runs]
+    groups = _by_truth(named_runs)
     parts = [
         f"<h1>{escape(title)}</h1>",
-        *(_table_html(table) for table in [*tables, *([_figures_table(read)] if read else [])]),
+        *(_table_html(table) for table in [*tables, *([_figures_table(named_runs)] if named_runs else [])]),
     ]
     if groups:
         parts.append('<div id="groups"></div><noscript>The drawings need JavaScript.</noscript>')

@@ -216,13 +216,13 @@ class _Region:
         nodes = [*spans, *(range(node, node + 1) for node in self._border)]
         self._poses = {row[0]: pose_of(row[1]) for row in _rows(store, "poses", nodes, "node")}
         self._graph, self._graph_node = PoseGraph(settings), dict[int, int]()
-        self._add(inner_nodes, self._poses, odometry)
-        self._add(self._border, self._poses, {})
+        self._add_nodes(inner_nodes, self._poses, odometry)
+        self._add_nodes(self._border, self._poses, {})
         for loop in self._loops.values():
             self._graph.add_loop(_reindexed(loop, self._graph_node))
         self._inner = inner_nodes
 
-    def _add(self, nodes: Iterable[int], poses: Mapping[int, Array], odometry: Mapping[int, Edge]) -> None:
+    def _add_nodes(self, nodes: Iterable[int], poses: Mapping[int, Array], odometry: Mapping[int, Edge]) -> None:
         for node in nodes:
             self._graph_node[node] = len(self._graph)
             self._graph.add_node(

@@ -70,7 +70,7 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         KeyboardInterrupt: it was stopped before all drives were examined; the map stays as it is.
     """
     folder, left_out = folder.resolve(), dict[str, str]()
-    before = _read_record(out, folder)
+    previous = _read_record(out, folder)
     with cluster:
         search = Search(folder, settings, cluster, view or View())
         parts = search.drives(left_out)
@@ -81,9 +81,9 @@ def merge(folder: Path, out: Path, settings: SlamSettings, cluster: Cluster, vie
         index = search.index(parts)
         inputs = _map_inputs(folder, settings, parts)
         merged = None
-        if before is not None and _is_up_to_date(before, out, inputs):
-            joins = search.joins(parts, index, before.drives)
-            merged = _extend_map(before, out, search, _keyframe_counts(places), joins, largest)
+        if previous is not None and _is_up_to_date(previous, out, inputs):
+            joins = search.joins(parts, index, previous.drives)
+            merged = _extend_map(previous, out, search, _keyframe_counts(places), joins, largest)
         if merged is None:
             merged = _build_map(out, search, _keyframe_counts(places), search.joins(parts, index), largest)
         unconnected = [name for name in places if name not in merged.drives]
@@ -128,30 +128,30 @@ def _map_inputs(folder: Path, settings: SlamSettings, parts: Mapping[str, Part])
     }
 
 
-def _is_up_to_date(before: Merged, out: Path, inputs: Mapping[str, Any]) -> bool:
+def _is_up_to_date(previous: Merged, out: Path, inputs: Mapping[str, Any]) -> bool:
     """Whether the existing map contains exactly the recorded drives, made from the same inputs as now."""
     try:
         with MapStore.open(out, read_only=False) as store:  # this recovers the file after a killed merge
             size = store.size
     except Dpm2Error:  # none, or damaged
         return False
-    if size != sum(before.drives.values()):  # the map was written, but not its record
+    if size != sum(previous.drives.values()):  # the map was written, but not its record
         return False
-    versions, old = inputs["versions"], before.made.get("versions", {})
-    if any(versions.get(name) != old.get(name) for name in before.drives):
+    versions, old = inputs["versions"], previous.made.get("versions", {})
+    if any(versions.get(name) != old.get(name) for name in previous.drives):
         return False
-    return all(before.made.get(key) == inputs[key] for key in ("folder", "settings"))
+    return all(previous.made.get(key) == inputs[key] for key in ("folder", "settings"))
 
 
 def _keyframe_counts(places: Mapping[str, Figures]) -> dict[str, int]:
     return {name: int(figures["keyframes"]) for name, figures in places.items()}
 
 
-def _extend_map(before: Merged, out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join],
+def _extend_map(previous: Merged, out: Path, search: Search, sizes: Mapping[str, int], joins: Sequence[Join],
            largest: int) -> Merged | None:  # fmt: skip
     """The map with the drives that are connected to it; None: it must be made again."""
-    inside, rows = before.drives, {(row["drives"][0], row["drives"][1]): row for row in before.joins}
-    accepted, refused = accepted_and_rejected(_reject_contradicted(before, joins))
+    inside, rows = previous.drives, {(row["drives"][0], row["drives"][1]): row for row in previous.joins}
+    accepted, refused = accepted_and_rejected(_reject_contradicted(previous, joins))
     connected = component(sizes, accepted, inside)
     if not set(inside) <= set(connected):
         return None
@@ -202,9 +202,9 @@ def _build_map(out: Path, search: Search, sizes: Mapping[str, int], joins: Seque
     return Merged({name: sizes[name] for name in connected}, {}, _rows([*accepted, *refused]))
 
 
-def _reject_contradicted(before: Merged, joins: Sequence[Join]) -> list[Join]:
+def _reject_contradicted(previous: Merged, joins: Sequence[Join]) -> list[Join]:
     """The joins, rejected if the existing map has contradicted those of the two drives."""
-    refused = {(row["drives"][0], row["drives"][1]) for row in before.joins if row["accepted"] < ENOUGH}
+    refused = {(row["drives"][0], row["drives"][1]) for row in previous.joins if row["accepted"] < ENOUGH}
     return [
         replace(join, loop=join.loop.rejected("the map contradicts the loops between the two drives"))
         if join.loop.ok and (join.one, join.other) in refused

@@ -120,14 +120,14 @@ def _world_settings(settings: GenerateSettings) -> dict[str, Any]:
     return settings.model_dump(mode="json", exclude={"worlds", "first_seed"})
 
 
-def check_same(folder: Path, asked: Mapping[str, Any]) -> None:
-    """Check that an existing packed drive was made with the settings `asked`, as far as its file records them.
+def check_same(folder: Path, requested: Mapping[str, Any]) -> None:
+    """Check that an existing packed drive was made with the settings `requested`, as far as its file records them.
 
     Raises:
         UsageError: it was made with others; the message names the first that differs.
     """
     recorded = PackedDrive(folder).about.get("settings")
-    for name, wanted in asked.items():
+    for name, wanted in requested.items():
         if isinstance(recorded, dict) and name in recorded and recorded[name] != wanted:
             raise UsageError(
                 f"{folder}: made with {name} {recorded[name]}, not {wanted}; remove it, or choose another folder"

@@ -23,8 +23,8 @@ def check_fits(drive: PackedDrive, network: NetworkSettings, images: bool) -> No
     """Raise UsageError if a network needs more than was packed, in the clouds or, with `images`, in the images."""
     packed, wanted = _packed_crop(drive), crop_of(network.points)
     for name in _CROP:
-        less = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
-        if less > 0:
+        shortfall = wanted[name] - packed[name] if name == "far" else packed[name] - wanted[name]
+        if shortfall > 0:
             raise UsageError(
                 f"{drive.folder}: packed with points.{name} {packed[name]:g}, but the network has {wanted[name]:g}:"
                 " the packed clouds lack points"

@@ -90,23 +90,23 @@ class Pooled(nn.Module):
         return torch.relu(self.norm(pool_neighbors(projected, index, relative, W_positions)))
 
 
-def pool_neighbors(own: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
-    """Maximum over k of own[index] + weight @ relative, without keeping the (n, k, C) sums for the gradient.
+def pool_neighbors(projected: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
+    """Maximum over k of projected[index] + weight @ relative, without keeping the (n, k, C) sums for the gradient.
 
-    own (B, m, C) and index (B, n, k), or None for `relative` alone; relative (B, n, k, P), weight (C, P): (B, n, C).
+    projected (B, m, C), index (B, n, k), or None for `relative` alone; relative (B, n, k, P), weight (C, P): (B, n, C).
     """
     if use_compiled(relative):
-        return largest_sums(own, index, relative, weight)
+        return largest_sums(projected, index, relative, weight)
     with torch.no_grad():
         sums = nn.functional.linear(relative, weight)
-        if own is not None and index is not None:
-            sums = gather(own, index).add_(sums)
+        if projected is not None and index is not None:
+            sums = gather(projected, index).add_(sums)
         best = argmax_neighbor(sums)
     n_positions = relative.shape[-1]
     chosen = relative.gather(2, best[..., None].expand(*best.shape, n_positions))
     out = (chosen * weight).sum(-1)
-    if own is not None and index is not None:
-        out = out + own.gather(1, index.gather(2, best))
+    if projected is not None and index is not None:
+        out = out + projected.gather(1, index.gather(2, best))
     return out
 
 

@@ -18,18 +18,18 @@ def use_compiled(values: Tensor) -> bool:
     return torch.is_inference_mode_enabled() and values.device.type == "cpu"
 
 
-def largest_sums(own: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
-    """`pointnext.pool_neighbors` on the CPU without gradients, summed in float32; out in the dtype of `own`."""
+def largest_sums(projected: Tensor | None, index: Tensor | None, relative: Tensor, weight: Tensor) -> Tensor:
+    """`pointnext.pool_neighbors` on the CPU without gradients, summed in float32; out in the dtype of `projected`."""
     batch, n, k, _ = relative.shape
     out = torch.empty(batch, n, len(weight))
     weights = weight.float().t().contiguous().numpy()
     no_features = np.zeros((1, len(weight)), np.float32), np.zeros((n, k), np.int64)
     for b in range(batch):
         values, neighbors = no_features
-        if own is not None and index is not None:
-            values, neighbors = own[b].float().contiguous().numpy(), index[b].numpy()
+        if projected is not None and index is not None:
+            values, neighbors = projected[b].float().contiguous().numpy(), index[b].numpy()
         _largest_sums(values, neighbors, relative[b].float().contiguous().numpy(), weights, out[b].numpy())
-    return out if own is None else out.to(own.dtype)
+    return out if projected is None else out.to(projected.dtype)
 
 
 def positions_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -> Tensor:
@@ -45,13 +45,14 @@ def positions_in_view(xyz: Tensor, axes: Tensor, index: Tensor, radius: float) -
 
 
 @compiled("void(f4[:, ::1], i8[:, ::1], f4[:, :, ::1], f4[:, ::1], f4[:, ::1])")
-def _largest_sums(own: Array, index: NDArray[np.int64], relative: Array, weight: Array, out: Array) -> None:
-    """out (n, C) = maximum over k of own[index] + relative @ weight; own (m, C), relative (n, k, P), weight (P, C)."""
+def _largest_sums(projected: Array, index: NDArray[np.int64], relative: Array, weight: Array, out: Array) -> None:
+    """out (n, C) = maximum over k of projected[index] + relative @ weight;
+    projected (m, C), relative (n, k, P), weight (P, C)."""
     channels, total = out.shape[1], np.empty(out.shape[1], np.float32)
     for i in range(len(out)):
         largest = out[i]
         for k in range(index.shape[1]):
-            values = own[index[i, k]]
+            values = projected[index[i, k]]
             for c in range(channels):
                 total[c] = values[c]
             for p in range(len(weight)):

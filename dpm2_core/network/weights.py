@@ -202,10 +202,10 @@ def check_fit(path: Path, state: Mapping[str, torch.Tensor], make: Callable[[], 
 
 def _check_shapes(model: nn.Module, state: Mapping[str, torch.Tensor], what: str) -> None:
     own = model.state_dict()
-    wrong = list(own.keys() ^ state.keys())
-    wrong += [name for name in own.keys() & state.keys() if own[name].shape != state[name].shape]
-    if wrong:
-        raise UsageError(f"{what}: {len(wrong)} tensors differ, such as {min(wrong)}")
+    differing = list(own.keys() ^ state.keys())
+    differing += [name for name in own.keys() & state.keys() if own[name].shape != state[name].shape]
+    if differing:
+        raise UsageError(f"{what}: {len(differing)} tensors differ, such as {min(differing)}")
 
 
 def _check_finite(path: Path, state: Mapping[str, torch.Tensor]) -> None:

@@ -42,17 +42,17 @@ class LidarAutoencoder(nn.Module):
             raise UsageError(f"AE_lidar: images of {rows} rows; want a multiple of 8, at least 16")
         c = settings.channels
         kernel = (3 if rows // 8 % 2 else 2, 4)  # halves an even number of rows, or an odd one minus one
-        whole = ((rows // 8 - kernel[0]) // 2 + 1, columns // 16)
+        full_kernel = ((rows // 8 - kernel[0]) // 2 + 1, columns // 16)
         self.encoder = nn.Sequential(
             nn.Conv2d(CHANNELS, c, 4, 2, 1, bias=False),
             nn.LeakyReLU(0.2),
             *down(c, 2 * c, 4, 1),
             *down(2 * c, 4 * c, 4, 1),
             *down(4 * c, 8 * c, kernel, (0, 1)),
-            nn.Conv2d(8 * c, settings.latent * (2 if settings.variational else 1), whole, bias=False),
+            nn.Conv2d(8 * c, settings.latent * (2 if settings.variational else 1), full_kernel, bias=False),
         )
         self.decoder = nn.Sequential(
-            *up(settings.latent, 8 * c, whole, 1, 0),
+            *up(settings.latent, 8 * c, full_kernel, 1, 0),
             *up(8 * c, 4 * c, kernel, 2, (0, 1)),
             *up(4 * c, 2 * c, 4, 2, 1),
             *up(2 * c, c, 4, 2, 1),

@@ -86,13 +86,13 @@ class GroundTask(Task):
 
         def slam() -> Tensor:
             xyz = [cloud[:, :3] for cloud in clouds]
-            found = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
-            requested = [
+            predicted = [obstacle_weight(c, e, network) for c, e in zip(xyz, elevation, strict=True)]
+            reference = [
                 torch.ones_like(w) if scan.labels is None else obstacle_weight(c, e, network)
-                for scan, c, e, w in zip(window, xyz, labels, found, strict=True)
+                for scan, c, e, w in zip(window, xyz, labels, predicted, strict=True)
             ]
             parts = self.windows(len(xyz))
-            return torch.stack([self.slam_loss(xyz[p], xyz[p], found[p], requested[p]) for p in parts]).mean()
+            return torch.stack([self.slam_loss(xyz[p], xyz[p], predicted[p], reference[p]) for p in parts]).mean()
 
         cell_weights = known + self.settings.gaps * (~known & known.flatten(1).any(1)[:, None, None])
         loss = ground_loss(elevation, labels, cell_weights, network)

@@ -110,18 +110,18 @@ class RangeReader:
         return fill(image * in_range, in_range), mask & in_range
 
 
-def image_error(made: Tensor, true: Tensor) -> Tensor:
+def image_error(output: Tensor, true: Tensor) -> Tensor:
     """Sum of the absolute errors of an image (B, 2, rows, columns), the mean over the images; a scalar."""
-    return (made - true).abs().sum((1, 2, 3)).mean()
+    return (output - true).abs().sum((1, 2, 3)).mean()
 
 
-def slam_of(slam_loss: SlamLoss, made: Tensor, true: RangeScans, windows: Sequence[slice]) -> Tensor:
+def slam_of(slam_loss: SlamLoss, output: Tensor, true: RangeScans, windows: Sequence[slice]) -> Tensor:
     """SLAM loss of images (B, 2, rows, columns) against the true ones, m2; the mean over the windows.
 
     Slots that are empty in the true scan do not count.
     """
-    found, requested = to_points(made, true.scale), to_points(true.images, true.scale)
-    weights = true.masks.flatten(1).to(made)
+    found, requested = to_points(output, true.scale), to_points(true.images, true.scale)
+    weights = true.masks.flatten(1).to(output)
     values = []
     for part in windows:
         w = weights[part]
