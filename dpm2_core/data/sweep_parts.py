@@ -7,7 +7,7 @@ One part shows too little of the scene to be registered: a tenth of a sweep of a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
 
@@ -96,6 +96,24 @@ class SweepParts:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
         return (last.stamp - first.stamp) * 1e-9 + end - _times(first)[0]
+
+
+def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int, Frame]]:
+    """The frames from a drive's position `start` on, parts joined to sweeps, and the position of each (last) frame.
+
+    Other than by `SweepParts`, the first part is only in the first sweep.
+    """
+    parts, held = SweepParts(), None
+    for position, frame in enumerate(frames, start):
+        sweep = parts.join(frame)
+        if sweep is not None and held is not None:
+            yield held
+        held = None if sweep is None else (position, sweep)
+        if held is not None and not (sweep is frame and may_be_part(frame)):
+            yield held
+            held = None
+    if held is not None:
+        yield held
 
 
 def may_be_part(frame: Frame) -> bool:

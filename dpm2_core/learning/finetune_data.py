@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dpm2_core.console import Advance
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
+from dpm2_core.estimates import BETWEEN
 from dpm2_core.evaluation.kitti_metric import known
 from dpm2_core.evaluation.pair_set import FAR, NEAR, has_pair
 from dpm2_core.evaluation.run_result import Result
@@ -30,7 +31,13 @@ _PART_DISTANCE = 1e4  # m: frames of unconnected parts make no pair
 
 
 class Referenced:
-    """A source with the poses of a SLAM instead of ground truth; NaN where the SLAM had none."""
+    """A source with the poses of a SLAM instead of ground truth; NaN where the SLAM had none.
+
+    Attributes:
+        in_parts: whether frames are parts of a sweep; then only the last part of each sweep has a pose.
+    """
+
+    in_parts = False
 
     def __init__(self, source: Source, poses: Array, notes: Iterable[str] = (), timed: bool = True) -> None:
         """`notes`: findings of the SLAM about the drive. `timed`: whether the times of its points are right."""
@@ -76,7 +83,9 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
         )
     if times:
         notes.append("the point times are not used, because the motion contradicts them")
-    return Referenced(source, poses, notes, timed=not times)
+    referenced = Referenced(source, poses, notes, timed=not times)
+    referenced.in_parts = BETWEEN in result.methods
+    return referenced
 
 
 def _part_of_frames(result: Result) -> NDArray[np.int32]:
@@ -123,7 +132,7 @@ def prepare(
             raise UsageError(
                 f"{source.name}: the SLAM has poses for only {followed} of {len(source)} scans; too few to train on"
             )
-        cut = round(len(source) * (1 - settings.held_out))
+        cut = _cut(referenced, settings.held_out)
         packing = _text_progress(advance, f"{name}: packing")
         if _is_measurable(referenced.poses[cut:]):
             pack(referenced, out / HELD_OUT / name, network, range(cut, len(source)), packing, requested)
@@ -135,6 +144,12 @@ def prepare(
         worlds = GenerateSettings(worlds=6, first_seed=3000, frames=40, preset=network.preset)
         generate(out / REHEARSAL, worlds, 1, _text_progress(advance, "rehearsal: world"))
     return notes
+
+
+def _cut(referenced: Referenced, held_out: float) -> int:
+    """Position at which the held-out part begins: with a whole sweep, if frames are parts of sweeps."""
+    cut = round(len(referenced) * (1 - held_out))
+    return 1 + int(known(referenced.poses[:cut]).nonzero()[0].max(initial=-1)) if referenced.in_parts else cut
 
 
 def _text_progress(advance: Callable[[str], None], what: str) -> Advance:

@@ -15,6 +15,7 @@ from dpm2_core.config import Settings
 from dpm2_core.console import Advance, untold
 from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writer, write_packed
 from dpm2_core.data.source import Source
+from dpm2_core.data.sweep_parts import whole_sweeps
 from dpm2_core.descriptors import levelling
 from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
@@ -187,9 +188,10 @@ def pack(
 ) -> int:
     """Pack the frames of a source that have a pose, one after the other; returns their number.
 
-    Frames that cannot be read or show fewer than `MIN_POINTS` points, too few for any network, are left out. Points
-    with time offsets are deskewed to the stamp with the true motion. All data are stored as the network reads them:
-    scans of a tilted sensor in leveled axes, and a drive that begins in a room enlarged.
+    Frames that are parts of a sweep are joined. Frames that cannot be read or show fewer than `MIN_POINTS` points, too
+    few for any network, are left out. Points with time offsets are deskewed to the stamp with the true motion. All data
+    are stored as the network reads them: scans of a tilted sensor in leveled axes, and a drive that begins in a room
+    enlarged.
 
     `frames`: positions to pack; `progress` is called for each. `settings`: what made the poses, see `check_same`.
 
@@ -201,12 +203,13 @@ def pack(
     chosen = frames or range(len(source))
     with packed_writer(folder) as writer:
         previous: tuple[Frame, Array] | None = None  # packed once the next pose is known, for its motion
-        twist, scale, first = np.zeros(6), 0.0, None
-        for position, frame in enumerate(source.frames(chosen.start, chosen.stop), chosen.start):
+        twist, scale, first, done = np.zeros(6), 0.0, None, 0
+        for position, frame in whole_sweeps(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
-            pose = source.poses[position]
+            pose, before_it = source.poses[position], done
+            done = len(range(chosen.start, position + 1, chosen.step))
             readable = frame.problem is None and len(frame.points) >= MIN_POINTS
-            if position not in chosen or not readable or not np.isfinite(pose).all():
+            if done == before_it or not readable or not np.isfinite(pose).all():
                 continue
             scale = scale or scale_of(frame.points)
             first = first or (frame.index, _camera_names(frame))

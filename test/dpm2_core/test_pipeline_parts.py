@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 
 from dpm2_core.config import load_settings
+from dpm2_core.data.sweep_parts import whole_sweeps
 from dpm2_core.errors import UsageError
 from dpm2_core.estimates import BETWEEN
 from dpm2_core.frame import Frame
+from dpm2_core.learning.finetune_data import _cut, refer
+from dpm2_core.learning.generate import pack
 from dpm2_core.pipeline import OfflineRun
 from dpm2_core.slam.settings import Config
 
 from ..helpers.drives import InMemory, in_parts, make_drive
+from ..helpers.networks import tiny
 
 CONFIG = load_settings(Config, None, ["slam.loops.enabled=false"])
 
@@ -38,3 +42,22 @@ def test_a_run_goes_on_where_its_map_ends(parts: list[Frame], tmp_path: Path) ->
     mirrored = [replace(frame, points=frame.points * np.float32([1, -1, 1, 1])) for frame in parts]
     with pytest.raises(UsageError, match="not the one with which the map ends"):
         OfflineRun(InMemory(mirrored), CONFIG, map_file=tmp_path / "map", map_mode="resume")
+
+
+@pytest.mark.parametrize("every", [1, 20])
+def test_sweeps_are_packed_not_their_parts(parts: list[Frame], tmp_path: Path, every: int) -> None:
+    """Each part was a sample of its own, a tenth of a sweep; with `--every`, of each so many frames."""
+    source = InMemory(parts)
+    source.poses = np.tile(np.eye(4), (len(parts), 1, 1))
+    assert pack(source, tmp_path / "all", tiny(), range(0, len(parts), every)) == 10 * 10 // max(every, 10)
+    sizes = [len(cloud.points) for _, cloud in whole_sweeps(parts)]
+    assert min(sizes) > 5 * max(len(one.points) for one in parts)
+
+
+def test_the_parts_of_a_fine_tuning_begin_with_a_sweep(parts: list[Frame], tmp_path: Path) -> None:
+    """Those of the held-out part were joined to other sweeps than the SLAM's, which have no pose."""
+    referenced = refer(InMemory(parts), CONFIG.slam)
+    cut = _cut(referenced, 0.35)
+    assert cut == 60
+    assert pack(referenced, tmp_path / "drive", tiny(), range(cut)) == 6
+    assert pack(referenced, tmp_path / "held out", tiny(), range(cut, 100)) == 4
