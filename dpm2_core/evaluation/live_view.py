@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Edge, OdometryResult, State
+from dpm2_core.estimates import BETWEEN, Edge, OdometryResult, State
 from dpm2_core.extras import needs
 from dpm2_core.frame import Array, Frame
 from dpm2_core.slam.mapping.mapper import Mapper
@@ -114,6 +114,8 @@ class LiveView:
         self._stream.log("map/lidar/scan", self._rr.Points3D(points, colors=color, radii=0.05))
 
     def _show_figures(self, tracked: OdometryResult) -> None:
+        if tracked.registration.method == BETWEEN:  # only predicted
+            return
         if self._stages != list(tracked.seconds):
             self._stages = list(tracked.seconds)
             self._stream.log("times", self._rr.SeriesLines(names=self._stages), static=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.ply import write_ply
 from dpm2_core.data.trajectory import write_tum
-from dpm2_core.estimates import OdometryResult
+from dpm2_core.estimates import BETWEEN, OdometryResult
 from dpm2_core.files import make_folder
 from dpm2_core.frame import Array
 from dpm2_core.geometry import se3
@@ -42,7 +42,7 @@ class TrajectoryRecorder:
     def add(self, tracked: OdometryResult) -> None:
         """Add the result of the next frame."""
         position, registered = len(self), tracked.registration
-        if self._first_compared is None and (registered.ok or registered.method != "none"):
+        if self._first_compared is None and (registered.ok or registered.method not in ("none", BETWEEN)):
             self._first_compared = position
         if tracked.breaks > self.breaks and self._first_compared is not None:
             self._last_before_break.append(self._last_registered)

@@ -3,9 +3,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from dpm2_core.estimates import BETWEEN, OdometryResult, Registration, State
+from dpm2_core.evaluation.live_view import LiveView
+from dpm2_core.frame import NO_POINTS, Frame
+from dpm2_core.slam.build import make_mapper
+from dpm2_core.slam.settings import SlamSettings
+from dpm2_core.slam.system import SlamResult
 
 from ...helpers.command import dpm2
 from ...helpers.drives import first_scans
@@ -43,6 +52,22 @@ def test_without_a_display_a_view_is_an_error_at_once(
     assert done.returncode == 1
     assert "no display for rerun's viewer" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_the_figures_are_those_of_whole_sweeps(tmp_path: Path) -> None:
+    """A part that completes no sweep has no times but the map's, which were drawn as if they were another stage's."""
+    pytest.importorskip("rerun", reason="no rerun: pip install '.[view]'")
+    mapper, found = make_mapper(SlamSettings()), Registration(np.eye(4), np.eye(6), method="geometric")
+    with LiveView("parts", False, tmp_path / "run.rrd") as view:
+        for i in range(20):
+            result = found if i % 10 == 9 else replace(found, method=BETWEEN, ok=False)
+            tracked = OdometryResult(
+                i, i, np.eye(4), np.eye(6), np.zeros(6), State.TRACKING, result, seconds={"map": 0}
+            )
+            view.add(Frame(i, NO_POINTS, index=i), SlamResult(tracked, None, np.eye(4), State.TRACKING), mapper)
+    names = entities(tmp_path / "run.rrd")
+    assert names["/map/lidar"] == 20
+    assert names["/times"] == 3  # with the names of the stages
 
 
 @pytest.mark.slow

@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dpm2_core.data.trajectory import read_trajectory
-from dpm2_core.estimates import Edge, Keyframe, OdometryResult, Registration, State
+from dpm2_core.estimates import BETWEEN, Edge, Keyframe, OdometryResult, Registration, State
 from dpm2_core.frame import NO_POINTS, Array
 from dpm2_core.geometry import se3
 from dpm2_core.slam.build import make_loops
@@ -63,16 +64,17 @@ def test_corrections_reach_the_frames_between_keyframes() -> None:
     np.testing.assert_allclose(out[6:, 1, 3] - poses[6:, 1, 3], 1.0, atol=1e-9)
 
 
-def test_a_loop_after_a_break_moves_what_comes_after_it_alone() -> None:
+@pytest.mark.parametrize("unseen", ["none", BETWEEN])
+def test_a_loop_after_a_break_moves_what_comes_after_it_alone(unseen: str) -> None:
     """Frames 6 and 7 follow a pause. Frame 8 gives up bridging it, and frame 10 is the next keyframe. Previously,
     frames on both sides were interpolated between the two keyframes: registered frames, whose position the loop
-    determines, were off by as much as the guess across the pause. Frames 4 and 5 have no registered scan and are still
-    interpolated."""
+    determines, were off by as much as the guess across the pause. Frames 4 and 5 have no registered scan, or are parts
+    of a sweep before the pause, and are still interpolated."""
     recorder = TrajectoryRecorder()
     poses = se3.exp(np.arange(12)[:, None] * np.array([0, 0, 0, 0.4, 0, 0]))
     for i, T in enumerate(poses):
         keyframe = Keyframe(i // 10, i, i, T, NO_POINTS) if i in (0, 10) else None
-        how = replace(found(T, ok=i not in (4, 5, 6, 7)), method="none" if i in (4, 5) else "test")
+        how = replace(found(T, ok=i not in (4, 5, 6, 7)), method=unseen if i in (4, 5) else "test")
         recorder.add(replace(tracked(i, T, keyframe), registration=how, breaks=int(i >= 8)))
     shift = se3.exp([0, 0, 0, 0, 30.0, 0])
     out = recorder.poses(np.array([poses[0], shift @ poses[10]]))
