@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpm2_core.data.gnss import FixBuffer
 from dpm2_core.data.image_messages import decode_camera, decode_image, is_fisheye, rectified
@@ -115,6 +116,9 @@ class FrameBuilder:
         self.problems: dict[str, str] = {}
         self.time_problem = ""
         self._imu, self._gnss = imu, gnss
+        # By topic: the last image message, the info that it was decoded with, its frame and its pixels. One image is
+        # associated with several clouds if these are parts of a sweep.
+        self._last_decoded: dict[str, tuple[Any, Any, str, NDArray[np.uint8]]] = {}
         self.up: Up | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, index: int, messages: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
@@ -240,11 +244,18 @@ class FrameBuilder:
 
     def _image(self, lidar_frame: str, camera_topic: CameraTopic, message: Any, delay: float) -> Image | None:
         with self._report_errors(camera_topic.topic, "images are left out"):
-            message = self._decode(camera_topic.topic, message)
-            camera = self.camera(camera_topic, lidar_frame, message.header.frame_id)
-            pixels = decode_image(message, camera.size)
-            if is_fisheye(camera_topic.info) and pixels.shape[1::-1] == camera.size:
-                pixels = rectified(pixels, camera_topic.info)
+            cached = self._last_decoded.pop(camera_topic.topic, None)
+            if cached is not None and cached[0] is message and cached[1] is camera_topic.info:
+                frame, pixels = cached[2:]
+                camera = self.camera(camera_topic, lidar_frame, frame)
+            else:
+                decoded = self._decode(camera_topic.topic, message)
+                frame = decoded.header.frame_id
+                camera = self.camera(camera_topic, lidar_frame, frame)
+                pixels = decode_image(decoded, camera.size)
+                if is_fisheye(camera_topic.info) and pixels.shape[1::-1] == camera.size:
+                    pixels = rectified(pixels, camera_topic.info)
+            self._last_decoded[camera_topic.topic] = message, camera_topic.info, frame, pixels
             return Image(pixels, camera, delay)
         return None
 

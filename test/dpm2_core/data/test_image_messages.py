@@ -11,9 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from dpm2_core.data import image_messages
+from dpm2_core.data import frames, image_messages
+from dpm2_core.data.frames import Calibration, CameraTopic, FrameBuilder
 from dpm2_core.data.messages import MessageError
-from test.helpers.messages import header, info, roi
+from dpm2_core.data.settings import InputSettings
+from dpm2_core.frame import Camera
+from test.helpers.messages import cloud, header, info, roi, xyz
 
 
 def picture(height: int = 6, width: int = 8) -> np.ndarray:
@@ -51,6 +54,23 @@ def test_image_encodings(encoding: str, pixels: np.ndarray, want: np.ndarray, pa
         decoded = image_messages.decode_image(image(pixels, encoding, padding, big))
         assert decoded.dtype == np.uint8
         np.testing.assert_array_equal(decoded, want)
+
+
+def test_an_image_of_several_clouds_is_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of ten parts of a sweep has the same one: of a large camera, decoding takes longer than the sweep."""
+    decoded = list[Any]()
+    monkeypatch.setattr(frames, "decode_image", lambda message, size: decoded.append(message) or RGB)
+    camera = CameraTopic("/image", info())
+    builder = FrameBuilder(InputSettings(), Calibration("/points", camera=camera), pytest.fail)
+    known = Camera(np.array([[10.0, 0, 4], [0, 10, 3], [0, 0, 1]]), np.eye(4), (8, 6))
+    monkeypatch.setattr(builder, "camera", lambda *_: known)
+    messages = [image(RGB, "rgb8") for _ in range(2)]
+    found = [builder.frame(i * 10**7, cloud(xyz()), i, {"/image": (10**8, messages[i // 10])}) for i in range(20)]
+    assert [frame.images[0].time_offset for frame in found] == pytest.approx([0.1 - 0.01 * i for i in range(20)])
+    assert decoded == messages
+    camera.info = info()  # another calibration may want another size
+    builder.frame(2 * 10**8, cloud(xyz()), 20, {"/image": (10**8, messages[1])})
+    assert len(decoded) == 3
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
