@@ -17,6 +17,7 @@ from dpm2_core.frame import Frame
 from dpm2_core.learning.finetune_data import _cut, refer
 from dpm2_core.learning.generate import pack
 from dpm2_core.pipeline import OfflineRun
+from dpm2_core.slam.session import MapMode
 from dpm2_core.slam.settings import Config
 
 from ..helpers.drives import InMemory, in_parts, make_drive
@@ -32,14 +33,15 @@ def parts() -> list[Frame]:
 
 def test_a_run_goes_on_where_its_map_ends(parts: list[Frame], tmp_path: Path) -> None:
     """The map ends with a sweep, and the frame of that number is only its last part: it was not recognized."""
-    for mode, end, scans in (("create", 75, 75), ("resume", None, 41)):
+    runs: list[tuple[MapMode, int | None, int]] = [("create", 75, 75), ("resume", None, 41)]
+    for mode, end, scans in runs:
         with OfflineRun(InMemory(parts), CONFIG, (0, end), map_file=tmp_path / "map", map_mode=mode) as run:
             result = run.run()
             result.save(tmp_path / mode)
         assert len(result) == scans
         assert result.methods[BETWEEN] >= 0.8 * scans
         assert result.methods["failed"] == 0
-    mirrored = [replace(frame, points=frame.points * np.float32([1, -1, 1, 1])) for frame in parts]
+    mirrored = [replace(frame, points=frame.points * np.array([1, -1, 1, 1], np.float32)) for frame in parts]
     with pytest.raises(UsageError, match="not the one with which the map ends"):
         OfflineRun(InMemory(mirrored), CONFIG, map_file=tmp_path / "map", map_mode="resume")
 
