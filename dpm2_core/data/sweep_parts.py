@@ -13,7 +13,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from dpm2_core.frame import Frame, Image
+from dpm2_core.frame import NO_POINTS, Frame, Image
 
 _PART = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
@@ -60,8 +60,10 @@ class SweepParts:
         if step <= 0 or (frame.time_offset is None and len(frame.points)):
             self._end()
             return frame
-        self._parts.append(_copied(frame))
         start, end = _times(frame)
+        if end - start > 2 * SWEEP:  # wrong times: the unit is unknown if few points span little, or one is an outlier
+            start, end, frame = 0.0, 0.0, replace(frame, points=NO_POINTS, time_offset=None)
+        self._parts.append(_copied(frame))
         while len(self._parts) > 1 and self._spanned(end) > 2 * SWEEP:  # parts were dropped in between
             self._parts.popleft()
         if self._spanned(end) < SWEEP - (end - start) / 2:

@@ -149,6 +149,14 @@ def test_a_part_without_a_return_is_waited_through_and_an_unreadable_one_is_hand
     assert (len(out[9].images), out[9].dropped) == (1, 2)
 
 
+def test_a_part_with_wrong_times_leaves_out_itself_alone() -> None:
+    """The parts before it were discarded, and it was registered alone."""
+    wrong = part(6, span=1.5)
+    out = joined([wrong if i == 6 else part(i) for i in range(10)])
+    assert out[1:9] == [None] * 8
+    assert numbers(out[9]) == [0, 1, 2, 3, 4, 5, 7, 8, 9]
+
+
 def test_sweeps_without_a_return_are_joined_too() -> None:
     sky = [replace(part(i), points=NO_POINTS, time_offset=None) for i in range(10, 40)]
     out = joined([*(part(i) for i in range(10)), *sky, *(part(i) for i in range(40, 61))])
