@@ -76,7 +76,8 @@ class KissSource(IndexedSource):
             raise UsageError(f"{self.path}: KISS-ICP's loader {kind} finds no scans here")
         self.stamps = self._read_stamps()
         self.poses = self._poses()
-        self.truth = f"gt_poses of KISS-ICP's loader {kind}" if self.poses is not None else ""
+        if self.poses is not None:
+            self.truth = "global_pose.csv" if kind == "mulran" else f"gt_poses of KISS-ICP's loader {kind}"
 
     def frame(self, position: int) -> Frame:
         """See `IndexedSource`."""

@@ -95,6 +95,7 @@ def test_the_truth_of_mulran_is_of_the_lidar(mulran: Path) -> None:
     np.testing.assert_allclose(source.poses[:2], [np.eye(4), T], atol=1e-5)
     assert np.isnan(source.poses[2]).all()  # the file ends before
     assert source.notes == [f"{mulran}: 1 of 3 frames have no pose"]
+    assert source.truth == "global_pose.csv"
 
 
 def test_loaders_that_cannot_are_named(mulran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
