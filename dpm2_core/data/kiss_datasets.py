@@ -105,7 +105,7 @@ class KissSource(IndexedSource):
         return str(Path(folder, files[position])) if len(files) == self._count else f"{self.path}: scan {position}"
 
     def _call_loader(self, what: Any, of: str = "") -> Any:
-        """Result of a call of the loader, which prints, exits and asserts if something is missing. `of`: the scan file."""
+        """Result of a call of the loader, which prints and exits on errors. `of`: the scan file, if any."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpm2_core.data.ply import read_ply
-from dpm2_core.data.scan_file import KITTI_CARLA, chosen, image_size, images_of
+from dpm2_core.data.scan_file import KITTI_CARLA, chosen, image_size, images_of, is_frames
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import IndexedSource
 from dpm2_core.data.text import read_numbers
@@ -28,7 +28,7 @@ _T_BODY_OPTICAL = se3.make(R_AHEAD, np.zeros(3))
 
 
 class KittiCarlaSource(IndexedSource):
-    """One town, by its folder, its `generated` folder, or the root and `input.sequence` (such as Town01).
+    """One town, by its folder, `generated` or `frames` in it, or the root and `input.sequence` (such as Town01).
 
     Sweeps are not de-skewed: each point is in the LiDAR frame at its own time. The stamp is that of the first point,
     which is also the time of the image. There is no intensity; the cosine of the angle of incidence is used in its
@@ -107,6 +107,8 @@ class KittiCarlaSource(IndexedSource):
 
 def _generated_folder(path: Path, sequence: str) -> Path:
     """The `generated` folder."""
+    if is_frames(path):
+        return path.absolute().parent
     for folder in (path, path / "generated"):
         if (folder / "frames").is_dir():
             return folder

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dpm2_core.data.rosbag2_folder import PACKED, STORAGES
-from dpm2_core.data.scan_file import KITTI, KITTI_360, KITTI_CARLA, KITTI_RAW, drives_below
+from dpm2_core.data.scan_file import KITTI, KITTI_360, KITTI_CARLA, KITTI_RAW, drives_below, is_frames
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.source import Source
 from dpm2_core.errors import UsageError
@@ -82,7 +82,8 @@ def open_source(path: Path | str, settings: InputSettings | None = None) -> Sour
         from dpm2_core.data.kitti360 import Kitti360Source
 
         return Kitti360Source(path, settings)
-    if (path / "frames").is_dir() or (path / "generated").is_dir() or drives_below(path, KITTI_CARLA):
+    is_carla = (path / "frames").is_dir() or (path / "generated").is_dir() or is_frames(path)
+    if is_carla or drives_below(path, KITTI_CARLA):
         from dpm2_core.data.kitti_carla import KittiCarlaSource
 
         return KittiCarlaSource(path, settings)

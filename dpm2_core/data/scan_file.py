@@ -90,6 +90,13 @@ def images_of(path: Path | None, camera: Camera | None, notes: list[str]) -> tup
     return ()
 
 
+def is_frames(path: Path) -> bool:
+    """Whether this is the folder `frames` of a KITTI-CARLA town: PLY files whose poses and images are next to it."""
+    around = path.absolute().parent
+    beside_frames = ("full_poses_lidar.txt", "images_rgb")
+    return path.absolute().name == "frames" and any((around / name).exists() for name in beside_frames)
+
+
 def drives_below(path: Path, layout: str) -> list[str]:
     """Names of the drives below `path` with that layout, sorted."""
     depth = layout.partition("*")[0].count("/")

@@ -69,6 +69,14 @@ def test_frames_poses_and_times(root: Path) -> None:
         assert (frame.images[0].pixels == 10 * n).all()
 
 
+def test_the_folder_of_the_frames_is_the_town_as_well(root: Path) -> None:
+    """It was read as a folder of PLY files: without poses, images and the cosines."""
+    source = open_source(root / "Town01" / "generated" / "frames")
+    assert isinstance(source, KittiCarlaSource)
+    assert source.name == "Town01"
+    assert source.poses is not None
+
+
 def test_the_camera_looks_forward(root: Path) -> None:
     """A point ahead, to the left and above projects to the upper left. The horizontal field of view is 72 degrees."""
     camera = open_source(root).frames().__next__().images[0].camera
