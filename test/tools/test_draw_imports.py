@@ -33,7 +33,7 @@ def test_arrows_that_others_imply_are_left_out() -> None:
 
 
 def test_a_circle_and_a_document_without_a_place_are_errors() -> None:
-    with pytest.raises(Dpm2Error, match="circle: a, b"):
+    with pytest.raises(Dpm2Error, match="circular imports: a, b"):
         reduced({"a": {"b"}, "b": {"a"}, "c": {"a"}})
     with pytest.raises(UsageError, match="no <!-- imports: slam -->"):
         replaced("<!-- imports: packages -->\n<!-- end -->\n", {"slam": "flowchart TD\n"})

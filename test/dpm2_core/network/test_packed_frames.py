@@ -69,10 +69,10 @@ def test_a_network_with_a_coarser_grid_learns_and_is_measured_on_it(packed: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"points": {"voxel": 0.15}}, r"packed with points\.voxel 0\.3, the network has 0\.15"),
-        ({"points": {"near": 0.5}}, r"packed with points\.near 1, the network has 0\.5"),
-        ({"points": {"far": 100.0}}, r"packed with points\.far 60, the network has 100"),
-        ({"image": {"size": [64, 128]}}, r"packed with images of 32 x 64, the network has 64 x 128"),
+        ({"points": {"voxel": 0.15}}, r"packed with points\.voxel 0\.3, but the network has 0\.15"),
+        ({"points": {"near": 0.5}}, r"packed with points\.near 1, but the network has 0\.5"),
+        ({"points": {"far": 100.0}}, r"packed with points\.far 60, but the network has 100"),
+        ({"image": {"size": [64, 128]}}, r"packed with images of 32 x 64, but the network has 64 x 128"),
     ],
     ids=["voxel", "near", "far", "images"],
 )
@@ -93,7 +93,7 @@ def test_a_drive_says_how_it_was_cropped(samples: list[Sample], tmp_path: Path) 
     """A drive that was packed for a coarser network lacks points for the usual one."""
     write_packed(tmp_path / "world", samples, {"crop": {"near": 1.0, "far": 60.0, "voxel": 0.6}})
     settings = DataSettings(packed={str(tmp_path): 1.0})
-    with pytest.raises(UsageError, match=r"world: packed with points\.voxel 0\.6, the network has 0\.3"):
+    with pytest.raises(UsageError, match=r"world: packed with points\.voxel 0\.6, but the network has 0\.3"):
         GroupDataset(settings, tiny(), settings.draw, 0)
     assert GroupDataset(settings, tiny(points={"voxel": 0.6}), settings.draw, 0)
     assert PackedDrive(tmp_path / "world").image_size == (32, 64)
