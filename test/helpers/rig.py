@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from dpm2_core.data.messages import stamp_ns
+from dpm2_core.data.messages import decode_points, stamp_ns
 from dpm2_core.data.naming import IMAGE, KITTI, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
-from dpm2_ros.conversions import transform_to_msg
+from dpm2_ros.conversions import columns_to_msg, transform_to_msg
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.stamps import stamp_to_msg
 from dpm2_ros.tf_message import TFMessage
@@ -55,6 +55,18 @@ class Rig:
             before = len(self.odom)
             self.send(n, **changes)
             self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
+
+    def send_in_parts(self, n: int, parts: Iterable[int] = range(10)) -> None:
+        """Scan n as ten clouds, like a driver that publishes each packet; each when the previous one has come out."""
+        points, _ = decode_points(self.drive.cloud(n))
+        angle = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+        for k in parts:
+            inside = (angle >= 0.1 * k) & (angle < 0.1 * (k + 1))
+            columns = {name: points[inside, i] for i, name in enumerate(("x", "y", "z"))}
+            columns["time"] = (0.1 * angle[inside] - 0.01 * k).astype(np.float32)
+            before = len(self.odom)
+            self.lidar.publish(columns_to_msg(columns, self.drive.stamp(n) + 10_000_000 * k, "lidar"))
+            self.wait(lambda before=before: len(self.odom) > before, f"the odometry of part {k} of scan {n}")
 
     def status(
         self, part: str, condition: Callable[[DiagnosticStatus], Any], since: int | None = None

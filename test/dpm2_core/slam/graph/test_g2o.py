@@ -98,7 +98,7 @@ def test_edges_in_no_order_are_not_taken_for_a_drive(tmp_path: Path) -> None:
         ([f"EDGE_SE2 0 0 1 0 0 {I3}"], r"graph.g2o:1: edge from vertex 0 to itself"),
         ([f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 2 {I6}"], r"graph.g2o:1: the quaternion is not of unit length"),
         (["VERTEX_SE2 0 0 0 0", f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: edge of vertex 1, which has no VERTEX"),
-        (["VERTEX_SE2 0 0 0 0"] * 2 + [f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: vertex 0 again"),
+        (["VERTEX_SE2 0 0 0 0"] * 2 + [f"EDGE_SE2 0 1 1 0 0 {I3}"], r"graph.g2o:2: vertex 0 is defined again"),
         ([f"EDGE_SE2 0 1 1 0 0 {I3}", f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {I6}"], "SE2 and SE3 lines in one graph"),
         ([f"EDGE_SE2 0 1 1 0 0 {I3}", "FIX 9"], "FIX 9: no such vertex"),
         (["EDGE_XY 0 1 2 3"], "no EDGE_SE2 or EDGE_SE3:QUAT line"),
