@@ -15,13 +15,13 @@ import numpy as np
 
 from dpm2_core.frame import NO_POINTS, Frame, Image
 
-_PART = 0.025
+_MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
 """
-_STILL_PART = 0.03  # s: then parts may follow each other a little later, as halves of a sweep of 0.05 s do
-# Of the period, which the parts of a sweep fill. A cloud that spans more overlaps the one before, as clouds do that
-# arrive in a burst; a cloud that spans less is a whole one, as of a flash LiDAR.
-_FILLED = 0.3, 1.5
+_MAX_PERIOD = 0.03  # s, between recognized parts; halves of a sweep of 0.05 s jitter about `_MAX_PART_SPAN`
+# Smallest and largest span of a part, relative to the period. Clouds with a smaller span are whole ones, as of a flash
+# LiDAR; clouds with a larger span overlap the previous one, as if several clouds arrive at once.
+_SPAN_RATIOS = 0.3, 1.5
 SWEEP = 0.1
 """s that a joined cloud spans."""
 
@@ -29,15 +29,15 @@ SWEEP = 0.1
 class SweepParts:
     """Collects parts until they span a sweep.
 
-    Clouds whose points have no times are never joined: nothing tells parts from whole clouds that arrive in a burst.
+    Clouds without point times are never joined: parts look like whole clouds that arrive at once.
     """
 
     def __init__(self) -> None:
         self._stamp: int | None = None  # of the last cloud
-        self._before: Frame | None = None  # the last cloud, if it may be a part, while none has been recognized
+        self._candidate: Frame | None = None  # the last cloud, if it may be a part, while none has been recognized
         self._parts = deque[Frame]()
-        self._joins = False  # whether clouds have been recognized as parts
-        self._follows = False  # whether a part of this sweep followed another one as soon as parts do
+        self._joining = False  # whether clouds have been recognized as parts
+        self._has_close_parts = False  # whether a part of this sweep followed another one as soon as parts do
 
     def join(self, frame: Frame) -> Frame | None:
         """The sweep that this frame completes, with its stamp and index; the frame itself unless it is a part; None
@@ -50,54 +50,54 @@ class SweepParts:
         step = float("inf") if self._stamp is None else (frame.stamp - self._stamp) * 1e-9
         self._stamp, period = frame.stamp, step / (1 + frame.dropped)
         if period > SWEEP:  # a pause, or whole clouds
-            self._end()
-        if self._joins:
-            self._follows |= period < _STILL_PART
-        elif not self._begins(frame, period):
+            self._stop_joining()
+        if self._joining:
+            self._has_close_parts |= period < _MAX_PERIOD
+        elif not self._recognizes_parts(frame, period):
             return frame
         if frame.problem is not None:
             return frame
         if step <= 0 or (frame.time_offset is None and len(frame.points)):
-            self._end()
+            self._stop_joining()
             return frame
-        start, end = _times(frame)
+        start, end = _time_range(frame)
         if end - start > 2 * SWEEP:  # wrong times: the unit is unknown if few points span little, or one is an outlier
             start, end, frame = 0.0, 0.0, replace(frame, points=NO_POINTS, time_offset=None)
         self._parts.append(_copied(frame))
-        while len(self._parts) > 1 and self._spanned(end) > 2 * SWEEP:  # parts were dropped in between
+        while len(self._parts) > 1 and self._span_to(end) > 2 * SWEEP:  # parts were dropped in between
             self._parts.popleft()
-        if self._spanned(end) < SWEEP - (end - start) / 2:
+        if self._span_to(end) < SWEEP - (end - start) / 2:
             return None
         sweep = frame if len(self._parts) == 1 else _joined(list(self._parts), frame)
         self._parts.clear()
-        if not self._follows:  # whole clouds, of which two followed each other too soon once
-            self._end()
-        self._follows = False
+        if not self._has_close_parts:  # whole clouds, of which two followed each other too soon once
+            self._stop_joining()
+        self._has_close_parts = False
         return sweep
 
-    def _begins(self, frame: Frame, period: float) -> bool:
-        """Whether a frame and the one before, a `period` (s) earlier, are the first parts that are recognized."""
-        before, self._before = self._before, None
+    def _recognizes_parts(self, frame: Frame, period: float) -> bool:
+        """Whether this frame and the previous one, `period` s earlier, are the first two parts of a drive."""
+        before, self._candidate = self._candidate, None
         if not may_be_part(frame):
             return False
-        start, end = _times(frame)
-        filled = _FILLED[0] * period < end - start < _FILLED[1] * period
-        self._joins = before is not None and period < _PART and filled
-        if before is not None and self._joins:
+        start, end = _time_range(frame)
+        filled = _SPAN_RATIOS[0] * period < end - start < _SPAN_RATIOS[1] * period
+        self._joining = before is not None and period < _MAX_PART_SPAN and filled
+        if before is not None and self._joining:
             self._parts.append(replace(before, fix=None, dropped=0, stepped=False))
         else:
-            self._before = _copied(frame)
-        return self._joins
+            self._candidate = _copied(frame)
+        return self._joining
 
-    def _end(self) -> None:
+    def _stop_joining(self) -> None:
         """Join no more clouds until parts are recognized again."""
         self._parts.clear()
-        self._joins, self._follows = False, False
+        self._joining, self._has_close_parts = False, False
 
-    def _spanned(self, end: float) -> float:
+    def _span_to(self, end: float) -> float:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
-        return (last.stamp - first.stamp) * 1e-9 + end - _times(first)[0]
+        return (last.stamp - first.stamp) * 1e-9 + end - _time_range(first)[0]
 
 
 def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int, Frame]]:
@@ -120,11 +120,11 @@ def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int,
 
 def may_be_part(frame: Frame) -> bool:
     """Whether a frame spans no more than a part; only the next one shows whether it is one."""
-    start, end = _times(frame)
-    return frame.problem is None and 0 < end - start < _PART
+    start, end = _time_range(frame)
+    return frame.problem is None and 0 < end - start < _MAX_PART_SPAN
 
 
-def _times(frame: Frame) -> tuple[float, float]:
+def _time_range(frame: Frame) -> tuple[float, float]:
     """The first and the last time of its points, s after its stamp; zeros without times."""
     offset = frame.time_offset
     return (0.0, 0.0) if offset is None or not len(offset) else (float(offset.min()), float(offset.max()))
@@ -140,8 +140,8 @@ def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
     """One frame at the stamp of the last part."""
     timed = [part.later((last.stamp - part.stamp) * 1e-9) for part in parts]
     offsets = [part.time_offset for part in timed if part.time_offset is not None]
-    start, end = min(times[0] for times in map(_times, timed)), max(times[1] for times in map(_times, timed))
-    guesses = [(abs(sum(_times(part)) - start - end), part.guess) for part in timed if part.guess is not None]
+    start, end = min(times[0] for times in map(_time_range, timed)), max(times[1] for times in map(_time_range, timed))
+    guesses = [(abs(sum(_time_range(part)) - start - end), part.guess) for part in timed if part.guess is not None]
     return replace(
         last,
         points=np.concatenate([part.points for part in parts]),
