@@ -244,6 +244,12 @@ class Frame:
         object.__setattr__(self, "stamp", int(self.stamp))
         object.__setattr__(self, "index", int(self.index))
 
+    @property
+    def time_range(self) -> tuple[float, float]:
+        """First and last capture time of its points, s relative to `stamp`; zeros without times."""
+        offset = self.time_offset
+        return (0.0, 0.0) if offset is None or not len(offset) else (float(offset.min()), float(offset.max()))
+
     def later(self, seconds: float) -> Frame:
         """The same frame with a stamp `seconds` later; times of points and images are adapted, the points not moved."""
         if not seconds:

@@ -53,14 +53,14 @@ class SweepParts:
             self._stop_joining()
         if self._joining:
             self._has_close_parts |= period < _MAX_PERIOD
-        elif not self._recognizes_parts(frame, period):
+        elif not self._recognize_parts(frame, period):
             return frame
         if frame.problem is not None:
             return frame
         if step <= 0 or (frame.time_offset is None and len(frame.points)):
             self._stop_joining()
             return frame
-        start, end = _time_range(frame)
+        start, end = frame.time_range
         if end - start > 2 * SWEEP:  # wrong times: the unit is unknown if few points span little, or one is an outlier
             start, end, frame = 0.0, 0.0, replace(frame, points=NO_POINTS, time_offset=None)
         self._parts.append(_copied(frame))
@@ -75,12 +75,12 @@ class SweepParts:
         self._has_close_parts = False
         return sweep
 
-    def _recognizes_parts(self, frame: Frame, period: float) -> bool:
+    def _recognize_parts(self, frame: Frame, period: float) -> bool:
         """Whether this frame and the previous one, `period` s earlier, are the first two parts of a drive."""
         before, self._candidate = self._candidate, None
         if not may_be_part(frame):
             return False
-        start, end = _time_range(frame)
+        start, end = frame.time_range
         filled = _SPAN_RATIOS[0] * period < end - start < _SPAN_RATIOS[1] * period
         self._joining = before is not None and period < _MAX_PART_SPAN and filled
         if before is not None and self._joining:
@@ -97,7 +97,7 @@ class SweepParts:
     def _span_to(self, end: float) -> float:
         """s from the first point of the parts to the last, which was measured `end` s after the last stamp."""
         first, last = self._parts[0], self._parts[-1]
-        return (last.stamp - first.stamp) * 1e-9 + end - _time_range(first)[0]
+        return (last.stamp - first.stamp) * 1e-9 + end - first.time_range[0]
 
 
 def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int, Frame]]:
@@ -120,14 +120,8 @@ def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int,
 
 def may_be_part(frame: Frame) -> bool:
     """Whether a frame spans no more than a part; only the next one shows whether it is one."""
-    start, end = _time_range(frame)
+    start, end = frame.time_range
     return frame.problem is None and 0 < end - start < _MAX_PART_SPAN
-
-
-def _time_range(frame: Frame) -> tuple[float, float]:
-    """The first and the last time of its points, s after its stamp; zeros without times."""
-    offset = frame.time_offset
-    return (0.0, 0.0) if offset is None or not len(offset) else (float(offset.min()), float(offset.max()))
 
 
 def _copied(frame: Frame) -> Frame:
@@ -140,8 +134,9 @@ def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
     """One frame at the stamp of the last part."""
     timed = [part.later((last.stamp - part.stamp) * 1e-9) for part in parts]
     offsets = [part.time_offset for part in timed if part.time_offset is not None]
-    start, end = min(times[0] for times in map(_time_range, timed)), max(times[1] for times in map(_time_range, timed))
-    guesses = [(abs(sum(_time_range(part)) - start - end), part.guess) for part in timed if part.guess is not None]
+    starts, ends = zip(*[part.time_range for part in timed], strict=True)
+    middle = (min(starts) + max(ends)) / 2
+    guesses = [(abs(sum(part.time_range) / 2 - middle), part.guess) for part in timed if part.guess is not None]
     return replace(
         last,
         points=np.concatenate([part.points for part in parts]),

@@ -50,7 +50,7 @@ class Sweep:
     def look(self, frame: Frame) -> float:
         """Time from the frame's stamp to the middle of its sweep, s."""
         if frame.time_offset is not None and len(frame.time_offset):
-            start, end = float(frame.time_offset.min()), float(frame.time_offset.max())
+            start, end = frame.time_range
             middle, self.span = (start + end) / 2, end - start
             self.middle = middle if abs(middle) > _CENTER_TOLERANCE * self.span else 0.0
         return self.middle
