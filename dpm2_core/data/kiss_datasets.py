@@ -104,18 +104,20 @@ class KissSource(IndexedSource):
         folder = getattr(self._loader, "scans_dir", getattr(self._loader, "scan_folder", ""))
         return str(Path(folder, files[position])) if len(files) == self._count else f"{self.path}: scan {position}"
 
-    def _call_loader(self, what: Any, of: str = "") -> Any:
-        """Result of a call of the loader, which prints and exits on errors. `of`: the scan file, if any."""
+    def _call_loader(self, call: Any, scan_file: str = "") -> Any:
+        """Result of a call of the loader, which prints and exits on errors; `scan_file`: for messages."""
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-                answer = what()
+                result = call()
         except (Exception, SystemExit) as error:
-            said = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
-            words = " ".join(said.split()[-30:]) or type(error).__name__
-            raise UsageError(f"{of or self.path}: KISS-ICP's loader {self._settings.dataset}: {words}") from None
+            output = printed.getvalue() if isinstance(error, SystemExit) else f"{self._printed} {error}"
+            message = " ".join(output.split()[-30:]) or type(error).__name__
+            raise UsageError(
+                f"{scan_file or self.path}: KISS-ICP's loader {self._settings.dataset}: {message}"
+            ) from None
         self._printed = self._printed or printed.getvalue()
-        return answer
+        return result
 
     def _poses(self) -> Array | None:
         found: Any

@@ -31,19 +31,20 @@ _PART_DISTANCE = 1e4  # m: frames of unconnected parts make no pair
 
 
 class Referenced:
-    """A source with the poses of a SLAM instead of ground truth; NaN where the SLAM had none.
+    """A source with the poses of a SLAM instead of ground truth; NaN where the SLAM had none."""
 
-    Attributes:
-        in_parts: whether frames are parts of a sweep; then only the last part of each sweep has a pose.
-    """
+    def __init__(
+        self, source: Source, poses: Array, notes: Iterable[str] = (), timed: bool = True, in_parts: bool = False
+    ) -> None:
+        """Combine source and poses.
 
-    in_parts = False
-
-    def __init__(self, source: Source, poses: Array, notes: Iterable[str] = (), timed: bool = True) -> None:
-        """`notes`: findings of the SLAM about the drive. `timed`: whether the times of its points are right."""
+        Args:
+            notes: findings of the SLAM about the drive. timed: whether the times of its points are right.
+            in_parts: whether frames are parts of a sweep; then only the last part of each sweep has a pose.
+        """
         self.name, self.notes, self.poses, self.truth = source.name, [*notes], poses, "SLAM"
         self.T_cam_lidar = None
-        self._source, self._timed = source, timed
+        self._source, self._timed, self.in_parts = source, timed, in_parts
 
     def __len__(self) -> int:
         return len(self._source)
@@ -83,9 +84,7 @@ def refer(source: Source, settings: SlamSettings, advance: Callable[[], None] = 
         )
     if times:
         notes.append("the point times are not used, because the motion contradicts them")
-    referenced = Referenced(source, poses, notes, timed=not times)
-    referenced.in_parts = BETWEEN in result.methods
-    return referenced
+    return Referenced(source, poses, notes, timed=not times, in_parts=BETWEEN in result.methods)
 
 
 def _part_of_frames(result: Result) -> NDArray[np.int32]:

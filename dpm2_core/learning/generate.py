@@ -206,10 +206,10 @@ def pack(
         twist, scale, first, done = np.zeros(6), 0.0, None, 0
         for position, frame in whole_sweeps(source.frames(chosen.start, chosen.stop), chosen.start):
             progress(position + 1 - chosen.start, len(chosen))
-            pose, before_it = source.poses[position], done
-            done = len(range(chosen.start, position + 1, chosen.step))
+            pose, done_before = source.poses[position], done
+            done = len(range(chosen.start, position + 1, chosen.step))  # chosen positions, also those of parts
             readable = frame.problem is None and len(frame.points) >= MIN_POINTS
-            if done == before_it or not readable or not np.isfinite(pose).all():
+            if done == done_before or not readable or not np.isfinite(pose).all():
                 continue
             scale = scale or scale_of(frame.points)
             first = first or (frame.index, _camera_names(frame))

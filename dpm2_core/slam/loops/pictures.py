@@ -29,7 +29,7 @@ from dpm2_core.slam.registration.texture import (
     textured,
 )
 
-BETWEEN = 6.0  # m to either side of a keyframe: beyond, the next one is nearer
+REACH = 6.0  # m to either side of a keyframe: beyond, the next one is nearer
 _MAX_RATIO = 0.6  # of 1 - correlation at the best place to that at the second best
 _ASSUMED_CORRELATION = 0.45  # correlation that a place which is not in the map is assumed to have
 _MIN_CORRELATION = 1 - _MAX_RATIO * (1 - _ASSUMED_CORRELATION)  # at least, at the right place
@@ -130,7 +130,7 @@ class PicturedPlaces:
         if known is None:
             return []
         T, axis, picture = result.T_target_source, result.open_direction, view.picture
-        found = peaks(s, known, picture, T, axis, BETWEEN) if closely else [glance(known, picture, T, axis, BETWEEN)]
+        found = peaks(s, known, picture, T, axis, REACH) if closely else [glance(known, picture, T, axis, REACH)]
         moved = [T @ se3.make(np.eye(3), peak.offset * axis) for peak in found]
         return [
             replace(result, T_target_source=self._poses[node] @ T_kf_lidar, confidence=max(peak.correlation, 0.0))

@@ -23,7 +23,7 @@ from dpm2_core.estimates import Keyframe, Registration
 from dpm2_core.frame import Array, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.scale import ByScale
-from dpm2_core.slam.loops.pictures import BETWEEN, KnownMap, PicturedPlaces
+from dpm2_core.slam.loops.pictures import REACH, KnownMap, PicturedPlaces
 from dpm2_core.slam.loops.place_recognition import PlaceRecognition
 from dpm2_core.slam.loops.verification import SAME_PLACE, Verifier, looks_elsewhere, objection_of_others
 from dpm2_core.slam.registration.texture import Texture, VisualSettings
@@ -117,7 +117,7 @@ class Relocalizer:
     def verify(self, keyframe: Keyframe, T_map_lidar: Array) -> Registration:
         """Verify a pose in the map by the points, and by the thumbnail if they leave a direction unconstrained; returns
         T_map_lidar, `ok` or not."""
-        return self._verify_pose(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), BETWEEN)
+        return self._verify_pose(keyframe.cloud, T_map_lidar, self._pictures.texture(keyframe), REACH)
 
     def _verify_pose(
         self, cloud: Points, T_map_lidar: Array, picture: Texture | None = None, reach: float = 0.0
