@@ -20,6 +20,14 @@ from dpm2_core.network.weights import save_weights
 from ..helpers.networks import tiny
 
 
+def _drive(folder: Path, scans: int) -> Path:
+    (folder / "velodyne").mkdir(parents=True)
+    for number in range(scans):
+        np.full((40, 4), 2.0 + number, np.float32).tofile(folder / "velodyne" / f"{number:06d}.bin")
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    return folder
+
+
 @pytest.mark.parametrize(
     "other",
     [
@@ -46,7 +54,7 @@ def test_parts_of_other_options_are_measured_again(
     monkeypatch.setattr(neural, "PARTS", {"first": part, "second": part})
     save_weights(DeepPointMap2(tiny()), tmp_path / "tiny.safetensors", {"phase": "2"})
     weights = f"slam.neural.weights={tmp_path}/tiny.safetensors"
-    options = Options(out=tmp_path, overrides=[weights], threads=1, pairs=3)
+    options = Options(out=tmp_path, sources=[_drive(tmp_path / "00", 2)], overrides=[weights], threads=1, pairs=3)
     other = {**other, "overrides": [weights, *other.get("overrides", ())]}
     neural.bench_neural(options)
     neural.bench_neural(options)
@@ -60,14 +68,6 @@ def test_parts_of_other_options_are_measured_again(
     record = json.loads((tmp_path / "neural.json").read_text())
     assert list(record["parts"]) == ["first", "second"]
     assert record["options"]["threads"] == record["machine"]["threads"]
-
-
-def _drive(folder: Path, scans: int) -> Path:
-    (folder / "velodyne").mkdir(parents=True)
-    for number in range(scans):
-        np.full((40, 4), 2.0 + number, np.float32).tofile(folder / "velodyne" / f"{number:06d}.bin")
-    (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
-    return folder
 
 
 def _worlds(folder: Path, points: int) -> Path:
