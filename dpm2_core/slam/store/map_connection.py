@@ -19,6 +19,8 @@ from dpm2_core.slam.store.map_file import copy_with_log, foreign_log, name_map, 
 
 BUSY = 5.0
 """s to wait for another program: a reader never blocks the writer for long; another writer is an error."""
+BRIEFLY = 0.2
+"""s to wait if it is tried again later, or if nothing depends on it."""
 _MAGIC = b"SQLite format 3"
 _CREATE_LOCK = Lock()  # `part_beside` returns one file for the whole process
 

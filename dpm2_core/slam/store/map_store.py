@@ -23,7 +23,7 @@ from dpm2_core.files import part_beside
 from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store import schema
 from dpm2_core.slam.store.cloud_store import Loan
-from dpm2_core.slam.store.map_connection import MapConnection, create_map, explained, open_map
+from dpm2_core.slam.store.map_connection import BRIEFLY, BUSY, MapConnection, create_map, explained, open_map
 from dpm2_core.slam.store.map_file import move_map, remove_map
 from dpm2_core.slam.store.rows import (
     RemovedKeyframe,
@@ -107,12 +107,13 @@ class MapStore:
             sql.executemany("INSERT INTO sessions VALUES (?,?,?,?,?)", rows)
         self._last_session = max([self._last_session, *(row[0] for row in rows)])
 
-    def write(self, change: Change) -> None:
-        """Write a change, whole or not at all.
+    def write(self, change: Change, wait: float = BUSY) -> None:
+        """Write a change, whole or not at all; `wait`: s to wait for another program that writes.
 
         Raises:
             Dpm2Error: it could not be written: a full disk, a read-only file, another writer.
         """
+        self._wait_at_most(wait)
         with self._transaction() as sql:
             self._check_only_writer(sql)
             for node, keyframe, cloud, thumbnail in change.keyframes:
@@ -212,7 +213,7 @@ class MapStore:
         """Close the file. The last writer leaves a single file, without FILE-wal."""
         if not self.read_only:
             with suppress(sqlite3.Error):  # with a reader, or a full disk, FILE-wal stays, and nothing is lost
-                self._connection.execute("PRAGMA busy_timeout = 200")
+                self._wait_at_most(BRIEFLY)
                 self._connection.execute("PRAGMA journal_mode = DELETE")
         self._map_connection.close()
 
@@ -255,6 +256,10 @@ class MapStore:
                 move_map(part, path)
             finally:
                 remove_map(part)
+
+    def _wait_at_most(self, seconds: float) -> None:
+        with explained(self.path):
+            self._connection.execute(f"PRAGMA busy_timeout = {1000 * seconds:.0f}")
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:

@@ -11,6 +11,7 @@ from dpm2_core.errors import Dpm2Error
 from dpm2_core.estimates import Edge, Keyframe
 from dpm2_core.frame import Array, Georeference
 from dpm2_core.slam.store.cloud_store import CloudStore
+from dpm2_core.slam.store.map_connection import BRIEFLY, BUSY
 from dpm2_core.slam.store.map_store import Change, MapStore
 from dpm2_core.slam.store.rows import array_bytes, edge_of
 
@@ -64,6 +65,12 @@ class MapWriter:
         except Dpm2Error as error:
             self.problem = f"{error}; {len(self._keyframes)} keyframes are in memory only"
 
+    @property
+    def _wait(self) -> float:
+        """s to wait for another program. If the last attempt failed, it may write for long: each keyframe, and the end
+        of a node, would wait in vain, and `ros2 launch` kills a node that takes more than 10 s to end."""
+        return BRIEFLY if self.problem else BUSY
+
     def _write(
         self, keyframes: list[tuple[int, Keyframe, bytes | None]], poses: Array, georeference: Georeference | None
     ) -> None:
@@ -80,7 +87,7 @@ class MapWriter:
         change.moving = {node: mask for node, mask in masks.items() if mask is not None}
         if len(keyframes) == len(self._keyframes):  # else the keyframes that replace them are not in the file yet
             change.given_up = list(self._given_up)
-        self._store.write(change)
+        self._store.write(change, self._wait)
         for node, *_ in keyframes:
             self._clouds.set_stored(node)
         self._keyframes = self._keyframes[len(keyframes) :]
@@ -101,7 +108,7 @@ class MapWriter:
         stored = {_loop_key(edge): (int(row[0]), edge) for row in rows for edge in [edge_of(row)]}
         known = [(number, loop, judged_by_key[key]) for key, (number, loop) in stored.items() if key in judged_by_key]
         if changed := {number: new for number, loop, new in known if new.ok != loop.ok}:
-            self._store.write(Change(judged=changed))
+            self._store.write(Change(judged=changed), self._wait)
 
     def _moved_poses(self, poses: Array) -> dict[int, Array]:
         """Poses that are not in the file, by node."""

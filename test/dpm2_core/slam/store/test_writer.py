@@ -4,7 +4,10 @@ one."""
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -29,11 +32,11 @@ def test_a_cloud_stays_in_the_file_until_that_is_there_for_which_it_is_given_up(
     path, room = tmp_path / "a.dpm2map", [100]
     write = MapStore.write
 
-    def limited(store: MapStore, change: Change) -> None:
+    def limited(store: MapStore, change: Change, wait: float) -> None:
         if not room[0]:
             raise Dpm2Error("the disk is full")
         room[0] -= 1
-        write(store, change)
+        write(store, change, wait)
 
     monkeypatch.setattr(MapStore, "write", limited)
     with MapStore.create(path) as store:
@@ -76,3 +79,30 @@ def test_a_cloud_stays_in_the_file_until_that_is_there_for_which_it_is_given_up(
         assert not writer.problem
         assert there() == set(range(len(keyframes))) - {1, 2}
         assert not check_map(path).problems
+
+
+def test_a_file_that_another_program_locks_for_long_delays_only_the_first_keyframe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Previously each keyframe waited 5 s, and the end of a node 25 s: `ros2 launch` kills it after 10."""
+    monkeypatch.setattr("dpm2_core.slam.store.writer.BUSY", 2.0)
+    path = tmp_path / "a.dpm2map"
+    with MapStore.create(path) as store, closing(sqlite3.connect(path, isolation_level=None)) as other:
+        store.begin_session()
+        clouds = CloudStore(lambda node: store.payload(node, "cloud"))
+        writer = MapWriter(store, clouds, np.zeros((0, 4, 4)))
+        seconds = []
+        other.execute("BEGIN IMMEDIATE")
+        for node in range(4):
+            clouds.append(pack_cloud(np.full((5, 4), 0.1 * node, np.float32)))
+            writer.add(node, Keyframe(node, node, node, np.eye(4), NO_POINTS), None, [])
+            started = monotonic()
+            writer.sync(np.tile(np.eye(4), (node + 1, 1, 1)), None)
+            seconds.append(monotonic() - started)
+            assert writer.problem == f"{path}: database is locked; {node + 1} keyframes are in memory only"
+        assert seconds[0] > 1.9
+        assert sum(seconds[1:]) < 2.0  # 0.2 s each, and a busy machine
+        other.execute("COMMIT")
+        writer.sync(np.tile(np.eye(4), (4, 1, 1)), None)
+        assert writer.problem == ""
+    assert check_map(path).problems == []
