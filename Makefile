@@ -18,7 +18,7 @@ JOBS ?= -n 3 --dist worksteal
 # The environment is self-contained: a sourced ROS 2, another environment's bootstrap or its libraries must not leak in.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV AMENT_PREFIX_PATH ROS_DISTRO LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help setup ros demo test test-long test-oldest test-fast fuzz lint bench measure bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation diagrams parameters topics docs dist dist-check lint-release picture clean
+.PHONY: help setup ros demo test test-long test-oldest test-fast fuzz lint bench measure bench-kitti bench-robustness bench-ros bench-livox bench-robots bench-memory train-data train-small train-movers train-ground ablation diagrams parameters topics docs dist dist-check lint-release picture clean
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:[^#]*##/\t/' | expand -t 16
 
@@ -91,6 +91,24 @@ bench-robots: setup  ## three robots and one mapper_node behind a link that lose
 bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
 	$(DPM2) sim out/memory --frames 2000 --seed 3 --no-images
 	$(DPM2) bench memory --source out/memory $(ARGS)
+
+KITTI := $(or $(DPM2_KITTI),../shared/kitti)
+# $(call ROAD,FOLDER,SEQUENCE,PRESET): a drive along the trajectory of a KITTI sequence, by a sensor with realistic errors.
+ROAD = $(DPM2) sim out/$(1)/sequences/$(2) --road $(KITTI)/gt_poses/$(2).txt --preset $(3) --sensor real --seed $(2:0%=%)
+bench-kitti: setup  ## KITTI's metric on whole synthetic roads, beside KISS-ICP and KISS-SLAM
+	$(call with,peers,kiss_icp kiss_slam)
+	$(call ROAD,roads,06,city) --no-images
+	$(call ROAD,roads,07,city) --no-images
+	$(call ROAD,roads,09,rural) --no-images
+	$(call ROAD,roads,10,suburb) --no-images
+	$(DPM2) experiment kitti out/roads --out out/kitti_roads --registration adaptive --peer kiss-icp --peer kiss-slam --quiet $(ARGS)
+	cp out/kitti_roads/kitti.json benchmarks/kitti.json
+
+bench-robustness: setup  ## failing cameras and LiDARs on 400 frames each of two synthetic roads
+	$(call ROAD,roads_images,07,city) --frames 400
+	$(call ROAD,roads_images,08,suburb) --frames 400
+	$(DPM2) experiment robustness out/roads_images --out out/robustness --registration adaptive,neural --lengths 50,100,150,200 --quiet $(ARGS)
+	cp out/robustness/robustness.json benchmarks/robustness.json
 
 measure: setup  ## every record that stands on the weights, again, at a clean commit; continues where it was stopped
 	$(call with,bench,kiss_icp)
