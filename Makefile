@@ -93,22 +93,29 @@ bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (
 	$(DPM2) bench memory --source out/memory $(ARGS)
 
 KITTI := $(or $(DPM2_KITTI),../shared/kitti)
-# $(call ROAD,FOLDER,SEQUENCE,PRESET): a drive along the trajectory of a KITTI sequence, by a sensor with realistic errors.
-ROAD = $(DPM2) sim out/$(1)/sequences/$(2) --road $(KITTI)/gt_poses/$(2).txt --preset $(3) --sensor real --seed $(2:0%=%)
+# An experiment that was stopped continues, with parts of the same commit.
+AT := $(shell git rev-parse --short HEAD 2>/dev/null)
+# $(call ROAD,TREE,SEQUENCE,PRESET,OPTIONS): a drive along the trajectory of a KITTI sequence, by a sensor with realistic errors.
+define ROAD
+	$(DPM2) sim out/$(1)/drives/$(2) --road $(KITTI)/gt_poses/$(2).txt --preset $(3) --sensor real --seed $(2:0%=%) $(4)
+	mkdir -p out/$(1)/sequences out/$(1)/poses
+	ln -sfn ../drives/$(2)/sequences/00 out/$(1)/sequences/$(2)
+	ln -sfn ../drives/$(2)/poses/00.txt out/$(1)/poses/$(2).txt
+endef
 bench-kitti: setup  ## KITTI's metric on whole synthetic roads, beside KISS-ICP and KISS-SLAM
 	$(call with,peers,kiss_icp kiss_slam)
-	$(call ROAD,roads,06,city) --no-images
-	$(call ROAD,roads,07,city) --no-images
-	$(call ROAD,roads,09,rural) --no-images
-	$(call ROAD,roads,10,suburb) --no-images
-	$(DPM2) experiment kitti out/roads --out out/kitti_roads --registration adaptive --peer kiss-icp --peer kiss-slam --quiet $(ARGS)
-	cp out/kitti_roads/kitti.json benchmarks/kitti.json
+	$(call ROAD,roads,06,city,--no-images)
+	$(call ROAD,roads,07,city,--no-images)
+	$(call ROAD,roads,09,rural,--no-images)
+	$(call ROAD,roads,10,suburb,--no-images)
+	$(DPM2) experiment kitti out/roads --out out/kitti_$(AT) --registration adaptive --peer kiss-icp --peer kiss-slam --quiet $(ARGS)
+	cp out/kitti_$(AT)/kitti.json benchmarks/kitti.json
 
 bench-robustness: setup  ## failing cameras and LiDARs on 400 frames each of two synthetic roads
-	$(call ROAD,roads_images,07,city) --frames 400
-	$(call ROAD,roads_images,08,suburb) --frames 400
-	$(DPM2) experiment robustness out/roads_images --out out/robustness --registration adaptive,neural --lengths 50,100,150,200 --quiet $(ARGS)
-	cp out/robustness/robustness.json benchmarks/robustness.json
+	$(call ROAD,roads_images,07,city,--frames 400)
+	$(call ROAD,roads_images,08,suburb,--frames 400)
+	$(DPM2) experiment robustness out/roads_images --out out/robustness_$(AT) --registration adaptive,neural --lengths 50,100,150,200 --quiet $(ARGS)
+	cp out/robustness_$(AT)/robustness.json benchmarks/robustness.json
 
 measure: setup  ## every record that stands on the weights, again, at a clean commit; continues where it was stopped
 	$(call with,bench,kiss_icp)
