@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dpm2_core.frame import Array, Fix, Georeference
 from dpm2_core.geometry import geodesy, se3
 from dpm2_core.geometry.sampling import evenly
+from dpm2_core.slam.graph.fix_errors import inflation
 from dpm2_core.slam.graph.graph_data import GraphData, Index
 from dpm2_core.slam.graph.lag import STRETCH, Stretch, lag_of, moved_by
 
@@ -48,6 +49,7 @@ class Fixes:
         self.georeference: Georeference | None = None
         self.uncertain = np.zeros((6, 6))
         self._lag = self._lag_of_georeference = 0.0  # s, lag of the stamps of the fixes, as far as it is known
+        self._inflation = np.ones(1)  # of each fix; the last one also of later fixes
 
     def __len__(self) -> int:
         return len(self._fixes)
@@ -101,8 +103,11 @@ class Fixes:
         else:
             self.georeference, self._solved = Georeference(origin, T_enu_map), 0
 
-    def find_lag(self, odometry: Array, placed: NDArray[np.bool_]) -> None:
-        """Estimate the lag of the fixes; `odometry`: (N, 4, 4), each trajectory as driven. `placed`: as in `chosen`."""
+    def calibrate(self, odometry: Array, placed: NDArray[np.bool_]) -> None:
+        """Estimate the lag of the fixes, and how alike their errors are.
+
+        `odometry`: (N, 4, 4), each trajectory as driven. `placed`: as in `chosen`.
+        """
         assert self.georeference is not None
         T_enu_map, (here, velocities) = self.georeference.T_enu_map, self._antenna_states(odometry)
         here, moving = se3.transform(T_enu_map, here), velocities @ T_enu_map[:3, :3].T
@@ -116,9 +121,17 @@ class Fixes:
         seconds = lag.seconds if lag.known else 0.0
         if abs(seconds - self._lag) > lag.sigma:
             self._lag = seconds
+        self._inflation = self._inflations(here - self._lag * moving, there, sigmas)
         moves = moved_by(stretches)
         excess = max(0.0, (lag.seconds - self._lag) ** 2 - lag.sigma**2)
         self.uncertain = excess * np.outer(moves, moves)
+
+    def _inflations(self, here: Array, there: Array, sigmas: Array) -> Array:
+        """(K,) of the fixes of each trajectory, which has a receiver of its own; see `fix_errors.inflation`."""
+        stamps, out = self._stamps(), np.ones(len(self))
+        for row in self._rows.values():
+            out[row] = inflation(here[row], there[row], sigmas[row], stamps[row])
+        return out
 
     def loaded(self) -> None:
         """The georeference is that of an optimized map with these fixes."""
@@ -128,12 +141,15 @@ class Fixes:
         """(K, 3) m, antenna positions in the map at the stamps of the fixes, and (K, 3) m/s, their velocities since the
         previous fix, 0 if unknown; `poses`: (N, 4, 4)."""
         positions = np.array([poses[node] @ np.append(fix.antenna, 1) for node, fix in self._fixes])[:, :3]
-        stamps, velocities = np.array([fix.stamp for _, fix in self._fixes], np.int64), np.zeros_like(positions)
+        stamps, velocities = self._stamps(), np.zeros_like(positions)
         for row in self._rows.values():
             seconds = np.diff(stamps[row])[:, None] * 1e-9
             valid = (seconds > 0) & (seconds < _MAX_FIX_INTERVAL)
             velocities[row[1:]] = np.where(valid, np.diff(positions[row], axis=0) / np.where(valid, seconds, 1.0), 0.0)
         return positions, velocities
+
+    def _stamps(self) -> Index:
+        return np.array([fix.stamp for _, fix in self._fixes], np.int64)
 
     def _measured_positions(self) -> tuple[Array, Array]:
         """(K, 3) m, antenna positions on Earth by the fixes, and (K,) m, their horizontal standard deviations."""
@@ -170,6 +186,7 @@ class Fixes:
         covariances[-1] = (
             np.diag([_TILT_SIGMA, _TILT_SIGMA, _FREE_ROTATION, _FREE_POSITION, _FREE_POSITION, _FREE_POSITION]) ** 2
         )
+        factors = np.pad(self._inflation, (0, max(0, len(self) - len(self._inflation))), mode="edge")
         yaw = np.arctan2(T_map_enu[1, 0], T_map_enu[0, 0])
         level = se3.make(se3.rotation(np.array([0.0, 0.0, yaw])), T_map_enu[:3, 3])
         return replace(
@@ -182,6 +199,7 @@ class Fixes:
             T_from_to=np.concatenate([data.T_from_to, T, (se3.inverse(data.poses[places[0]]) @ level)[None]]),
             covariances=np.concatenate([data.covariances, covariances]),
             enu=np.array([last], np.intp),
+            inflation=np.concatenate([np.ones(len(data.ends)), factors[chosen], [1.0]]),
         )
 
     def solved(self, chosen: Sequence[int], T_map_enu: Array, kept: NDArray[np.bool_]) -> None:

@@ -30,6 +30,8 @@ class GraphData:
         covariances: (E, 6, 6) of each loop.
         fixed: nodes that keep their pose; the first node of each unconnected trajectory does so anyway.
         enu: the node, if any, of the local frame of fixes, which is no keyframe; its start is good.
+        inflation: (E,) factors by which the covariances of loops are larger as constraints than for the check whether
+            they can be right: errors of fixes that are alike do not average out. None: all are 1.
     """
 
     poses: Array
@@ -41,9 +43,15 @@ class GraphData:
     covariances: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     fixed: Index = field(default_factory=lambda: np.zeros(0, np.intp))
     enu: Index = field(default_factory=lambda: np.zeros(0, np.intp))
+    inflation: Array | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def constraint_covariances(self) -> Array:
+        """(E, 6, 6) of each loop as a constraint: see `inflation`."""
+        return self.covariances if self.inflation is None else self.covariances * self.inflation[:, None, None]
 
     @property
     def odometry_ends(self) -> Index:

@@ -147,7 +147,7 @@ class PoseGraph:
     def set_georeference(self, georeference: Georeference) -> None:
         """Set the pose of a loaded map on Earth."""
         self._fixes.georeference = georeference
-        self._find_lag()
+        self._calibrate_fixes()
         self._fixes.loaded()
         chosen, first = self._chosen_fixes(), len(self._loops)
         if chosen:
@@ -299,21 +299,21 @@ class PoseGraph:
 
     def _prepare_graph(self) -> GraphData:
         """The graph for the next optimization."""
-        self._find_lag()
+        self._calibrate_fixes()
         self._fixes.locate(self.poses, self.placed)
         self._sent_loops, self._sent_fixes = len(self._loops), self._chosen_fixes()
         self._fixes.sent()
         return self._graph_data()
 
-    def _find_lag(self) -> None:
-        """Estimate the lag of the fixes, once the georeference is known."""
+    def _calibrate_fixes(self) -> None:
+        """Estimate the errors of the fixes, once the georeference is known."""
         if self.georeference is None or not len(self._fixes):
             return
         odometry = self.poses
         for node, step in enumerate(self._steps):
             if step is not None:
                 odometry[node] = odometry[step.from_node] @ step.T_from_to
-        self._fixes.find_lag(odometry, self.placed)
+        self._fixes.calibrate(odometry, self.placed)
 
     def _move_part(self, part: int, T: Array) -> None:
         """Move a part: all its poses become T @ T_map_kf."""

@@ -171,14 +171,16 @@ def _factors(
     """The gtsam graph of the chosen nodes; `ends` are indices among them; without a kernel: plain least squares."""
     factors, gaussian = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance
     noise: gtsam.noiseModel.Base
+    covariances = graph.constraint_covariances
     by_satellite = np.asarray(np.isin(ends, np.searchsorted(condensed.nodes, graph.enu)).any(axis=1))
     for k in np.flatnonzero(condensed.chained):
         noise = gaussian(condensed.covariances[k])
         factors.add(gtsam.BetweenFactorPose3(int(k) - 1, int(k), gtsam.Pose3(condensed.T[k]), noise))
     for loop in np.flatnonzero(used):
-        noise = gaussian(graph.covariances[loop])
+        noise = gaussian(covariances[loop])
         if kernel is not None:
             width = _FIX_KERNEL if by_satellite[loop] else kernel
+            width /= 1.0 if graph.inflation is None else float(np.sqrt(graph.inflation[loop]))
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(width), noise)
         a, b = ends[loop].tolist()
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_from_to[loop]), noise))
