@@ -16,6 +16,7 @@ from dpm2_core.data.image_messages import decode_camera, decode_image, is_fishey
 from dpm2_core.data.imu import ImuBuffer
 from dpm2_core.data.messages import MessageError, decode_points, returned, why_untimed
 from dpm2_core.data.naming import frame_name
+from dpm2_core.data.pairing import JUMP
 from dpm2_core.data.point_times import last_point
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.data.transforms import TransformTree
@@ -26,6 +27,7 @@ from dpm2_core.geometry import se3
 
 _MAX_REPORTS = 20  # damaged data may produce any number of different messages
 _MAX_PROBLEM_LENGTH = 300  # characters of a problem, whatever is in the message
+_MAX_IMU_PERIOD = 50_000_000  # ns: an IMU whose samples are further apart has stopped
 _MAX_SILENCE = 2_000_000_000  # ns, by the stamps: after a silence of this length another sensor may use the topic
 
 
@@ -214,6 +216,8 @@ class FrameBuilder:
         if buffer.last == -float("inf"):
             return None
         found = buffer.take(stamp, stamp + last_point(offset))
+        if found is None and -JUMP < stamp - buffer.taken < _MAX_IMU_PERIOD:  # a part of a sweep, between two samples
+            return None
         with self._report_errors(self._calibration.imu_topic, "going on without the IMU"):
             if found is None:
                 raise UsageError("no samples at the time of the scan")

@@ -42,11 +42,13 @@ class ImuBuffer:
     """The latest samples in order of their stamps; thread-safe.
 
     Attributes:
-        last: stamp of the newest sample, ns; -inf before the first. frame: frame of the measurements.
+        last: stamp of the newest sample, ns; -inf before the first. taken: the same, of those that were taken.
+        frame: frame of the measurements.
     """
 
     def __init__(self) -> None:
-        self.last, self.frame = -float("inf"), ""
+        self.last = self.taken = -float("inf")
+        self.frame = ""
         self._lock = threading.Lock()
         self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=_MAX_SAMPLES)
         self._set_back = SetBack()
@@ -54,7 +56,7 @@ class ImuBuffer:
     def clear(self) -> None:
         """Remove all samples."""
         with self._lock:
-            self.last = -float("inf")
+            self.last = self.taken = -float("inf")
             self._samples.clear()
 
     def add(self, stamp: int, message: Any) -> None:
@@ -87,5 +89,6 @@ class ImuBuffer:
         taken = [sample for sample in taken if sample[0] > stamp - KEPT]
         if not taken:
             return None
+        self.taken = taken[-1][0]
         stamps, rates, forces = zip(*taken, strict=True)
         return Inertial(np.array(stamps, np.int64), np.array(rates), np.array(forces))

@@ -19,6 +19,7 @@ from dpm2_core.data.messages import MessageError
 from dpm2_core.data.naming import POINTS
 from dpm2_core.data.settings import InputSettings
 from dpm2_core.errors import UsageError
+from test.helpers.recordings import by_time
 
 SECOND = 10**9
 NAN, INF = float("nan"), float("inf")
@@ -144,6 +145,17 @@ def test_one_that_stops_is_missed_once(bags: Any, tmp_path: Path) -> None:
     source = BagSource(bags.write(tmp_path / "b", [quarter(bags), *drive(bags, until=1.45)]))
     assert [frame.imu is not None for frame in source.frames()] == [True] * 6 + [False] * 4
     assert source.notes == ["/imu: no samples at the time of the scan; going on without the IMU"]
+
+
+def test_clouds_between_two_samples_are_not_reported_to_have_none(bags: Any, tmp_path: Path) -> None:
+    """Parts of a sweep at 100 Hz, and an IMU at 50 Hz, which was reported as missing though it was used."""
+    parts = [(1 + 0.01 * i, POINTS, bags.cloud(1 + 0.01 * i)) for i in range(100)]
+    samples = [(1.004 + 0.02 * i, "/imu", imu(bags, 1.004 + 0.02 * i)) for i in range(-5, 80)]
+    source = BagSource(bags.write(tmp_path / "b", by_time([quarter(bags), *parts, *samples])))
+    frames = list(source.frames())
+    assert sum(frame.imu is None for frame in frames) == 49
+    assert sum(len(frame.imu) for frame in frames if frame.imu is not None) == 55
+    assert source.notes == []
 
 
 def test_one_of_zeros_is_left_out_and_said(bags: Any, tmp_path: Path) -> None:
