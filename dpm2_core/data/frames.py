@@ -121,6 +121,8 @@ class FrameBuilder:
         # By topic: the last image message, the info that it was decoded with, its frame and its pixels. One image is
         # associated with several clouds if these are parts of a sweep.
         self._last_decoded: dict[str, tuple[Any, Any, str, NDArray[np.uint8]]] = {}
+        self._last_stamp: int | None = None  # of the last cloud
+        self._last_merged: Any = None  # the last message of a second LiDAR whose points a cloud got
         self.up: Up | None = (0.0, 0.0, 1.0)
 
     def frame(self, stamp: int, cloud: Any, index: int, messages: Mapping[str, tuple[int, Any]] | None = None) -> Frame:
@@ -141,8 +143,11 @@ class FrameBuilder:
         self.time_problem = f"{why_untimed(cloud)}: not de-skewed" if offset is None and expected else ""
         points = correct_vertical_angle(points, self.angle_correction_deg)
         lidar_frame = cloud.header.frame_id
-        if (second := messages.get(self._calibration.second_topic)) is not None:
+        second = messages.get(self._calibration.second_topic)
+        if second is not None and self._is_nearest(stamp, *second):
+            self._last_merged = second[1]
             points, offset = self._merged(points, offset, lidar_frame, (second[0] - stamp) * 1e-9, second[1])
+        self._last_stamp = stamp
         imu = None if self._imu is None else self._imu_samples(self._imu, lidar_frame, stamp, offset)
         fix = None if self._gnss is None else self._fix(self._gnss, lidar_frame, stamp)
         associated = [
@@ -163,6 +168,12 @@ class FrameBuilder:
         """Points (N, 4) and their times (N,), s after the stamp, of a decoded message."""
         settings = self._settings
         return decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
+
+    def _is_nearest(self, stamp: int, second_stamp: int, second: Any) -> bool:
+        """Whether the cloud of a second LiDAR is to be merged into this one, with stamps in ns: of several clouds that
+        it is associated with, as are parts of a sweep, the nearest one gets its points."""
+        period = 0 if self._last_stamp is None else abs(stamp - self._last_stamp)
+        return second is not self._last_merged and (not period or second_stamp - stamp <= period / 2)
 
     def _merged(
         self, points: Points, offset: Points | None, lidar_frame: str, delay: float, second: Any
