@@ -17,7 +17,7 @@ from nav_msgs.msg import Odometry
 from dpm2_core.data.frames import Calibration, FrameBuilder
 from dpm2_core.descriptors import is_level
 from dpm2_core.errors import UsageError
-from dpm2_core.estimates import Keyframe, OdometryResult, State
+from dpm2_core.estimates import BETWEEN, Keyframe, OdometryResult, State
 from dpm2_core.frame import Array, Frame, Up
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.sweep import Sweep
@@ -227,7 +227,7 @@ class SlamNode(ManagedNode):
         at = frame.stamp + round(self._sweep.look(frame) * 1e9)  # where the scan is registered
         guess = other.guess(at, base.name, base.T_base_start @ base.T_start_lidar)
         tracked = self._slam.odometry_step(replace(frame, guess=guess))
-        if problem := other.judge(tracked.comparison):
+        if tracked.registration.method != BETWEEN and (problem := other.judge(tracked.comparison)):
             self.get_logger().warning(f"{other.source}: {problem}", throttle_duration_sec=5)
         return tracked
 

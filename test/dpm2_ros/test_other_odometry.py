@@ -220,6 +220,20 @@ def test_one_that_is_unsure_by_its_own_covariance_is_not_called_outweighed(robot
     assert having(outweighed=0)(said)
 
 
+def test_parts_of_a_sweep_do_not_clear_what_the_last_sweep_has_shown(robot: Callable[..., Robot], drive: Any) -> None:
+    """Nine of ten clouds are not compared with it: /diagnostics alternated between "in use" and what is wrong."""
+    r = robot("topic")
+    r.covariance = lambda n: (1e-4 + 1e3 * n) * np.eye(6)
+    r.turn_wheels(0)
+    for n in range(4):
+        r.turn_wheels(n + 1)
+        r.send_in_parts(n)
+    assert saying("left out: its own covariance")(r.status("other odometry", having(**{"clouds with it": 40})))
+    r.turn_wheels(5)
+    r.lidar.publish(r.parts(4)[0])
+    assert saying("left out: its own covariance")(r.status("other odometry", having(**{"clouds with it": 41})))
+
+
 def test_it_is_asked_for_the_middle_of_the_sweep(robot: Callable[..., Robot], drive: Any) -> None:
     """The scan is registered at that time. With the stamp, here of the first point, the distances of an accelerating
     robot were too short. In this test, the wheels begin between the two times."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -56,16 +56,23 @@ class Rig:
             self.send(n, **changes)
             self.wait(lambda before=before: len(self.odom) > before, f"the odometry of cloud {n}")
 
-    def send_in_parts(self, n: int, parts: Iterable[int] = range(10)) -> None:
-        """Scan n as ten clouds, like a driver that publishes each packet; each when the previous one has come out."""
+    def parts(self, n: int, count: int = 10) -> list[PointCloud2]:
+        """Scan n as so many clouds, like those of a driver that publishes each packet."""
         points, _ = decode_points(self.drive.cloud(n))
-        angle = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-        for k in parts:
-            inside = (angle >= 0.1 * k) & (angle < 0.1 * (k + 1))
+        turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+        out = []
+        for k in range(count):
+            inside = (turn >= k / count) & (turn < (k + 1) / count)
             columns = {name: points[inside, i] for i, name in enumerate(("x", "y", "z"))}
-            columns["time"] = (0.1 * angle[inside] - 0.01 * k).astype(np.float32)
+            columns["time"] = (0.1 * (turn[inside] - k / count)).astype(np.float32)
+            out.append(columns_to_msg(columns, self.drive.stamp(n) + self.drive.period * k // count, "lidar"))
+        return out
+
+    def send_in_parts(self, n: int) -> None:
+        """Scan n as ten clouds, each when the previous one has come out."""
+        for k, part in enumerate(self.parts(n)):
             before = len(self.odom)
-            self.lidar.publish(columns_to_msg(columns, self.drive.stamp(n) + 10_000_000 * k, "lidar"))
+            self.lidar.publish(part)
             self.wait(lambda before=before: len(self.odom) > before, f"the odometry of part {k} of scan {n}")
 
     def status(
