@@ -53,9 +53,9 @@ class RosSettings(Settings):
     addition to map -> odom."""
 
     base_frame: str = ""
-    """Frame whose pose is published. No pose is published before /tf_static connects this frame with the LiDAR. Up to
-    300 poses are kept until then; with one more, all are discarded and the drive begins again. Empty: the root frame
-    above the LiDAR in /tf_static, also if it arrives late, else the LiDAR's own frame."""
+    """Frame whose pose is published. No pose is published before /tf_static connects this frame with the LiDAR. The
+    poses of up to 30 s are kept until then; with later ones, all are discarded and the drive begins again. Empty: the
+    root frame above the LiDAR in /tf_static, also if it arrives late, else the LiDAR's own frame."""
 
     tf_timeout: float = Field(default=0.5, ge=0, le=60)
     """How long the first cloud waits for all publishers of /tf_static, s."""

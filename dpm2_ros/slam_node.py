@@ -41,8 +41,8 @@ from dpm2_ros.synchronizer import Bundle
 from dpm2_ros.tf import TransformBroadcaster
 from dpm2_ros.warm_up import warm_up
 
-HELD = 300
-"""Poses kept while the base frame is unknown; with one more the drive begins again."""
+HELD = 30_000_000_000
+"""ns: poses of that time are kept while the base frame is unknown; with later ones the drive begins again."""
 
 
 class SlamNode(ManagedNode):
@@ -209,7 +209,7 @@ class SlamNode(ManagedNode):
             for held in self._held_results:
                 tracked = self._publish_result(held)
             self._held_results = []
-        elif len(self._held_results) > HELD:
+        elif tracked.stamp - self._held_results[0].stamp > HELD:
             self._report_unpublished()
             self._begin_drive()
         self._health.add(tracked, time.monotonic() - bundle.arrival)

@@ -154,7 +154,7 @@ def test_poses_kept_for_a_base_are_bounded(
 
     The log names the preset of each of the two drives, and none before it is known.
     """
-    monkeypatch.setattr("dpm2_ros.slam_node.HELD", 3)
+    monkeypatch.setattr("dpm2_ros.slam_node.HELD", 250_000_000)
     r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0")
     for n in range(5):
         r.send(n)
@@ -167,6 +167,20 @@ def test_poses_kept_for_a_base_are_bounded(
     lines = [line for line in capfd.readouterr().err.splitlines() if "slam.preset auto" in line]
     assert len(lines) == 2
     assert all("slam.preset auto: outdoor," in line for line in lines)
+
+
+def test_poses_of_parts_are_kept_for_a_base_as_long_as_those_of_sweeps(rig: Callable[..., Rig], drive: Any) -> None:
+    """At 100 Hz the drive began anew every 3 s, at 10 Hz every 30 s."""
+    r = rig("ros.base_frame:=base_link", "ros.tf_timeout:=0.0", "ros.queue_depth:=1000")
+    parts = [part for n in range(drive.frames) for part in r.parts(n, 20)]
+    for sent, part in enumerate(parts[:-1], 1):
+        r.lidar.publish(part)
+        if sent % 20 == 0:
+            r.processed(sent)
+    r.processed(len(parts) - 1)
+    publish_static(r, "base_link", "lidar", np.eye(4))
+    r.lidar.publish(parts[-1])
+    r.wait(lambda: len(r.odom) == len(parts) == 320, "the poses")
 
 
 def test_a_parent_that_comes_late_becomes_the_base(rig: Callable[..., Rig], drive: Any) -> None:
