@@ -28,9 +28,8 @@ from dpm2_core.network.encoder import to_device
 from dpm2_core.network.precision import mixed_precision
 
 M = TypeVar("M", bound=nn.Module)
-_MAX_SKIPPED_STEPS = (
-    100  # steps in a row without a finite gradient: none of them changes the weights, which do not recover
-)
+_MAX_SKIPPED_STEPS = 10
+"""Steps in a row without a finite gradient: none of them changes the weights, which do not recover."""
 
 
 class StepSettings(Settings):
@@ -146,6 +145,13 @@ def update_ema(ema: nn.Module, module: nn.Module, decay: float, step: int) -> No
     torch._foreach_lerp_(averaged, current, 1 - decay)  # exact for weights that do not learn
 
 
+def _divergence(skipped: int, last: int, steps: range) -> str:
+    """What happened if the steps up to `last` had no finite gradient."""
+    if skipped == len(steps):
+        return f"none of {skipped} steps had a finite gradient: the weights did not change"
+    return f"diverged: no finite gradient since step {last + 1 - skipped} of {steps.stop}"
+
+
 @dataclass(frozen=True)
 class Trainer(Generic[M]):
     """A training, from its batches to the averaged weights; under torchrun in several processes.
@@ -173,7 +179,7 @@ class Trainer(Generic[M]):
         Raises:
             UsageError: a checkpoint of another training, or of more steps than the settings have; or another training
                 is writing in the folder.
-            Dpm2Error: no step had a finite gradient, or none of the last hundred.
+            Dpm2Error: no step had a finite gradient, or none of the last ten; or the weights are not finite.
         """
         keep_memory()
         make_folder(self.out)
@@ -191,7 +197,7 @@ class Trainer(Generic[M]):
             if self.settings.compile:
                 wrapped.compile(dynamic=False)
             log = Log(self.out, start) if rank == 0 else None
-            skipped = 0  # steps in a row without a finite gradient
+            skipped, in_a_row = 0, 0  # steps without a finite gradient
             with progress_bar() as progress:
                 task = progress.add_task("training", total=self.settings.steps, completed=start)
                 for step in steps:
@@ -199,18 +205,19 @@ class Trainer(Generic[M]):
                     batch = next(batches)
                     waited = time.perf_counter() - begin
                     figures = self._step(wrapped, ema, optimizer, to_device(batch, device), step)
-                    skipped = 0 if math.isfinite(figures["norm"]) else skipped + 1
-                    if skipped == _MAX_SKIPPED_STEPS:
-                        raise Dpm2Error(f"diverged: no finite gradient since step {step + 1 - skipped} of {steps.stop}")
+                    is_skipped = not math.isfinite(figures["norm"])
+                    skipped, in_a_row = skipped + is_skipped, in_a_row + 1 if is_skipped else 0
+                    if in_a_row == min(_MAX_SKIPPED_STEPS, len(steps)):  # no checkpoint: --resume ends here again
+                        raise Dpm2Error(_divergence(in_a_row, step, steps))
                     figures |= {"seconds": time.perf_counter() - begin, "waited": waited}
                     progress.update(task, advance=1, description=f"loss {figures['loss']:.3f}")
                     if log is not None:
                         log.write(step, figures)
                         self._validate_and_save(ema, optimizer, log, step + 1, last=step == steps[-1])
+                if skipped:
+                    progress.console.print(f"{skipped} of {len(steps)} steps had no finite gradient and were skipped")
             if log is not None:
                 log.close()
-                if steps and skipped == len(steps):
-                    raise Dpm2Error(f"none of {len(steps)} steps had a finite gradient: the weights did not change")
                 self.save(ema)
 
     def _step(

@@ -113,11 +113,12 @@ def pool_neighbors(projected: Tensor | None, index: Tensor | None, relative: Ten
 def argmax_neighbor(sums: Tensor) -> Tensor:
     """Index (B, n, C) of the largest of (B, n, k, C) over k < 256.
 
-    `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the lowest bits store the index.
+    `argmax` over an inner dimension is many times slower than `amax` on the CPU, so the lowest bits store the index. A
+    NaN may have any bits: the index is kept in range.
     """
     k = torch.arange(sums.shape[2], dtype=torch.int32, device=sums.device)[:, None]
     tagged = sums.float().view(torch.int32).bitwise_and(~255).bitwise_or(k)
-    return tagged.view(torch.float32).amax(2).view(torch.int32).bitwise_and(255).long()
+    return tagged.view(torch.float32).amax(2).view(torch.int32).bitwise_and(255).clamp(max=sums.shape[2] - 1).long()
 
 
 class Aggregation(nn.Module):

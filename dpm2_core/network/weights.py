@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import nn
 
 from dpm2_core.config import Settings
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.settings import NetworkSettings, settings_from
@@ -39,11 +39,16 @@ def write_tensors(state: Mapping[str, torch.Tensor], path: Path, metadata: dict[
     """Write tensors and their metadata, completely or not at all; `half` stores fp16.
 
     The same tensors and metadata give the same bytes, by which weights are identified.
+
+    Raises:
+        Dpm2Error: a value is not finite, or too large for fp16, as after a training that diverged.
     """
     stored = {
         name: (value.half() if half and value.is_floating_point() else value).contiguous().cpu()
         for name, value in state.items()
     }
+    if bad := [name for name, value in stored.items() if not bool(value.isfinite().all())]:
+        raise Dpm2Error(f"{path}: not written: {bad[0]} holds values that are not finite{' in fp16' if half else ''}")
     with atomic_write(path, "wb") as file:
         file.write(_with_sorted_metadata(save(stored, metadata)))
 

@@ -203,6 +203,26 @@ def test_a_training_that_diverges_ends(tmp_path: Path) -> None:
     assert not saved
 
 
+def test_a_short_training_that_diverges_ends_also_if_resumed(tmp_path: Path) -> None:
+    """Ten steps in a row without a finite gradient are an error, again on --resume. Previously, only a hundred were: 12
+    steps of which 11 were skipped, or a training resumed after its last step, wrote the weights without a word."""
+    saved: list[Toy] = []
+    module = line(lambda x, y: y.square().sum() * (1.0 if float(x[0]) < 2 else torch.nan))
+    batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
+    for _ in range(2):
+        with pytest.raises(Dpm2Error, match=r"no finite gradient since step 2 of 12|none of .* had a finite gradient"):
+            replace(trainer(module, tmp_path, saved, steps=12, save_every=4), batches=batches).run()
+    assert not saved
+
+
+def test_skipped_steps_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The number of skipped steps is printed at the end. Previously, it was only in the log."""
+    module = line(lambda x, y: y.square().sum() * (torch.nan if 2 <= float(x[0]) < 5 else 1.0))
+    batches = lambda start, rank: ((torch.full((2,), float(n)),) for n in count(start))  # noqa: E731
+    replace(trainer(module, tmp_path, steps=12), batches=batches).run()
+    assert "3 of 12 steps had no finite gradient and were skipped" in capsys.readouterr().err
+
+
 def test_the_progress_of_a_training_is_that_of_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -265,6 +265,12 @@ def test_argmax_neighbor() -> None:
         torch.testing.assert_close(found, sums.amax(2), atol=1e-4, rtol=1e-4)  # float32 loses 8 bits to the index
 
 
+def test_argmax_neighbor_of_nan_is_in_range() -> None:
+    """The maximum of NaN in vector registers has all bits set, those of an index beyond the neighbors. Previously, a
+    training whose features became NaN ended in torch's traceback instead of the error that it diverged."""
+    assert argmax_neighbor(torch.full((1, 2, 8, 64), torch.nan)).max() < 8
+
+
 def test_the_feature_of_the_own_pixel_begins_as_nothing(noise: np.random.Generator) -> None:
     """At first the network equals one without it, and always where no view sees the point; several views are
     averaged."""

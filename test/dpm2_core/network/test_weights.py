@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dpm2_core.descriptors import Descriptors
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.network.model import DeepPointMap2
 from dpm2_core.network.weights import (
     load_fitting,
@@ -40,6 +40,18 @@ def test_round_trip(model: DeepPointMap2, saved: Path) -> None:
     for name, value in model.state_dict().items():
         torch.testing.assert_close(loaded.state_dict()[name], value, atol=1e-3, rtol=1e-3)
     assert load_weights(model, saved)["steps"] == "3"
+
+
+@pytest.mark.parametrize(("value", "half"), [(float("nan"), False), (1e6, True)])
+def test_weights_that_could_not_be_loaded_are_not_written(
+    model: DeepPointMap2, tmp_path: Path, value: float, half: bool
+) -> None:
+    """Values that are not finite, or too large for fp16, are an error. Previously, a training that diverged wrote
+    weights that every command rejected."""
+    torch.nn.init.constant_(next(model.parameters()), value)
+    with pytest.raises(Dpm2Error, match=r"not written: .* holds values that are not finite"):
+        save_weights(model, tmp_path / "new.safetensors", {}, half)
+    assert not (tmp_path / "new.safetensors").exists()
 
 
 def test_the_same_weights_are_the_same_file(model: DeepPointMap2, tmp_path: Path) -> None:
