@@ -19,6 +19,7 @@ from dpm2_core.data.naming import frame_name
 from dpm2_core.data.pairing import JUMP
 from dpm2_core.data.point_times import last_point
 from dpm2_core.data.settings import InputSettings
+from dpm2_core.data.sweep_parts import MAX_PERIOD
 from dpm2_core.data.transforms import TransformTree
 from dpm2_core.data.vertical_angle import HDL64_CORRECTION_DEG, correct_vertical_angle
 from dpm2_core.errors import UsageError, printable
@@ -170,10 +171,12 @@ class FrameBuilder:
         return decode_points(cloud, settings.time_field, settings.time_unit, settings.intensity_max)
 
     def _is_nearest(self, stamp: int, second_stamp: int, second: Any) -> bool:
-        """Whether the cloud of a second LiDAR is to be merged into this one, with stamps in ns: of several clouds that
-        it is associated with, as are parts of a sweep, the nearest one gets its points."""
-        period = 0 if self._last_stamp is None else abs(stamp - self._last_stamp)
-        return second is not self._last_merged and (not period or second_stamp - stamp <= period / 2)
+        """Whether the cloud of a second LiDAR is to be merged into this one; stamps in ns. Of parts of a sweep that it
+        is associated with, only the nearest one gets its points."""
+        period = MAX_PERIOD if self._last_stamp is None else abs(stamp - self._last_stamp) * 1e-9
+        if not 0 < period < MAX_PERIOD:
+            return True
+        return second is not self._last_merged and (second_stamp - stamp) * 1e-9 <= period / 2
 
     def _merged(
         self, points: Points, offset: Points | None, lidar_frame: str, delay: float, second: Any

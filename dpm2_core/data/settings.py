@@ -47,8 +47,7 @@ class InputSettings(Settings):
 
     second_points_topic: str = ""
     """Topic of a second LiDAR, whose pose is on /tf_static. The nearest of its clouds within `image_tolerance` is
-    merged into each cloud of `points_topic`, or into the nearest if several have the same one, as parts of a sweep do;
-    empty: none."""
+    merged into each cloud of `points_topic`; if these are parts of a sweep, into the nearest. Empty: none."""
 
     images: bool = True
     """Use the camera if there is one."""

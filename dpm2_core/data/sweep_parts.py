@@ -18,7 +18,8 @@ from dpm2_core.frame import NO_POINTS, Frame, Image
 _MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
 """
-_MAX_PERIOD = 0.03  # s, between recognized parts; halves of a sweep of 0.05 s jitter about `_MAX_PART_SPAN`
+MAX_PERIOD = 0.03
+"""s, between recognized parts: halves of a sweep of 0.05 s jitter about `_MAX_PART_SPAN`."""
 # Smallest and largest span of a part, relative to the period. Clouds with a smaller span are whole ones, as of a flash
 # LiDAR; clouds with a larger span overlap the previous one, as if several clouds arrive at once.
 _SPAN_RATIOS = 0.3, 1.5
@@ -52,7 +53,7 @@ class SweepParts:
         if period > SWEEP:  # a pause, or whole clouds
             self._stop_joining()
         if self._joining:
-            self._has_close_parts |= period < _MAX_PERIOD
+            self._has_close_parts |= period < MAX_PERIOD
         elif not self._recognize_parts(frame, period):
             return frame
         if frame.problem is not None:
