@@ -18,7 +18,7 @@ import numpy as np
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Keyframe, Registration
+from dpm2_core.estimates import Edge, Keyframe, Registration
 from dpm2_core.files import new_folder, write_json
 from dpm2_core.frame import Array
 from dpm2_core.slam.loops.relocalization import CANDIDATES, RelocalizationSettings, Relocalizer, nowhere
@@ -55,12 +55,17 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
     for node, (x, y) in enumerate(np.floor(data.poses[:, :2, 3] / size).astype(int).tolist()):
         if data.clouds.loan(node) is None:
             squares.setdefault((x, y), []).append(node)
+    square_of = {node: tile for tile, nodes in squares.items() for node in nodes}
+    edges: dict[Tile | None, list[Edge]] = {}  # None: at a keyframe that is left out
+    for edge in data.constraints:
+        if (tile := square_of.get(edge.from_node)) == square_of.get(edge.to_node):
+            edges.setdefault(tile, []).append(edge)
     with new_folder(folder) as part:
         vectors = np.array([_place_vector(data, node) for _, nodes in sorted(squares.items()) for node in nodes])
         mean = np.asarray(vectors.sum(0) / max(int(vectors.any(1).sum()), 1), np.float32)
         np.save(part / VECTORS, centered(vectors, mean))
         for tile, nodes in squares.items():
-            save_as(subset(data, nodes, data.constraints, []), part / _file_name(tile))
+            save_as(subset(data, nodes, edges.get(tile, []), []), part / _file_name(tile))
         counts = [[*tile, len(nodes)] for tile, nodes in sorted(squares.items())]
         weights = sorted({session.weights for session in data.sessions if session.weights})
         write_json(part / INDEX, {"size": size, "tiles": counts, "weights": weights, "mean": mean.tolist()})
@@ -68,7 +73,7 @@ def write_tiles(data: MapData, folder: Path, size: float) -> int:
 
 
 def _place_vector(data: MapData, node: int) -> Vector:
-    descriptors = data.keyframes[node].descriptors or data.describe(node)
+    descriptors = data.descriptors(node)
     return np.zeros(WIDTH, np.float32) if descriptors is None else pooled(descriptors)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 from dpm2_core.descriptors import Descriptors
 from dpm2_core.errors import Dpm2Error, UsageError
-from dpm2_core.estimates import Registration
+from dpm2_core.estimates import Edge, Registration
 from dpm2_core.slam.loops.relocalization import RelocalizationSettings
 from dpm2_core.slam.loops.retrieval import pooled
 from dpm2_core.slam.mapping.tiles import INDEX, VECTORS, TiledMap, TiledRelocalizer, write_tiles
@@ -69,6 +70,20 @@ def test_every_keyframe_with_a_cloud_is_in_the_tile_of_its_place(folder: Path, d
             for edge in tile.edges:
                 assert tile.keyframes[edge.to_node].id - tile.keyframes[edge.from_node].id in (1, 59)
     assert sorted(found) == [node for node in range(60) if node != 9]
+
+
+def test_the_edges_of_a_map_are_passed_over_once_for_all_tiles(tmp_path: Path, data: MapData) -> None:
+    class Counting(list[Edge]):
+        visits = 0
+
+        def __iter__(self) -> Iterator[Edge]:
+            for edge in super().__iter__():
+                self.visits += 1
+                yield edge
+
+    edges = Counting(data.edges)
+    assert write_tiles(replace(data, edges=edges), tmp_path / "tiles", 10.0) == 35
+    assert edges.visits == len(edges)
 
 
 def test_only_the_tiles_that_are_asked_for_are_open(folder: Path, data: MapData) -> None:
