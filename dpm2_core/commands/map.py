@@ -99,7 +99,7 @@ def prune(
 
     check_new(out)
     with MapStore.open(path) as store:
-        data = load_map(store)
+        data = load_map(store, descriptors=False)
         pruned_data = pruned(data, redundant_nodes(data, SAME, TURNED))
         save_as(pruned_data, out)
     note(f"{out}: {len(pruned_data)} keyframes of {len(data)}")

@@ -48,7 +48,7 @@ def merge_files(
         raise UsageError("merge: --config and --set are for finding places, and do not apply with --transform")
     chosen = load_settings(Config, config, settings or ()).slam
     with ExitStack() as stack:
-        maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=True) for path in paths]
+        maps = [load_map(stack.enter_context(MapStore.open(path)), descriptors=not transforms) for path in paths]
         weights_ids = {session.weights for data in maps for session in data.sessions if session.weights}
         if not transforms:
             weights_ids.add(weights_id(chosen.neural.weights))

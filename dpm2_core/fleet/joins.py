@@ -120,7 +120,7 @@ def _read_excerpt(store: MapStore, nodes: Sequence[int], robot: str) -> _Excerpt
     for node in chosen:
         loan = data.clouds.loan(node)
         owner = node if loan is None else loan.lender
-        owner_keyframe = replace(data.keyframes[owner], descriptors=data.describe(owner))
+        owner_keyframe = replace(data.keyframes[owner], descriptors=data.descriptors(owner))
         keyframe = owner_keyframe if loan is None else borrowing(data.keyframes[node], {owner: owner_keyframe}, loan)  # type: ignore[arg-type]
         continues = node - 1 in chosen and data.keyframes[node - 1].robot == keyframe.robot
         # Separate names keep the odometry of the two apart; a gap begins another stretch of odometry.

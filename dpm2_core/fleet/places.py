@@ -54,11 +54,11 @@ def describe(folder: Path, advance: Advance, path: Path, version: Sequence[int])
     if problems := check_map(path).problems:
         raise Dpm2Error(f"{path}: {problems[0]}; see dpm2 map check")
     with MapStore.open(path) as store:
-        data = load_map(store)
-    vectors = np.zeros((len(data), WIDTH), np.float32)
-    for node, keyframe in enumerate(data.keyframes):
-        if keyframe.descriptors is not None and data.clouds.loan(node) is None:  # else all candidates are one place
-            vectors[node] = pooled(keyframe.descriptors)
+        data = load_map(store, descriptors=False)
+        vectors = np.zeros((len(data), WIDTH), np.float32)
+        for node in np.flatnonzero(data.clouds.own).tolist():  # else all candidates are one place
+            if (descriptors := data.descriptors(node)) is not None:
+                vectors[node] = pooled(descriptors)
     if not vectors.any():
         raise Dpm2Error(f"{path}: no keyframe has descriptors, by which it could be found in the others")
     np.save(folder / _VECTORS_FILE, vectors)

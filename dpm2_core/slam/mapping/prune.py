@@ -41,8 +41,8 @@ def redundant_nodes(data: MapData, distance: float, angle: float) -> list[int]:
     session = np.array([keyframe.session for keyframe in data.keyframes])
     tree, lasts = KDTree(positions), {int(part): node for node, part in enumerate(parts)}.values()
     needed = {*lasts, *(loan.lender for node in lasts if (loan := data.clouds.loan(node)))}
-    stays, described = np.ones(len(data), np.bool_), np.array([k.descriptors is not None for k in data.keyframes])
-    own = data.clouds.own
+    stays, own = np.ones(len(data), np.bool_), data.clouds.own
+    described = np.array([own[node] and data.descriptors(node) is not None for node in range(len(data))])
     for node in range(len(data)):
         if node in needed:
             continue

@@ -65,6 +65,14 @@ class MapData:
     def __len__(self) -> int:
         return len(self.keyframes)
 
+    def descriptors(self, node: int) -> Descriptors | None:
+        """Descriptors of a node that does not borrow, from memory or from the file; None if it has none.
+
+        Raises:
+            Dpm2Error: they are damaged.
+        """
+        return self.keyframes[node].descriptors or self.describe(node)
+
     @property
     def constraints(self) -> list[Edge]:
         """The valid edges: odometry and accepted loops."""
@@ -72,7 +80,8 @@ class MapData:
 
 
 def load_map(store: MapStore, descriptors: bool = True) -> MapData:
-    """Read a map, which stays open for its clouds; with `descriptors` False those also stay in the file.
+    """Read a map, which stays open for its clouds; with `descriptors` False those also stay in the file, and are
+    checked when they are read.
 
     Raises:
         Dpm2Error: it is damaged; the message states where.
@@ -85,7 +94,8 @@ def load_map(store: MapStore, descriptors: bool = True) -> MapData:
 
 
 def _load(store: MapStore, descriptors: bool) -> MapData:
-    keyframes, loans = _load_keyframes(store, descriptors)
+    describe = _reader_of_descriptors(store)
+    keyframes, loans = _load_keyframes(store, describe if descriptors else None)
     nodes = range(len(keyframes))
     edges = []
     for number, edge in _read_objects(store, "edges", edge_of):
@@ -119,13 +129,14 @@ def _load(store: MapStore, descriptors: bool) -> MapData:
             lambda node: store.payload(node, "cloud"), [moving.get(node) for node in nodes], loans, str(store.path)
         ),
         lambda node: store.payload(node, "thumbnail"),
-        lambda node: None if (packed := store.payload(node, "descriptors")) is None else unpack_descriptors(packed),
+        describe,
         next((made for _, made in _read_objects(store, "georeference", georeference_of)), None),
     )
 
 
-def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe], dict[int, Loan]]:
-    """Keyframes with their odometry pose, and descriptors if requested; and the loans of those that borrow."""
+def _load_keyframes(store: MapStore, describe: Describe | None) -> tuple[list[Keyframe], dict[int, Loan]]:
+    """Keyframes with their odometry pose, and descriptors if there is `describe`; and the loans of those that
+    borrow."""
     keyframes, loans = [], {}
     for position, (_, (node, keyframe, loan)) in enumerate(_read_objects(store, "keyframes", keyframe_of)):
         if node != position:
@@ -136,18 +147,31 @@ def _load_keyframes(store: MapStore, descriptors: bool) -> tuple[list[Keyframe],
     for node, loan in loans.items():  # a lender has its own cloud: there are no chains, and so no cycles
         if not 0 <= loan.lender < len(keyframes) or loan.lender in loans:
             raise ValueError(f"keyframe {node} borrows the cloud of {loan.lender}, which has none")
-    if descriptors:
-        widths = set()
-        for node in range(len(keyframes)):
-            if (data := store.payload(node, "descriptors")) is not None:
-                with _naming_row("keyframe", node):
-                    keyframes[node] = replace(keyframes[node], descriptors=(made := unpack_descriptors(data)))
-                    widths.add(made.features.shape[1])
-        if len(widths) > 1:
-            raise ValueError(f"descriptors of {', '.join(map(str, sorted(widths)))} channels, which cannot be compared")
+    if describe is not None:
+        keyframes = [replace(keyframe, descriptors=describe(node)) for node, keyframe in enumerate(keyframes)]
         for node, loan in loans.items():
             keyframes[node] = borrowing(keyframes[node], keyframes, loan)
     return keyframes, loans
+
+
+def _reader_of_descriptors(store: MapStore) -> Describe:
+    """Reads the descriptors of a node from the file. Raises Dpm2Error if they are damaged, or if they have another
+    number of channels than those that were read before."""
+    known = set[int]()
+
+    def describe(node: int) -> Descriptors | None:
+        if (packed := store.payload(node, "descriptors")) is None:
+            return None
+        try:
+            made = unpack_descriptors(packed)
+            known.add(made.features.shape[1])
+            if len(known) > 1:
+                raise ValueError(f"descriptors of {', '.join(map(str, sorted(known)))} channels cannot be compared")
+        except ValueError as error:
+            raise Dpm2Error(f"{store.path}: keyframe {node}: {error}; see dpm2 map check") from None
+        return made
+
+    return describe
 
 
 def _read_objects(store: MapStore, table: str, make: Callable[[tuple[Any, ...]], _T]) -> Iterator[tuple[int, _T]]:
@@ -205,8 +229,8 @@ def append_map(store: MapStore, data: MapData) -> None:
         ending.setdefault(max(edge.from_node, edge.to_node), []).append(edge)
     for node, keyframe in enumerate(data.keyframes):
         loan, mask = data.clouds.loan(node), data.clouds.moving(node)
-        if keyframe.descriptors is None and loan is None:
-            keyframe = replace(keyframe, descriptors=data.describe(node))
+        if loan is None:
+            keyframe = replace(keyframe, descriptors=data.descriptors(node))
         change = Change(
             keyframes=[(first + node, keyframe, data.clouds.packed(node), data.thumbnail(node))],
             loans={} if loan is None else {first + node: replace(loan, lender=loan.lender + first)},

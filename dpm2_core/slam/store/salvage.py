@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dpm2_core.data.thumbnail import image_of
+from dpm2_core.descriptors import Descriptors
 from dpm2_core.estimates import Edge, Keyframe, Registration, isotropic
 from dpm2_core.frame import NO_POINTS, Array, Georeference
 from dpm2_core.geometry import se3
@@ -23,6 +25,7 @@ from dpm2_core.slam.store.rows import RemovedKeyframe, Session
 
 _MIN_ROW_BYTES = 20  # limits the number of rows, so that a small file cannot have a row 2^62
 _MAX_HIDDEN_ROWS = 30_000  # consecutive rows that one damaged page of a tree can hide
+_Payload = tuple[bytes | None, Descriptors | None, bytes | None]
 _BRIDGE_COVARIANCE = isotropic(0.05, 0.5)  # of an edge that bridges a lost keyframe
 
 
@@ -48,6 +51,7 @@ class Salvage:
     def __init__(self, sql: sqlite3.Connection, size: int, findings: Findings) -> None:
         """`size`: file size, bytes."""
         self._sql, self._max_rows, self._findings = sql, size // _MIN_ROW_BYTES, findings
+        self._channels = 0  # of most descriptors
         self._last_rows = {table: self._find_last_row(table) for table in schema.CONTENT}
 
     def run(self) -> MapData:
@@ -78,6 +82,7 @@ class Salvage:
                 lambda node: self._read_payload(node)[0] or (None if node in loans else empty_cloud), moving, loans
             ),
             lambda node: self._read_payload(node)[2],
+            self._describe,
             georeference=self._read_georeference(),
         )
         return subset(with_gaps, good, edges, trail)
@@ -102,26 +107,32 @@ class Salvage:
             with self._recording(f"keyframe {node}: its own cloud is lost"):
                 if (payload := self._read_row("payloads", node)) is not None:
                     unpack_cloud(payload[1])
-        without_cloud = [
-            node for node in keyframes if node not in loans and self._read_payload(node, complain=True)[0] is None
-        ]
-        self._findings.lost_clouds = len(without_cloud)
-        for node in keyframes.keys() - set(without_cloud) - loans.keys():
-            packed = self._read_payload(node)[1]
-            descriptors = None if packed is None else rows.unpack_descriptors(packed)
-            keyframes[node] = replace(keyframes[node], descriptors=descriptors)
+        channels: dict[int, int] = {}
+        for node in (node for node in keyframes if node not in loans):
+            cloud, descriptors, _ = self._read_payload(node, complain=True)
+            self._findings.lost_clouds += cloud is None
+            if descriptors is not None:
+                channels[node] = descriptors.features.shape[1]
+        (self._channels, _), *_ = Counter(channels.values()).most_common(1) or [(0, 0)]
+        for node, count in channels.items():
+            if count != self._channels:
+                self._report(f"keyframe {node}: its descriptors are lost: {count} channels, most have {self._channels}")
         return keyframes, loans
 
-    def _read_payload(self, node: int, complain: bool = False) -> tuple[bytes | None, bytes | None, bytes | None]:
+    def _describe(self, node: int) -> Descriptors | None:
+        """Descriptors of a node, if they are good and can be compared with those of most others."""
+        descriptors = self._read_payload(node)[1]
+        return None if descriptors is None or descriptors.features.shape[1] != self._channels else descriptors
+
+    def _read_payload(self, node: int, complain: bool = False) -> _Payload:
         """Packed cloud, descriptors and thumbnail of a node, if they are good."""
         try:
             row = self._read_row("payloads", node)
             if row is None:
                 raise ValueError("none there")
             unpack_cloud(row[1])
-            if row[2] is not None:
-                rows.unpack_descriptors(row[2])
-            return row[1], row[2], self._check_thumbnail(node, row[3], complain)
+            descriptors = None if row[2] is None else rows.unpack_descriptors(row[2])
+            return row[1], descriptors, self._check_thumbnail(node, row[3], complain)
         except (ValueError, TypeError) as error:
             if complain:
                 self._report(f"keyframe {node}: its payload is lost: {error}")
