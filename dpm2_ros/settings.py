@@ -25,9 +25,9 @@ class RosSettings(Settings):
     only best effort."""
 
     queue_depth: int = Field(default=10, ge=1, le=1000)
-    """Largest number of clouds in the input queue. When it is full, the oldest cloud is dropped and counted in
-    /diagnostics. While clouds arrive faster than they are processed, the limit shrinks, down to two, until the worker
-    has caught up."""
+    """Largest number of clouds in the input queue; of clouds that are parts of a sweep, the number of sweeps. When it
+    is full, the oldest cloud, or the oldest sweep, is dropped and counted in /diagnostics. While clouds arrive faster
+    than they are processed, the limit shrinks, down to two, until the worker has caught up."""
 
     sync_timeout: float = Field(default=0.03, ge=0, le=5)
     """How long a cloud waits for its image before it is processed without it, s."""

@@ -242,7 +242,7 @@ class SlamNode(ManagedNode):
         end, room = time.monotonic() + ros.tf_timeout, max(ros.queue_depth - 1, 1)
         while not self._base_wait_is_over:
             is_found = inputs.calibrated(lidar_frame) and (base.optional or base.look(known.transforms, lidar_frame))
-            is_full = len(inputs.synchronizer) >= room
+            is_full = inputs.synchronizer.filled >= room
             self._base_wait_is_over = is_found or is_full or self._stopping.is_set() or time.monotonic() >= end
             if not self._base_wait_is_over:
                 time.sleep(0.01)

@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import Any
 
 from dpm2_core.data.pairing import AHEAD, JUMP, Beside, SetBack, is_due, passed
+from dpm2_core.data.sweep_parts import MAX_PART_SPAN, SWEEP
 
 HOLD = 0.5
 """Longest wait (s) for the next stamp, which confirms a jump of the stamps."""
@@ -23,6 +24,10 @@ FEW = 2
 """Smallest limit of the queue when clouds arrive faster than they can be processed."""
 PATIENCE = 5
 """Consecutive clouds that a sensor may miss before clouds no longer wait for it (until it delivers again)."""
+
+
+_MIN_PART_PERIOD = 1e-4
+"""s: no driver sends parts of a sweep faster."""
 
 
 class StampCheck(StrEnum):
@@ -103,9 +108,10 @@ class Synchronizer:
 
     Args:
         beside: topics of the other sensors. Without any, no cloud waits.
-        depth: limit of the queue; when it is full, the oldest cloud is dropped. While clouds arrive faster than they
-            are processed, the limit shrinks by one each time, down to `FEW`. Just as many clouds are dropped then, but
-            the remaining ones are more recent.
+        depth: limit of `filled`; when it is reached, the oldest cloud is dropped, or the oldest parts that make up a
+            sweep: with a hole in every sweep, none could be registered. While clouds arrive faster than they are
+            processed, the limit shrinks by one each time, down to `FEW`. Just as many clouds are dropped then, but the
+            remaining ones are more recent.
         timeout: longest wait of a cloud, s.
         tolerance: largest difference of the stamps of synchronized messages, s.
 
@@ -132,6 +138,19 @@ class Synchronizer:
     def __len__(self) -> int:
         """Number of clouds that are waiting."""
         return len(self._queue) + (self._jumped is not None)
+
+    @property
+    def filled(self) -> float:
+        """Number of clouds that are waiting; if they are parts of a sweep, the number of sweeps."""
+        span = self._span_of_parts
+        return span / SWEEP if span else len(self)
+
+    @property
+    def _span_of_parts(self) -> float:
+        """s from the first cloud in the queue to the last; 0 unless they are parts of a sweep."""
+        queue = self._queue
+        span = (queue[-1].stamp - queue[0].stamp) * 1e-9 if queue else 0.0
+        return span if _MIN_PART_PERIOD <= span / max(len(queue) - 1, 1) < MAX_PART_SPAN else 0.0
 
     @property
     def received(self) -> int:
@@ -282,9 +301,12 @@ class Synchronizer:
             self._period = bundle.stamp - self._newest.stamp
         self._newest = bundle
         self._queue.append(bundle)
-        if len(self._queue) > self._current_depth and self._released_since_drop:
+        if self.filled <= self._current_depth:
+            return
+        if self._released_since_drop:
             self._current_depth, self._released_since_drop = max(self._current_depth - 1, min(FEW, self._depth)), False
-        while len(self._queue) > self._current_depth:
+        most = self._current_depth - (self._span_of_parts > 0)
+        while len(self._queue) > 1 and self.filled > most:
             oldest = self._queue.popleft()
             self._queue[0].restarted |= oldest.restarted  # kept, although the cloud that had it is dropped
             self._queue[0].stepped |= oldest.stepped

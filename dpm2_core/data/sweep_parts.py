@@ -15,11 +15,11 @@ import numpy as np
 
 from dpm2_core.frame import NO_POINTS, Frame, Image
 
-_MAX_PART_SPAN = 0.025
+MAX_PART_SPAN = 0.025
 """s: a cloud that spans less is a part if the next one follows as soon. No LiDAR rotates more than 40 times per second.
 """
 MAX_PERIOD = 0.03
-"""s, between recognized parts: halves of a sweep of 0.05 s jitter about `_MAX_PART_SPAN`."""
+"""s, between recognized parts: halves of a sweep of 0.05 s jitter about `MAX_PART_SPAN`."""
 # Smallest and largest span of a part, relative to the period. Clouds with a smaller span are whole ones, as of a flash
 # LiDAR; clouds with a larger span overlap the previous one, as if several clouds arrive at once.
 _SPAN_RATIOS = 0.3, 1.5
@@ -64,9 +64,9 @@ class SweepParts:
         start, end = frame.time_range
         if end - start > 2 * SWEEP:  # wrong times: the unit is unknown if few points span little, or one is an outlier
             start, end, frame = 0.0, 0.0, replace(frame, points=NO_POINTS, time_offset=None)
+        if step > SWEEP:  # a sweep or more was dropped in between
+            self._parts.clear()
         self._parts.append(_copied(frame))
-        while len(self._parts) > 1 and self._span_to(end) > 2 * SWEEP:  # parts were dropped in between
-            self._parts.popleft()
         if self._span_to(end) < SWEEP - (end - start) / 2:
             return None
         sweep = frame if len(self._parts) == 1 else _joined(list(self._parts), frame)
@@ -83,7 +83,7 @@ class SweepParts:
             return False
         start, end = frame.time_range
         filled = _SPAN_RATIOS[0] * period < end - start < _SPAN_RATIOS[1] * period
-        self._joining = before is not None and period < _MAX_PART_SPAN and filled
+        self._joining = before is not None and period < MAX_PART_SPAN and filled
         if before is not None and self._joining:
             self._parts.append(replace(before, fix=None, dropped=0, stepped=False))
         else:
@@ -122,7 +122,7 @@ def whole_sweeps(frames: Iterable[Frame], start: int = 0) -> Iterator[tuple[int,
 def may_be_part(frame: Frame) -> bool:
     """Whether a frame spans no more than a part; only the next one shows whether it is one."""
     start, end = frame.time_range
-    return frame.problem is None and 0 < end - start < _MAX_PART_SPAN
+    return frame.problem is None and 0 < end - start < MAX_PART_SPAN
 
 
 def _copied(frame: Frame) -> Frame:

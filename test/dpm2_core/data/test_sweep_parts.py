@@ -129,6 +129,14 @@ def test_what_a_pause_of_the_node_interrupts_is_not_joined_across_it() -> None:
     assert numbers(out[-1]) == list(range(200, 210))
 
 
+def test_parts_before_a_dropped_sweep_are_not_joined_with_those_after_it() -> None:
+    """They made a sweep with a single part of the next one."""
+    after = [replace(part(i), dropped=10 if i == 15 else 0) for i in range(15, 25)]
+    out = joined([*(part(i) for i in range(5)), *after])
+    assert out[5:-1] == [None] * 9
+    assert numbers(out[-1]) == list(range(15, 25))
+
+
 def test_lost_parts_leave_a_hole() -> None:
     """A node that is too slow drops clouds: the sweep ends where it would have ended."""
     *_, sweep = joined([part(i) for i in (0, 1, 2, 6, 9)])
