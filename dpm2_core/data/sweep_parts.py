@@ -6,7 +6,6 @@ One part shows too little of the scene to be registered: a tenth of a sweep of a
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
@@ -36,7 +35,7 @@ class SweepParts:
     def __init__(self) -> None:
         self._stamp: int | None = None  # of the last cloud
         self._candidate: Frame | None = None  # the last cloud, if it may be a part, while none has been recognized
-        self._parts = deque[Frame]()
+        self._parts: list[Frame] = []
         self._joining = False  # whether clouds have been recognized as parts
         self._has_close_parts = False  # whether a part of this sweep followed another one as soon as parts do
 
@@ -56,8 +55,6 @@ class SweepParts:
             self._has_close_parts |= period < MAX_PERIOD
         elif not self._recognize_parts(frame, period):
             return frame
-        if frame.problem is not None:
-            return frame
         if step <= 0 or (frame.time_offset is None and len(frame.points)):
             self._stop_joining()
             return frame
@@ -69,7 +66,7 @@ class SweepParts:
         self._parts.append(_copied(frame))
         if self._span_to(end) < SWEEP - (end - start) / 2:
             return None
-        sweep = frame if len(self._parts) == 1 else _joined(list(self._parts), frame)
+        sweep = frame if len(self._parts) == 1 else _joined(self._parts, frame)
         self._parts.clear()
         if not self._has_close_parts:  # whole clouds, of which two followed each other too soon once
             self._stop_joining()
@@ -138,9 +135,11 @@ def _joined(parts: Sequence[Frame], last: Frame) -> Frame:
     starts, ends = zip(*[part.time_range for part in timed], strict=True)
     middle = (min(starts) + max(ends)) / 2
     guesses = [(abs(sum(part.time_range) / 2 - middle), part.guess) for part in timed if part.guess is not None]
+    points = np.concatenate([part.points for part in parts])
     return replace(
         last,
-        points=np.concatenate([part.points for part in parts]),
+        points=points,
+        problem=None if len(points) else last.problem,  # an unreadable part is one without points
         time_offset=np.concatenate(offsets) if offsets else None,
         images=_nearest([image for part in timed for image in part.images]),
         guess=min(guesses, key=itemgetter(0))[1] if guesses else None,  # nearest to the middle of the sweep

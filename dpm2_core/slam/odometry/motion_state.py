@@ -309,13 +309,14 @@ class MotionState:
         T, covariance = predicted(last.T_odom_lidar, self.ahead, dt, turns), self.unknown(dt)
         if not last.registration.ok:  # after a pause, `unknown` lacks the motion during it
             covariance = max(covariance, last.covariance, key=np.trace)
+        registration = replace(last.registration, T_target_source=T, method=BETWEEN, ok=False)
         return replace(
             last,
             stamp=frame.stamp,
             index=frame.index,
             T_odom_lidar=T,
             covariance=covariance,
-            registration=replace(last.registration, T_target_source=T, method=BETWEEN, ok=False),
+            registration=registration if frame.problem is None else registration.because(frame.problem),
             keyframe=None,
             seconds={},
             comparison=None,
