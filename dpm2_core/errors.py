@@ -6,7 +6,11 @@ import os
 import sys
 from collections.abc import Callable
 
-_PATH_ERRORS = (errno.EACCES, errno.ENAMETOOLONG)  # already the check whether such a file exists raises these
+_PATH_ERRORS = (
+    errno.EACCES,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+)  # already the check whether such a file exists raises these
 
 
 class Dpm2Error(Exception):
@@ -24,11 +28,14 @@ class UsageError(Dpm2Error):
 def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
     """Run `work` and return its exit code; on an error, print it as one line on stderr after `name`, return its code.
 
-    An error that is a bug is raised. A path without access permission or with a name that is too long is not a bug.
+    An error that is a bug is raised. A path without access permission, with a name that is too long, or in a loop of
+    symbolic links is not a bug.
     """
     try:
         return work() or 0
-    except Exception as error:
+    except Exception as raised:
+        cause = raised.__context__  # `Path.resolve` replaces ELOOP by a RuntimeError before Python 3.13
+        error = cause if isinstance(cause, OSError) and cause.errno == errno.ELOOP else raised
         code, text = getattr(error, "exit_code", None), str(error)
         if isinstance(error, OSError) and error.errno in _PATH_ERRORS and isinstance(error.filename, (str, bytes)):
             code, text = Dpm2Error.exit_code, f"{os.fsdecode(error.filename)}: {error.strerror}"

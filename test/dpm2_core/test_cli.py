@@ -200,6 +200,15 @@ def test_a_reader_that_stops_early_is_no_error() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_loop_of_symbolic_links_is_one_line(tmp_path: Path, map_file: Path) -> None:
+    """Before Python 3.13 it ended with a traceback where a new file was to be written."""
+    (loop := tmp_path / "loop").symlink_to("loop")
+    for arguments in (["map", "prune", map_file, "--out", loop], ["map", "export", map_file, loop, "--format", "ply"]):
+        done = dpm2(*arguments)
+        assert (done.returncode, done.stderr) == (1, f"dpm2: {loop}: Too many levels of symbolic links\n")
+    assert loop.is_symlink()
+
+
 def test_a_path_that_may_not_be_entered_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Examples are the folder of another user and a name that no file can have: Python raises when checking if it
     exists."""
