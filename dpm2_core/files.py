@@ -45,7 +45,7 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
     target = path.resolve()  # a symbolic link stays a link
     encoding = None if "b" in mode else "utf-8"
     with explaining(path):
-        if path.exists() and not path.is_file() and not path.is_dir():
+        if is_stream(path):
             with path.open(mode, encoding=encoding) as file:
                 yield file
             return
@@ -60,6 +60,11 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
         finally:
             with suppress(OSError):
                 part.unlink()
+
+
+def is_stream(path: Path) -> bool:
+    """Whether a path is that of a pipe, a socket or a device, whose content may have no end."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def part_beside(path: Path) -> Path:

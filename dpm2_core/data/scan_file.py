@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dpm2_core.data.compressed import decode_compressed
 from dpm2_core.errors import UsageError
+from dpm2_core.files import is_stream
 from dpm2_core.frame import NO_POINTS, Camera, Image, Points
 
 KITTI, KITTI_RAW = "*/velodyne", "*_drive_*/velodyne_points"
@@ -26,6 +27,8 @@ def numbered_scans(folder: Path) -> list[Path]:
 
 def read_scan(path: Path) -> tuple[Points, str | None]:
     """A velodyne file as (N, 4) float32 [x, y, z in m, intensity 0..1], or an empty array and the problem."""
+    if is_stream(path):
+        return NO_POINTS, f"{path}: not a file"
     try:
         values, size = np.fromfile(path, "<f4"), path.stat().st_size
     except OSError as error:

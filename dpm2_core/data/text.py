@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpm2_core.errors import UsageError
+from dpm2_core.files import is_stream
 from dpm2_core.frame import Array
 
 _MAX_NUMBER = 9e9  # s, of a stamp in ns as an integer: the year 2255; no position or focal length is as large
@@ -64,7 +65,10 @@ def required(rows: dict[str, Array], name: str, count: int, path: Path) -> Array
 
 
 def read_lines(path: Path, missing_ok: bool = True) -> list[str]:
-    """Lines of a text file; for a missing file an empty list, or an error."""
+    """Lines of a text file; for a missing file an empty list, or an error. With `missing_ok` it belongs to a data set,
+    and may be no pipe or device."""
+    if missing_ok and is_stream(path):
+        raise UsageError(f"{path}: not a file")
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

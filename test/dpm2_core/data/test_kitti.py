@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -365,6 +366,22 @@ def test_a_damaged_text_file_is_named(kitti_folder: MakeFolder, name: str, text:
     with (folder / "calib.txt").open("a") as file:
         file.write("Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(UsageError, match=message):
+        KittiSource(folder)
+
+
+def test_a_pipe_or_device_in_place_of_a_file_is_named(kitti_folder: MakeFolder) -> None:
+    """To read it would take forever, or all of the memory."""
+    folder = kitti_folder()
+    (folder / "velodyne" / "000001.bin").unlink()
+    (folder / "velodyne" / "000001.bin").symlink_to("/dev/zero")
+    (folder / "velodyne" / "000002.bin").unlink()
+    os.mkfifo(folder / "velodyne" / "000002.bin")
+    scan = folder / "velodyne" / "000001.bin"
+    problems = [frame.problem for frame in KittiSource(folder).frames()]
+    assert problems == [None, f"{scan}: not a file", f"{scan.with_name('000002.bin')}: not a file", None, None]
+    (folder / "calib.txt").unlink()
+    os.mkfifo(folder / "calib.txt")
+    with pytest.raises(UsageError, match=r"calib\.txt: not a file$"):
         KittiSource(folder)
 
 
