@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 from dpm2_core.config import Settings
 from dpm2_core.console import Advance, untold
-from dpm2_core.errors import Dpm2Error
+from dpm2_core.errors import Dpm2Error, explaining_killed_workers
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write, explaining, file_digest, make_folder
 
@@ -88,7 +88,7 @@ def run_parts(
         workers: parts at a time; if more than one, each runs in its own process.
 
     Raises:
-        Dpm2Error: a part failed; it is named. Parts that are done are kept.
+        Dpm2Error: a part failed; it is named. Or its process was killed. Parts that are done are kept.
     """
     progress = progress or Progress()
     found = {part.name: figures for part in parts if (figures := figures_of(part, out)) is not None}
@@ -110,7 +110,9 @@ def _do_missing(parts: Sequence[Part], out: Path, workers: int, progress: Progre
     try:
         running = {pool.submit(_do_with_named_errors, part, out): part.name for part in parts}
         for future in as_completed(running):
-            yield running[future], future.result()
+            with explaining_killed_workers():
+                figures = future.result()
+            yield running[future], figures
     finally:
         pool.shutdown(cancel_futures=True)
 

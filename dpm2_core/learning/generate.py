@@ -17,7 +17,7 @@ from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writ
 from dpm2_core.data.source import Source
 from dpm2_core.data.sweep_parts import whole_sweeps
 from dpm2_core.descriptors import levelling
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import UsageError, explaining_killed_workers
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
@@ -158,7 +158,7 @@ def generate(out: Path, settings: GenerateSettings, workers: int, progress: Adva
 
     Raises:
         UsageError: an existing world was made with other settings.
-        Dpm2Error: a world could not be written. No other is begun then, nor after Ctrl-C.
+        Dpm2Error: a world could not be written, or its process was killed. No other is begun then, nor after Ctrl-C.
     """
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
     folders = {seed: out / f"world_{seed:06d}" for seed in seeds}
@@ -171,7 +171,8 @@ def generate(out: Path, settings: GenerateSettings, workers: int, progress: Adva
     try:
         running = [pool.submit(generate_world, folders[seed], seed, settings) for seed in missing]
         for future in as_completed(running):
-            future.result()
+            with explaining_killed_workers():
+                future.result()
             done += 1
             progress(done, settings.worlds)
     finally:

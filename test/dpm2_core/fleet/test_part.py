@@ -11,13 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from dpm2_core.errors import UsageError
+from dpm2_core.errors import Dpm2Error, UsageError
 from dpm2_core.fleet.part import DONE, Part, Progress, do_part, figures_of, remove_attempts, run_parts
 
 WORK = "part_work:count"
 SOURCE = """
 import os
+import signal
 from dpm2_core.errors import UsageError
+
+def die(folder, advance):
+    os.kill(os.getpid(), signal.SIGKILL)
 
 def count(folder, advance, start):
     log = folder / "log"
@@ -80,6 +84,17 @@ def test_parts_in_processes_of_their_own_give_the_same(tmp_path: Path) -> None:
     assert os.getpid() not in [figures["process"] for figures in found.values()]
     with pytest.raises(UsageError, match=r"^bad: below zero$"):
         run_parts([Part("bad", WORK, {"start": -1}), Part("good", WORK, {"start": 1})], tmp_path, workers=2)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_one_line(tmp_path: Path) -> None:
+    """A worker that the kernel kills for lack of memory is an error that says what to do. Previously, it was a
+    traceback of concurrent.futures."""
+    parts = [Part("dead", "part_work:die", {}), Part("good", WORK, {"start": 1})]
+    with pytest.raises(Dpm2Error, match=r"^a worker process was killed, .* fewer --workers$"):
+        run_parts(parts, tmp_path, workers=2)
+    parts = [Part("next", WORK, {"start": 3}), parts[1]]
+    assert [figures["value"] for figures in run_parts(parts, tmp_path, workers=2).values()] == [4, 2]
 
 
 def test_a_part_that_fails_is_named_and_is_not_done(tmp_path: Path) -> None:
