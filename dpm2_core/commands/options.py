@@ -68,9 +68,9 @@ def parse_names(text: str | None) -> tuple[str, ...]:
 
 
 def parse_lengths(text: str) -> tuple[float, ...]:
-    """`10,20,30` to meters."""
+    """`10,20,30` to meters, each once, in increasing order."""
     try:
-        lengths = tuple(float(part) for part in text.split(","))
+        lengths = tuple(sorted({float(part) for part in text.split(",")}))
     except ValueError:
         raise UsageError(f"--lengths {text}: want meters separated by commas, such as 10,20,30,40,50") from None
     if not all(0 < length < float("inf") for length in lengths):

@@ -18,6 +18,7 @@ from dpm2_core.data.kitti import read_calib
 from dpm2_core.data.open import open_source
 from dpm2_core.data.trajectory import read_trajectory, write_kitti, write_tum
 from dpm2_core.errors import UsageError
+from dpm2_core.evaluation.kitti_metric import OFFICIAL_LENGTHS
 from dpm2_core.geometry import se3
 
 from ...helpers.command import dpm2, refused, succeeded
@@ -147,6 +148,13 @@ def test_a_run_of_some_frames_is_told_which_of_its_files_a_drive_is_the_truth_of
     folder, poses = drive_with_truth(tmp_path)
     write_kitti(tmp_path / "est.txt", poses[2:5])
     assert "trajectory.tum" in refused("eval", "--gt", folder, "--est", tmp_path / "est.txt")
+
+
+def test_lengths_count_once_in_any_order() -> None:
+    """A length given twice counts once, and the benchmark's lengths in another order are the benchmark's. Previously,
+    the first had twice the weight in the mean, and the others had segments from each frame instead of every tenth."""
+    assert parse_lengths("20,10,10") == (10, 20)
+    assert parse_lengths("800,700,600,500,400,300,200,100") == OFFICIAL_LENGTHS
 
 
 @pytest.mark.parametrize("text", ["", "ten", "10,,20", "0", "-5", "inf", "nan"])
