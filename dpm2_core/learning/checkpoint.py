@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from dpm2_core.errors import UsageError
-from dpm2_core.files import atomic_write, make_folder
+from dpm2_core.files import atomic_write, explaining, make_folder
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.jsonl", "weights.safetensors"
 """The files that a training writes to its folder."""
@@ -123,9 +123,14 @@ class Log:
             self.board = None
 
     def write(self, step: int, figures: dict[str, float]) -> None:
-        """Log figures of a step; one that is not finite is written as null."""
+        """Log figures of a step; one that is not finite is written as null.
+
+        Raises:
+            Dpm2Error: not written, e.g. on a full disk.
+        """
         rounded = {k: round(v, 6) if math.isfinite(v) else None for k, v in figures.items()}
-        self.file.write(json.dumps({"step": step, **rounded}) + "\n")
+        with explaining(Path(self.file.name)):
+            self.file.write(json.dumps({"step": step, **rounded}) + "\n")
         if self.board is not None:
             for name, value in figures.items():
                 self.board.add_scalar(name, value, step)

@@ -323,6 +323,15 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
     assert load_checkpoint(path, module, module, made) == 7
 
 
+def test_a_log_on_a_full_disk_is_named(tmp_path: Path) -> None:
+    """Previously, it was a traceback or, depending on the error, a line that did not name the file."""
+    log = Log(tmp_path)
+    log.write(0, {"loss": 1.0})
+    with largest_file(10), pytest.raises(Dpm2Error, match=r"log\.jsonl: not written"):
+        log.write(1, {"loss": 1.0})
+    log.close()
+
+
 def test_drives_that_were_packed_anew_are_not_gone_on_with(
     settings: RegistrationTrainingSettings, packed: Path, tmp_path: Path
 ) -> None:
