@@ -13,7 +13,8 @@ from dpm2_core.errors import UsageError
 from dpm2_core.files import is_stream
 from dpm2_core.frame import Array
 
-_MAX_NUMBER = 9e9  # s, of a stamp in ns as an integer: the year 2255; no position or focal length is as large
+MAX_NUMBER = 9e9
+"""s, of a stamp in ns as an integer: the year 2255; no position or focal length is as large."""
 _DATE = re.compile(r"(?:.*\D)?(\d{4})\D?([01]\d)\D?([0-3]\d)\D([0-2]\d)\D?([0-5]\d)\D?([0-5]\d)(?:\D(\d{1,9}))?")
 
 
@@ -85,7 +86,7 @@ def parse_row(text: str, count: int, where: str) -> Array:
         raise UsageError(f"{where}: {error}") from None
     if len(row) != count or not np.isfinite(row).all():
         raise UsageError(f"{where}: {len(row)} numbers, want {count} finite ones")
-    if np.abs(row).max(initial=0) > _MAX_NUMBER:
+    if np.abs(row).max(initial=0) > MAX_NUMBER:
         raise UsageError(f"{where}: {np.abs(row).max():g} is too large for a time, position or calibration")
     return row
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpm2_core.data.text import read_lines
+from dpm2_core.data.text import MAX_NUMBER, read_lines
 from dpm2_core.errors import UsageError
 from dpm2_core.files import atomic_write
 from dpm2_core.frame import Array
@@ -118,7 +118,7 @@ def _parse_key(field: str, columns: int) -> int:
 
 def _poses(rows: Array, columns: int) -> tuple[Array, NDArray[np.bool_]]:
     """(N, columns) numbers to (N, 4, 4) poses, and which of them are finite rigid transforms."""
-    finite = np.logical_and.reduce(np.isfinite(rows), axis=1)
+    finite = np.logical_and.reduce(np.abs(rows) <= MAX_NUMBER, axis=1)  # also rejects NaN
     rows = np.where(finite[:, None], rows, 0.0)
     if columns == _TUM:
         quaternions = rows[:, 4:8]

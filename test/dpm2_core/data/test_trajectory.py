@@ -75,6 +75,7 @@ def test_exponents_comments_and_blank_lines_are_read(tmp_path: Path) -> None:
         (f"{IDENTITY}\n\n# gap\n{IDENTITY} 1\n", ":4: 13 numbers where the lines before have 12"),
         (f"{IDENTITY}\n{IDENTITY[:-1]}x\n", ":2: .*'x'"),
         (f"{IDENTITY}\n{IDENTITY[:-1]}nan\n", ":2: not a finite rigid transform"),
+        (f"{IDENTITY}\n{IDENTITY[:-1]}1e308\n", ":2: not a finite rigid transform"),  # `dpm2 eval` never ended
         (f"{IDENTITY}\n{'0 ' * 12}\n", ":2: not a finite rigid transform"),
         (f"{IDENTITY}\n-1 0 0 0 0 1 0 0 0 0 1 0\n", ":2: not a finite rigid transform"),
         ("0 1 2 3 0 0 0 0\n", ":1: not a finite rigid transform"),
