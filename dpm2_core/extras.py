@@ -24,7 +24,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
         extra: its name in setup.py. purpose: what needs the package, the subject of the message.
 
     Raises:
-        MissingPackageError: the package is not installed.
+        MissingPackageError: the package is not installed, or a library of the system that it needs.
     """
     try:
         yield
@@ -35,3 +35,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
         else:
             why = f"which is not installed: pip install 'dpm2_ros[{extra}]'"
         raise MissingPackageError(f"{purpose} needs the package {package}, {why}") from None
+    except ImportError as error:
+        if "shared object file" not in str(error):
+            raise
+        raise MissingPackageError(f"{purpose} needs a library that this system lacks: {error}") from None

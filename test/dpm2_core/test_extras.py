@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -81,3 +82,20 @@ def test_an_error_inside_a_package_is_no_missing_package() -> None:
     with pytest.raises(ImportError, match="cannot import name") as caught, needs("sim", "the city"):
         from json import no_such_name  # noqa: F401
     assert not isinstance(caught.value, MissingPackageError)
+
+
+def test_a_library_that_the_system_lacks_is_named_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As libusb of Open3D, which KISS-SLAM imports. Previously, `dpm2 experiment --peer kiss-slam` ended in a
+    traceback."""
+
+    def build(name: str, code: str, *options: str) -> None:
+        command = ["g++", "-shared", "-fPIC", "-x", "c++", "-", "-o", name, *options]
+        subprocess.run(command, input=code, text=True, cwd=tmp_path, check=True)
+
+    build("libgone.so", "void f() {}")
+    build("needsgone.so", "void f(); void g() { f(); }", "-L.", "-lgone")
+    (tmp_path / "libgone.so").unlink()
+    monkeypatch.syspath_prepend(tmp_path)
+    problem = r"^KISS-SLAM needs a library that this system lacks: libgone.so: cannot open shared object file"
+    with pytest.raises(MissingPackageError, match=problem), needs("peers", "KISS-SLAM"):
+        importlib.import_module("needsgone")
