@@ -68,7 +68,7 @@ def own(folder: Path, advance: Advance, drive: Drive, corrupt: str | None = None
         result = driven(run, advance)
         result.lengths = tuple(drive["lengths"])
         if result.metrics is None:
-            raise UsageError(f"{run.source.name}: no ground truth to compare with")
+            raise UsageError(f"{run.source.name}: fewer than two frames with a ground truth to compare with")
         result.save(folder, cloud=False)
         seconds = {stage: float(np.sum(times)) for stage, times in result.seconds.items()}
         accepted = sum(loop.ok for loop in result.mapper.loops)

@@ -176,6 +176,7 @@ def test_a_peer_or_a_file_that_is_not_there_is_named_with_its_part(kitti: Path, 
     assert "x/10: no.txt: No such file" in dpm2(*call, "--peer", "x=no.txt").stderr
     write_tum(tmp_path / "other.tum", [10**12, 2 * 10**12], np.stack([np.eye(4)] * 2))
     assert "other.tum" in dpm2(*call, "--peer", f"x={tmp_path}/other.tum").stderr
+    assert "10: fewer than two frames with a ground truth to compare with" in dpm2(*call[:-1], "0:1").stderr
 
 
 def ahead(t: np.ndarray) -> np.ndarray:
