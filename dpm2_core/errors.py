@@ -7,11 +7,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-_PATH_ERRORS = (
-    errno.EACCES,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-)  # already the check whether such a file exists raises these
+_PATH_ERRORS = (errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
+"""Already the check whether such a file exists raises these."""
 
 
 class Dpm2Error(Exception):
