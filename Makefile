@@ -88,7 +88,7 @@ bench-livox: $(LIVOX)/poses.txt  ## `dpm2 bench hard` on a public drive of a han
 bench-robots: setup  ## three robots and one mapper_node behind a link that loses packets and is cut for 30 s (root, nftables)
 	$(BIN)/python -m benchmarks.robots $(ARGS)
 
-bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk)
+bench-memory: setup  ## resident memory over a synthetic drive of 2,000 frames (8 GB on disk): benchmarks/memory.json
 	$(DPM2) sim out/memory --frames 2000 --seed 3 --no-images
 	$(DPM2) bench memory --source out/memory $(ARGS)
 

@@ -28,7 +28,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "traffic": ("--threads", "1", "--repetitions", "3"), "finetune": (),
 }  # fmt: skip
 """Benchmarks and their options, fast ones first."""
-TARGETS = {"livox": "bench-livox", "kitti": "bench-kitti", "robustness": "bench-robustness"}
+TARGETS = {name: f"bench-{name}" for name in ("livox", "kitti", "robustness", "memory")}
 """Records that are made by a target of the Makefile."""
 
 
