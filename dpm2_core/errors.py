@@ -4,8 +4,7 @@
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 _PATH_ERRORS = (errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
 """Already the check whether such a file exists raises these."""
@@ -44,20 +43,6 @@ def exit_code(work: Callable[[], int | None], name: str = "error") -> int:
         if text:  # empty for a group of commands that is called without one: it has shown its help
             print(f"{name}: {printable(text)}", file=sys.stderr)
         return int(code)
-
-
-@contextmanager
-def explaining_killed_workers() -> Iterator[None]:
-    """A process of a pool that is killed while the block waits for it, mostly for lack of memory, is a `Dpm2Error`."""
-    from concurrent.futures.process import BrokenProcessPool  # slow to import
-
-    try:
-        yield
-    except BrokenProcessPool:
-        raise Dpm2Error(
-            "a worker process was killed, perhaps because the memory was full; the same command continues, "
-            "and needs less memory with fewer --workers"
-        ) from None
 
 
 def printable(text: str) -> str:

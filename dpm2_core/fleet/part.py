@@ -10,7 +10,7 @@ import resource
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -21,9 +21,10 @@ from typing import Any, Literal, NamedTuple
 
 from dpm2_core.config import Settings
 from dpm2_core.console import Advance, untold
-from dpm2_core.errors import Dpm2Error, explaining_killed_workers
+from dpm2_core.errors import Dpm2Error
 from dpm2_core.evaluation.record import git_commit
 from dpm2_core.files import atomic_write, explaining, file_digest, make_folder
+from dpm2_core.workers import worker_pool
 
 DONE = "part.json"
 """The record in the folder of a part that ended: its request and its figures."""
@@ -106,15 +107,10 @@ def _do_missing(parts: Sequence[Part], out: Path, workers: int, progress: Progre
             yield part.name, _do_with_named_errors(part, out, partial(progress.frame, part.name))
         return
     context = multiprocessing.get_context("spawn")  # a fork would inherit torch's threads only partly
-    pool = ProcessPoolExecutor(workers, mp_context=context)
-    try:
+    with worker_pool(workers, context) as pool:
         running = {pool.submit(_do_with_named_errors, part, out): part.name for part in parts}
         for future in as_completed(running):
-            with explaining_killed_workers():
-                figures = future.result()
-            yield running[future], figures
-    finally:
-        pool.shutdown(cancel_futures=True)
+            yield running[future], future.result()
 
 
 def _do_with_named_errors(part: Part, out: Path, advance: Advance = untold) -> Figures:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from dpm2_core.data.packed import PackedDrive, PackedWriter, Sample, packed_writ
 from dpm2_core.data.source import Source
 from dpm2_core.data.sweep_parts import whole_sweeps
 from dpm2_core.descriptors import levelling
-from dpm2_core.errors import UsageError, explaining_killed_workers
+from dpm2_core.errors import UsageError
 from dpm2_core.frame import Array, Frame, Image, Points
 from dpm2_core.geometry import se3
 from dpm2_core.geometry.deskew import deskew
@@ -32,6 +32,7 @@ from dpm2_core.sim.lidar import Lidar
 from dpm2_core.sim.sensors import drawn_sensor
 from dpm2_core.sim.settings import PRESETS, CameraConfig, LidarConfig, PresetName
 from dpm2_core.sim.world import World, build_world
+from dpm2_core.workers import worker_pool
 
 
 class GenerateSettings(Settings):
@@ -167,16 +168,12 @@ def generate(out: Path, settings: GenerateSettings, workers: int, progress: Adva
         check_same(folders[seed], _world_settings(settings))
     done = settings.worlds - len(missing)
     progress(done, settings.worlds)
-    pool = ProcessPoolExecutor(workers)
-    try:
+    with worker_pool(workers) as pool:
         running = [pool.submit(generate_world, folders[seed], seed, settings) for seed in missing]
         for future in as_completed(running):
-            with explaining_killed_workers():
-                future.result()
+            future.result()
             done += 1
             progress(done, settings.worlds)
-    finally:
-        pool.shutdown(cancel_futures=True)  # a `with` block would finish the other worlds first
 
 
 def pack(
