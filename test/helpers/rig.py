@@ -16,6 +16,7 @@ from dpm2_core.data.naming import IMAGE, KITTI, POINTS
 from dpm2_core.data.transforms import transform_matrix
 from dpm2_core.frame import Array
 from dpm2_ros.conversions import columns_to_msg, transform_to_msg
+from dpm2_ros.mapping import KEEP_ALL
 from dpm2_ros.slam_node import SlamNode
 from dpm2_ros.stamps import stamp_to_msg
 from dpm2_ros.tf_message import TFMessage
@@ -32,7 +33,7 @@ class Rig:
         self.harness = ros(*quiet, *parameters, **options)
         self.drive = drive
         self.lidar = self.harness.publisher(PointCloud2, POINTS, reliable)
-        self.odom = self.harness.hear(Odometry, f"{options.get('namespace', '')}/dpm2/odom")
+        self.odom = self.harness.hear(Odometry, f"{options.get('namespace', '')}/dpm2/odom", KEEP_ALL)
         self.diagnostics = self.harness.diagnostics
         self.node: SlamNode = self.harness.add(SlamNode())
         self.wait = self.harness.wait
