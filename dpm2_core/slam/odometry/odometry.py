@@ -124,7 +124,7 @@ class Odometry:
         is_part, frame = received is not frame, self._sweep.centered(received)
         dt = self._clock.advance(frame.stamp)
         if self._first is not None and self._sweep.is_part(self._first_sweep.span):
-            self._discard_first(dt)
+            self._discard_first(frame, dt)
         frame, twist = self._use_priors(frame, motion.seconds + dt)
         scan = self._registration.prepare(frame, twist)
         ticks.append(perf_counter())
@@ -207,10 +207,10 @@ class Odometry:
             motion.other.look(frame.guess, known, seconds, motion.prediction_covariance(seconds))
         return frame, twist
 
-    def _discard_first(self, dt: float) -> None:
-        """The first scan shows only a part of the scene, as drivers start in mid-sweep: the next one is the first."""
-        self._first = None
-        self._registration = self._registration.fresh()
+    def _discard_first(self, frame: Frame, dt: float) -> None:
+        """The first scan shows only a part of the scene, as drivers start in mid-sweep: this frame is the first."""
+        self._first, self._motion.settings = None, self._settings
+        self._registration = self._tools.registration.fresh()
         self._keyframes.add_uncertainty(self._motion.unknown(dt))
         self._keyframes.request()
 

@@ -61,6 +61,13 @@ class ScaledOdometry(Odometry):
             self._contrary_checks = 0
         return result
 
+    def _discard_first(self, frame: Frame, dt: float) -> None:
+        """A part of the scene does not show its type either: this frame decides."""
+        is_room = self._is_room(frame)
+        self._use_tools(self._choice.indoor if is_room else self._choice.outdoor)
+        self._undecided = is_room is None
+        super()._discard_first(frame, dt)
+
     def _is_room(self, frame: Frame) -> bool | None:
         """Whether a scan shows a room, see `is_room`.
 

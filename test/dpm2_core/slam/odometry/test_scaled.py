@@ -37,6 +37,12 @@ def away(preset: str, drive: list[Frame], poses: np.ndarray) -> tuple[np.ndarray
     return np.linalg.norm(T[:, :3, 3] - want[:, :3, 3], axis=1), [r.registration.ok for r in results], odometry.scale
 
 
+def _timed(frame: Frame) -> Frame:
+    """The frame with the times of a LiDAR that rotates ten times per second."""
+    turn = np.arctan2(frame.points[:, 1], frame.points[:, 0]) / (2 * np.pi) % 1.0
+    return replace(frame, time_offset=np.asarray(0.1 * turn, np.float32))
+
+
 @pytest.mark.slow
 def test_a_small_room_with_16_beams_works_unasked() -> None:
     """5 x 4 m, furnished: every scan is registered, to 3 cm. The settings for streets register none of them."""
@@ -159,6 +165,26 @@ def test_short_sight_on_a_street_is_no_room() -> None:
         assert is_room(frame.points[near])
         odometry.process(replace(frame, points=frame.points[near]))
     assert odometry.scale == "outdoor"
+
+
+def test_a_part_of_a_street_is_no_room() -> None:
+    """A driver that starts in mid-sweep first shows the nearest house. The next scan decides, for its keyframe too."""
+    poses = se3.exp(np.outer(np.arange(3), [0, 0, 0, 0.05, 0, 0])) @ se3.make(np.eye(3), [0, 0, 1.7])
+    part, *whole = (_timed(frame) for frame in frames(poses, street=True))
+    assert part.time_offset is not None
+    seen = (part.time_offset < 0.01) & (np.linalg.norm(part.points[:, :3], axis=1) < 10)
+    part = replace(part, points=part.points[seen], time_offset=part.time_offset[seen])
+    odometry = make_odometry(geometric("auto"))
+    odometry.process(part)
+    assert odometry.scale == "indoor"
+    results = [odometry.process(frame) for frame in whole]
+    assert odometry.scale == "outdoor"
+    street, first = make_odometry(geometric("outdoor")), results[0].keyframe
+    same = street.process(whole[0]).keyframe
+    assert first is not None
+    assert same is not None
+    np.testing.assert_array_equal(first.cloud, same.cloud)
+    assert results[1].registration.ok
 
 
 def test_a_second_lidar_of_half_the_rate_does_not_hide_a_room() -> None:
